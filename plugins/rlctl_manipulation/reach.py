@@ -1,0 +1,70 @@
+"""Reach: a KUKA LBR iiwa brings its hand to a goal."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlctl.task import Box, Sim, Task, rewards
+
+HOME = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])  # [rad], elbow bent
+MAX_SPEED = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
+GOAL_LOW, GOAL_HIGH = (0.35, -0.35, 0.15), (0.65, 0.35, 0.65)  # [m], world frame, in front of the arm
+HAND = "lbr_iiwa_link_7"
+
+
+@dataclass
+class Reach(Task):
+    """Bring the hand within `tolerance` of the goal and keep it there until the episode ends."""
+
+    tolerance: float = 0.05  # [m]
+
+    robot = "KUKA LBR iiwa"
+    control_dt, substeps, episode_s = 4 / 240, 4, 2.0  # [s], -, [s]
+    action_space = Box(-1.0, 1.0, (7,), np.float32)
+    action_meaning = "joint steps; 1 is the joint's top speed for one control step"
+    observation_units = {"joint_positions": "rad", "joint_velocities": "rad/s", "hand": "m", "goal": "m"}
+    reward_weights = {"distance": -1.0, "reached": 1.0, "action": -0.01, "smoothness": -0.01}
+
+    def build(self, sim: Sim) -> None:
+        sim.load("plane", "plane.urdf", fixed=True)
+        self.arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+        self.joint_step = MAX_SPEED * self.control_dt  # [rad]
+        self.max_speed, self.max_torque = MAX_SPEED.tolist(), self.arm.joint_max_force.tolist()
+
+    def reset(self, rng: np.random.Generator) -> None:
+        self.arm.set_joints(HOME + rng.uniform(-0.1, 0.1, 7))
+        self.goal = rng.uniform(GOAL_LOW, GOAL_HIGH)
+        self.last_action = self.action_change = np.zeros(7, np.float32)
+
+    def act(self, action: np.ndarray) -> None:
+        target = self.arm.joint_positions + self.joint_step * action
+        target = np.clip(target, self.arm.joint_low, self.arm.joint_high)
+        self.arm.drive_to(target, max_speed=self.max_speed, max_force=self.max_torque, gain=0.25)
+        self.action_change, self.last_action = action - self.last_action, action
+
+    def observe(self) -> dict[str, np.ndarray]:
+        return {
+            "joint_positions": self.arm.joint_positions,
+            "joint_velocities": self.arm.joint_velocities,
+            "hand": self.arm.link_position(HAND),
+            "goal": self.goal,
+        }
+
+    def rewards(self, action: np.ndarray) -> dict[str, float]:
+        distance = self.distance()
+        return {
+            "distance": distance,
+            "reached": float(distance < self.tolerance),
+            "action": rewards.squared(action),
+            "smoothness": rewards.squared(self.action_change),
+        }
+
+    def distance(self) -> float:
+        """Distance from the hand to the goal [m]."""
+        return rewards.distance(self.arm.link_position(HAND), self.goal)
+
+    def is_success(self) -> bool:
+        return self.distance() < self.tolerance
+
+    def markers(self) -> dict[str, np.ndarray]:
+        return {"goal": self.goal}

@@ -1,0 +1,67 @@
+"""What can go wrong, and the exit code each kind ends the tool with."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class RlctlError(Exception):
+    """An error that is explained to the user in one to three lines; never a traceback.
+
+    `details` is text that a report may show below the message, such as a plugin's own traceback.
+    """
+
+    exit_code = 70
+
+    def __init__(self, message: str, *, details: str | None = None) -> None:
+        super().__init__(message)
+        self.details = details
+
+
+class AnswerIsNo(RlctlError):
+    """Everything worked, and the answer is no: a check failed, a gate was missed, a replay differed."""
+
+    exit_code = 1
+
+
+class UsageError(RlctlError):
+    """The command line asks for something that does not exist or that this task cannot do."""
+
+    exit_code = 2
+
+
+class RecipeError(UsageError):
+    """A recipe or a `--set` has an unknown key, a wrong type or a value out of range."""
+
+
+class TaskError(RlctlError):
+    """The task or its plugin failed: import, exception, crash, hang, or values that are not finite."""
+
+    exit_code = 3
+
+
+class DivergedError(RlctlError):
+    """Training produced losses or weights that are not finite."""
+
+    exit_code = 4
+
+
+class ArtifactError(RlctlError):
+    """A file is missing, damaged, not ours, or made for other spaces."""
+
+    exit_code = 5
+
+
+class Interrupted(RlctlError):
+    """A signal ended the run in good order; the exit code is 128 + the signal's number."""
+
+    def __init__(self, message: str, signal_number: int) -> None:
+        super().__init__(message)
+        self.exit_code = 128 + signal_number
+
+
+def did_you_mean(word: str, options: Iterable[str]) -> str:
+    """Return " Did you mean 'reach'?" for the option closest to `word`, or an empty string."""
+    close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.5)
+    return f" Did you mean {close[0]!r}?" if close else ""

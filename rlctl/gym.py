@@ -1,0 +1,19 @@
+"""Registers every installed task with Gymnasium when imported; no plugin is imported.
+
+`gymnasium.make("rlctl.gym:rlctl/reach-v0")`, or `--gym-packages rlctl.gym` in other tools.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+from rlctl import registry
+
+for _entry in registry.installed():
+    if _entry.problem is None:
+        gymnasium.register(
+            id=f"rlctl/{_entry.name}-v0",
+            entry_point="rlctl.registry:make",
+            kwargs={"task": _entry.name},
+            disable_env_checker=True,
+        )

@@ -1,0 +1,58 @@
+"""Where results and messages go: results to stdout, everything else to stderr."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_PIPED_WIDTH = 120
+
+
+@functools.cache
+def results() -> TextIO:
+    """Return the stream of results: the stdout this process was started with.
+
+    From then on file descriptor 1 points to stderr, so that what PyBullet, a plugin or a worker prints cannot
+    mix with a result.
+    """
+    sys.stdout.flush()
+    stream = os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace")
+    os.dup2(2, 1)
+    return stream
+
+
+@functools.cache
+def out() -> Console:
+    """Return the console for results."""
+    return _console(results())
+
+
+@functools.cache
+def err() -> Console:
+    """Return the console for progress, logs and errors."""
+    return _console(sys.stderr)
+
+
+def _console(stream: TextIO) -> Console:
+    from rich.console import Console
+
+    width = None if stream.isatty() else _PIPED_WIDTH
+    return Console(file=stream, highlight=False, width=width, soft_wrap=not stream.isatty())
+
+
+def write_result_json(target: str, content: Any) -> None:
+    """Write a result as JSON to a file, or to stdout for `-`."""
+    if target == "-":
+        results().write(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        results().flush()
+        return
+    from rlctl.run import files
+
+    files.write_json(Path(target), content)

@@ -1,0 +1,1 @@
+"""Many environments, fast and reproducible; numpy only."""

@@ -1,0 +1,43 @@
+"""Episode addresses: every episode's seed follows from (run seed, stream, environment, episode)."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+import numpy as np
+
+
+class Stream(enum.IntEnum):
+    """What episodes are for; streams never share a seed."""
+
+    TRAIN = 0
+    EVAL_IN_TRAINING = 1
+    EVAL = 2
+    REPLAY = 3
+    VERIFY = 4
+    CHECK = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeAddress:
+    """Names one episode of one run; enough, with the actions, to live it again."""
+
+    run_seed: int
+    stream: Stream
+    env_index: int
+    episode: int
+
+    @property
+    def seed(self) -> int:
+        """The seed given to `env.reset`, in [0, 2**31)."""
+        sequence = np.random.SeedSequence(
+            self.run_seed, spawn_key=(int(self.stream), self.env_index, self.episode)
+        )
+        # Some environments hand the seed to a 32-bit signed generator.
+        return int(sequence.generate_state(1)[0]) >> 1
+
+
+def episode_seeds(run_seed: int, stream: Stream, episodes: int) -> list[int]:
+    """Return the seeds of a numbered list of episodes, the same whatever environment lives each of them."""
+    return [EpisodeAddress(run_seed, stream, 0, index).seed for index in range(episodes)]

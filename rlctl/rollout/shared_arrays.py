@@ -1,0 +1,90 @@
+"""Arrays that the main process and its workers see at once, in one anonymous file."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+Fields = dict[str, tuple[tuple[int, ...], np.dtype[Any]]]
+
+_ALIGNMENT = 64  # [bytes], a cache line: two workers never write one
+SINGLE = ""
+"""The key of an observation that is not a dictionary."""
+
+
+def observation_fields(space: spaces.Space[Any]) -> Fields:
+    """Return shape and dtype per observation key; `SINGLE` where the space is no Dict."""
+    if isinstance(space, spaces.Dict):
+        return {key: _leaf(value) for key, value in space.spaces.items()}
+    return {SINGLE: _leaf(space)}
+
+
+def _leaf(space: spaces.Space[Any]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    if space.shape is None or space.dtype is None:
+        raise TypeError(f"{type(space).__name__} inside a Dict space is not supported")
+    return space.shape, np.dtype(space.dtype)
+
+
+class SharedArrays:
+    """Named arrays over one memory map: per environment a row in each.
+
+    The file has no name, so nothing is left behind whatever kills the processes.
+    """
+
+    def __init__(
+        self,
+        descriptor: int,
+        n_envs: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        terms: int,
+    ) -> None:
+        observation = observation_fields(observation_space)
+        layout: Fields = {
+            "action": _leaf(action_space),
+            "reward": ((), np.dtype(np.float64)),
+            "terminated": ((), np.dtype(np.bool_)),
+            "truncated": ((), np.dtype(np.bool_)),
+            "next_seed": ((), np.dtype(np.int64)),
+            "terms": ((terms,), np.dtype(np.float64)),
+        }
+        for key, field in observation.items():
+            layout[f"observation/{key}"] = field
+            layout[f"final/{key}"] = field
+        size = 0
+        offsets = {}
+        for name, (shape, dtype) in layout.items():
+            offsets[name] = size
+            bytes_needed = n_envs * int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+            size += -(-max(bytes_needed, 1) // _ALIGNMENT) * _ALIGNMENT
+        os.ftruncate(descriptor, size)
+        self._map = mmap.mmap(descriptor, size)
+        arrays: dict[str, NDArray[Any]] = {
+            name: np.ndarray((n_envs, *shape), dtype, buffer=self._map, offset=offsets[name])
+            for name, (shape, dtype) in layout.items()
+        }
+        self.action = arrays["action"]
+        self.reward = arrays["reward"]
+        self.terminated = arrays["terminated"]
+        self.truncated = arrays["truncated"]
+        self.next_seed = arrays["next_seed"]
+        """Seed of the episode to start when the present one ends; negative: do not start one."""
+        self.terms = arrays["terms"]
+        """Raw reward terms of the last step, shape (n_envs, terms)."""
+        self.observation = {key: arrays[f"observation/{key}"] for key in observation}
+        self.final = {key: arrays[f"final/{key}"] for key in observation}
+        """The observation an episode ended with, where one ended in the last step."""
+
+
+def anonymous_file() -> int:
+    """Return the descriptor of a new file without a name."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("rlctl-workers")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())

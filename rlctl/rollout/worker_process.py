@@ -1,0 +1,235 @@
+"""What runs in a worker: a few environments, stepped in turn. Started by `workers.py`; imports no torch.
+
+Messages are JSON. The main process sends a command; the worker answers once, with `error` if one was raised, and
+with the episodes that ended. Observations, actions, rewards and flags travel in shared memory.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import sys
+import threading
+import traceback
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from rlctl import registry
+from rlctl.errors import RlctlError
+from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
+from rlctl.run.env_info import describe
+
+
+class _Episode:
+    """One environment and the episode it is in."""
+
+    def __init__(self, env: Any, index: int) -> None:
+        self.env = env
+        self.index = index
+        self.seed = -1
+        self.step = 0
+        self.active = False
+        self._return = 0.0
+        self._sums: dict[str, float] = {}
+
+    def start(self, seed: int) -> Any:
+        self.seed, self.step, self.active = seed, 0, True
+        self._return, self._sums = 0.0, {}
+        observation, _ = self.env.reset(seed=seed)
+        return observation
+
+    def count(self, reward: float, info: dict[str, Any]) -> None:
+        self._return += reward
+        sums = self._sums
+        for name, value in info.get("reward_terms", {}).items():
+            sums[name] = sums.get(name, 0.0) + value
+
+    def summary(self, info: dict[str, Any]) -> dict[str, Any]:
+        success = info.get("is_success")
+        distance = info.get("metrics", info).get("distance")
+        return {
+            "env": self.index,
+            "seed": self.seed,
+            "return": self._return,
+            "length": self.step,
+            "success": None if success is None else bool(success),
+            "terms": {name: float(value) for name, value in self._sums.items()},
+            "final_distance": None if distance is None else float(distance),
+        }
+
+
+class _Worker:
+    def __init__(self, descriptor: int, spec: registry.EnvSpec, first: int, count: int, total: int) -> None:
+        envs = [spec.make() for _ in range(count)]
+        self.info = describe(envs[0])
+        self.first = first
+        self.term_names = list(self.info.reward_weights)
+        self.episodes = [_Episode(env, first + i) for i, env in enumerate(envs)]
+        space = envs[0].observation_space
+        self.fields = observation_fields(space)
+        self.space = space
+        self.action_space = envs[0].action_space
+        self.discrete = isinstance(self.action_space, spaces.Discrete)
+        self.total = total
+        self.descriptor = descriptor
+        self.arrays: SharedArrays
+
+    def attach(self) -> None:
+        self.arrays = SharedArrays(
+            self.descriptor, self.total, self.space, self.action_space, len(self.term_names)
+        )
+
+    def store(self, place: dict[str, Any], episode: _Episode, observation: Any) -> None:
+        parts = observation if isinstance(observation, dict) else {SINGLE: observation}
+        if parts.keys() != place.keys():
+            raise ValueError(f"observation has the keys {sorted(parts)}, the space has {sorted(place)}")
+        for key, value in parts.items():
+            row = place[key]
+            shape, _ = self.fields[key]
+            value = np.asarray(value)
+            if value.shape != shape:
+                what = f"observation {key!r}" if key else "observation"
+                raise ValueError(f"{what} has shape {value.shape}, the space has {shape}")
+            if value.dtype.kind == "f" and not math.isfinite(value.sum()) and not np.isfinite(value).all():
+                bad = int(np.flatnonzero(~np.isfinite(value))[0])
+                raise ValueError(f"observation is not finite: element {bad} is {value.ravel()[bad]}")
+            row[episode.index] = value
+
+    def reset(self, pairs: list[tuple[int, int]]) -> list[dict[str, Any]]:
+        for index, seed in pairs:
+            episode = self.episodes[index - self.first]
+            if seed < 0:
+                episode.active = False
+            else:
+                self.guarded(episode, lambda e=episode, s=seed: self.begin(e, s))  # type: ignore[misc]
+        return []
+
+    def begin(self, episode: _Episode, seed: int) -> None:
+        self.store(self.arrays.observation, episode, episode.start(seed))
+
+    def step(self) -> list[dict[str, Any]]:
+        ended: list[dict[str, Any]] = []
+        for episode in self.episodes:
+            if episode.active:
+                self.guarded(episode, lambda e=episode: self.step_one(e, ended))  # type: ignore[misc]
+        return ended
+
+    def step_one(self, episode: _Episode, ended: list[dict[str, Any]]) -> None:
+        arrays, index = self.arrays, episode.index
+        action = arrays.action[index]
+        episode.step += 1
+        observation, reward, terminated, truncated, info = episode.env.step(
+            int(action) if self.discrete else action.copy()
+        )
+        reward = float(reward)
+        if not math.isfinite(reward):
+            raise ValueError(f"reward is {reward}")
+        episode.count(reward, info)
+        arrays.reward[index] = reward
+        arrays.terminated[index] = terminated
+        arrays.truncated[index] = truncated
+        if self.term_names:
+            arrays.terms[index] = list(info["metrics"].values())
+        if not (terminated or truncated):
+            self.store(arrays.observation, episode, observation)
+            return
+        self.store(arrays.final, episode, observation)
+        ended.append(episode.summary(info))
+        seed = int(arrays.next_seed[index])
+        if seed >= 0:
+            self.begin(episode, seed)
+        else:
+            episode.active = False
+
+    def guarded(self, episode: _Episode, call: Any) -> None:
+        try:
+            call()
+        except BaseException as error:  # a plugin may raise anything, SystemExit too
+            raise _EpisodeFailed(episode) from error
+
+
+class _EpisodeFailed(Exception):
+    def __init__(self, episode: _Episode) -> None:
+        super().__init__()
+        self.where = {"env": episode.index, "seed": episode.seed, "step": episode.step}
+
+
+def _error(error: BaseException) -> dict[str, Any]:
+    where = error.where if isinstance(error, _EpisodeFailed) else {}
+    cause = error.__cause__ if isinstance(error, _EpisodeFailed) and error.__cause__ else error
+    ours = isinstance(cause, RlctlError)
+    return {
+        "message": str(cause) if ours else f"{type(cause).__name__}: {cause}",
+        "kind": type(cause).__name__ if ours else None,
+        "traceback": "".join(traceback.format_exception(cause)),
+        **where,
+    }
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent ends, even while an environment is stuck in a step."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        if hasattr(os, "pidfd_open"):
+            import select
+
+            try:
+                select.select([os.pidfd_open(parent)], [], [])
+            except ProcessLookupError:
+                pass
+        else:
+            import time
+
+            while os.getppid() == parent:
+                time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def main() -> None:
+    """Serve commands until the connection closes. Arguments: connection, descriptor, and the job as JSON."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the main process decides
+    _end_with_parent()
+    connection = Connection(int(sys.argv[1]))
+    job = json.loads(sys.argv[3])
+
+    def answer(**content: Any) -> None:
+        connection.send_bytes(json.dumps(content).encode())
+
+    try:
+        spec = registry.EnvSpec(**job["spec"])
+        worker = _Worker(int(sys.argv[2]), spec, job["first"], job["count"], job["total"])
+    except BaseException as error:
+        answer(error=_error(error))
+        return
+    answer(info=worker.info.model_dump())
+    while True:
+        try:
+            message = connection.recv_bytes()
+        except (EOFError, OSError):
+            break
+        try:
+            if message == b"step":
+                ended = worker.step()
+            elif message == b"attach":
+                worker.attach()
+                ended = []
+            else:
+                ended = worker.reset(json.loads(message))
+        except BaseException as error:
+            answer(error=_error(error))
+            continue
+        if ended:
+            answer(ended=ended)
+        else:
+            connection.send_bytes(b"")
+    for episode in worker.episodes:
+        episode.env.close()
+

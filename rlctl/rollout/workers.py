@@ -1,0 +1,277 @@
+"""Many environments on few processes: W workers, each stepping K environments in turn.
+
+Observations, actions, rewards and flags are in shared memory; pipes only say "go", "done", and which episodes
+ended. Workers are fresh interpreters, never forks, with one thread each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl import errors
+from rlctl.errors import RlctlError, TaskError
+from rlctl.registry import EnvSpec
+from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
+from rlctl.run.env_info import EnvInfo
+
+Observations = NDArray[Any] | dict[str, NDArray[Any]]
+
+# Started this way a worker finds what its parent finds, and the caller's script is not run again.
+_BOOTSTRAP = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[3])['sys_path']; "
+    "from rlctl.rollout.worker_process import main; main()"
+)
+
+BUILD_TIMEOUT_S = 300.0
+DEFAULT_TIMEOUT_S = 60.0
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeResult:
+    """How an episode ended. `terms` are sums over the episode, weighted: they add up to the return."""
+
+    env: int
+    seed: int
+    total_reward: float
+    length: int
+    success: bool | None
+    terms: dict[str, float]
+    final_distance: float | None
+
+
+class Workers:
+    """`n_envs` environments of one kind on `n_workers` processes (default: the cores).
+
+    Building starts at once and is waited for by the first use, so that a caller can do its own slow imports
+    meanwhile. Errors in an environment raise `TaskError` with the episode's seed and step; a worker that dies or
+    does not answer within `timeout_s` does too. After an error the workers are gone.
+    """
+
+    def __init__(
+        self,
+        spec: EnvSpec,
+        n_envs: int,
+        *,
+        n_workers: int | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> None:
+        self.n_envs = n_envs
+        self.timeout_s = timeout_s
+        self._spec = spec
+        n_workers = min(n_envs, n_workers or available_cores())
+        bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
+        self._ranges = list(zip(bounds[:-1], bounds[1:], strict=True))
+        self._memory = anonymous_file()
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._connections: list[Connection] = []
+        self._ready = False
+        self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
+        try:
+            for first, last in self._ranges:
+                self._start(first, last - first)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, first: int, count: int) -> None:
+        ours, theirs = socket.socketpair()
+        job = {
+            "spec": dataclasses.asdict(self._spec),
+            "first": first,
+            "count": count,
+            "total": self.n_envs,
+            "sys_path": sys.path,
+        }
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+        with theirs:
+            process = subprocess.Popen(
+                [sys.executable, "-c", _BOOTSTRAP, str(theirs.fileno()), str(self._memory), json.dumps(job)],
+                pass_fds=(theirs.fileno(), self._memory),
+                stdin=subprocess.DEVNULL,
+                stdout=2,  # results own stdout; what an environment prints goes to stderr
+                env=environment,
+            )
+        self._processes.append(process)
+        self._connections.append(Connection(ours.detach()))
+
+    @property
+    def info(self) -> EnvInfo:
+        """What the environments are; waits until they are built."""
+        self._wait_until_built()
+        return self._info
+
+    @property
+    def arrays(self) -> SharedArrays:
+        """The shared arrays, a row per environment; waits until the environments are built."""
+        self._wait_until_built()
+        return self._arrays
+
+    def _wait_until_built(self) -> None:
+        if self._ready:
+            return
+        answers = self._answers(range(len(self._processes)), max(BUILD_TIMEOUT_S, self.timeout_s), "being built")
+        self._info = EnvInfo.model_validate(answers[0]["info"])
+        observation_space, action_space = self._info.spaces()
+        terms = len(self._info.reward_weights)
+        self._arrays = SharedArrays(self._memory, self.n_envs, observation_space, action_space, terms)
+        self._ready = True
+        self._send_all(b"attach")
+        self._answers(range(len(self._processes)), self.timeout_s, "attaching")
+
+    def reset(self, seeds: dict[int, int]) -> None:
+        """Start an episode in some environments: environment index -> seed; a negative one lets it rest."""
+        self._wait_until_built()
+        by_worker: dict[int, list[tuple[int, int]]] = {}
+        for index, seed in seeds.items():
+            by_worker.setdefault(self._owner[index], []).append((index, seed))
+        for worker, pairs in by_worker.items():
+            self._send(worker, json.dumps(pairs).encode())
+        self._answers(by_worker, self.timeout_s, "resetting")
+
+    def step(self) -> list[EpisodeResult]:
+        """Step every active environment with the row of `arrays.action`; return the episodes that ended.
+
+        An environment whose episode ended starts the one of `arrays.next_seed`, or rests if that is negative.
+        """
+        self._send_all(b"step")
+        answers = self._answers(range(len(self._processes)), self.timeout_s, "stepping")
+        ended = []
+        for answer in answers.values():
+            for each in answer.get("ended", ()):
+                ended.append(
+                    EpisodeResult(
+                        each["env"],
+                        each["seed"],
+                        each["return"],
+                        each["length"],
+                        each["success"],
+                        each["terms"],
+                        each["final_distance"],
+                    )
+                )
+        return ended
+
+    def observations(self, rows: Any = slice(None)) -> Observations:
+        """Return a copy of the current observations, shape (rows, ...) or a dict of such."""
+        return _picked(self.arrays.observation, rows)
+
+    def final_observations(self, rows: Any) -> Observations:
+        """Return a copy of the last observations of episodes that just ended."""
+        return _picked(self.arrays.final, rows)
+
+    def _send_all(self, message: bytes) -> None:
+        for worker in range(len(self._processes)):
+            self._send(worker, message)
+
+    def _send(self, worker: int, message: bytes) -> None:
+        try:
+            self._connections[worker].send_bytes(message)
+        except OSError:
+            self._fail(self._death(worker, "idle"))
+
+    def _answers(self, workers: Any, timeout_s: float, doing: str) -> dict[int, Any]:
+        """Wait for one answer from each of some workers."""
+        pending = {self._connections[worker]: worker for worker in workers}
+        answers: dict[int, Any] = {}
+        deadline = time.monotonic() + timeout_s
+        while pending:
+            ready = wait(list(pending), timeout=max(0.0, deadline - time.monotonic()))
+            if not ready:
+                self._fail(self._hang(list(pending.values()), timeout_s, doing))
+            for connection in ready:
+                worker = pending.pop(connection)  # type: ignore[arg-type]
+                try:
+                    content = connection.recv_bytes()  # type: ignore[union-attr]
+                except (EOFError, OSError):
+                    self._fail(self._death(worker, doing))
+                answer = json.loads(content) if content else {}
+                if "error" in answer:
+                    self._fail(self._raised(answer["error"]))
+                answers[worker] = answer
+        return answers
+
+    def _fail(self, error: RlctlError) -> Any:
+        self.close(grace_s=0.0)
+        raise error from None
+
+    def _raised(self, error: dict[str, Any]) -> RlctlError:
+        message = error["message"]
+        if "env" in error:
+            message += (
+                f"\nin environment {error['env']}, episode seed {error['seed']}, step {error['step']}; "
+                f"to see it alone: rlctl check-env {self._spec.task}"
+            )
+        kind = getattr(errors, error["kind"], TaskError) if error["kind"] else TaskError
+        if kind is TaskError and self._spec.task not in message:
+            message = f"task {self._spec.task!r}: {message}"
+        details = None if error["kind"] else error["traceback"]
+        result: RlctlError = kind(message, details=details)
+        return result
+
+    def _death(self, worker: int, doing: str) -> TaskError:
+        try:
+            code = self._processes[worker].wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            code = 0
+        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        return TaskError(
+            f"task {self._spec.task!r}: worker {worker} died while {doing} ({how}); it ran environments "
+            f"{self._ranges[worker][0]}-{self._ranges[worker][1] - 1}"
+        )
+
+    def _hang(self, workers: list[int], timeout_s: float, doing: str) -> TaskError:
+        named = ", ".join(f"{self._ranges[w][0]}-{self._ranges[w][1] - 1}" for w in workers)
+        return TaskError(
+            f"task {self._spec.task!r}: environments {named} gave no answer for {timeout_s:g} s while {doing}; "
+            "if a step may take that long, raise --env-timeout"
+        )
+
+    def close(self, grace_s: float = 2.0) -> None:
+        """End the workers; those that do not end within `grace_s` are killed. A second call does nothing."""
+        for connection in self._connections:
+            connection.close()
+        self._connections = []
+        deadline = time.monotonic() + grace_s
+        for process in self._processes:
+            try:
+                process.wait(timeout=max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._processes = []
+        if self._memory >= 0:
+            os.close(self._memory)
+            self._memory = -1
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _picked(arrays: dict[str, NDArray[Any]], rows: Any) -> Observations:
+    if SINGLE in arrays:
+        return arrays[SINGLE][rows].copy()
+    return {key: array[rows].copy() for key, array in arrays.items()}
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+

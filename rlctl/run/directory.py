@@ -1,0 +1,205 @@
+"""The run folder: the only place that spells its file names."""
+
+from __future__ import annotations
+
+import datetime
+import fcntl
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rlctl import registry
+from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.run import files
+from rlctl.run.recipe import Recipe, read, validate
+
+ROOT = Path("runs")
+
+
+class RunDirectory:
+    """What a training wrote, and where."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def recipe_file(self) -> Path:
+        return self.path / "recipe.yaml"
+
+    @property
+    def status_file(self) -> Path:
+        return self.path / "run.json"
+
+    @property
+    def metrics_file(self) -> Path:
+        return self.path / "metrics.csv"
+
+    @property
+    def evals_file(self) -> Path:
+        return self.path / "evals.csv"
+
+    @property
+    def best_policy(self) -> Path:
+        return self.path / "policies" / "best.safetensors"
+
+    @property
+    def last_policy(self) -> Path:
+        return self.path / "policies" / "last.safetensors"
+
+    @property
+    def episodes(self) -> Path:
+        return self.path / "episodes"
+
+    @property
+    def tensorboard(self) -> Path:
+        return self.path / "tensorboard"
+
+    @property
+    def onnx_file(self) -> Path:
+        return self.path / "exports" / "policy.onnx"
+
+    def checkpoint(self, steps: int) -> Path:
+        """Return the folder of the checkpoint at a training step."""
+        return self.path / "checkpoints" / f"{steps:09d}"
+
+    def checkpoints(self) -> list[Path]:
+        """Return the folders of the complete checkpoints, oldest first."""
+        folder = self.path / "checkpoints"
+        if not folder.is_dir():
+            return []
+        return sorted(each for each in folder.iterdir() if each.name.isdigit())
+
+    def episode_file(self, number: int) -> Path:
+        """Return the file of a recorded episode."""
+        return self.episodes / f"{number:06d}.npz"
+
+    def next_episode_number(self) -> int:
+        """Return the number after the highest one there is."""
+        numbers = [int(each.stem) for each in self.episodes.glob("*.npz") if each.stem.isdigit()]
+        return max(numbers, default=-1) + 1
+
+    def recipe(self) -> Recipe:
+        """Read the resolved recipe."""
+        return validate(read(self.recipe_file), str(self.recipe_file))
+
+    def status(self) -> dict[str, Any]:
+        """Read `run.json`."""
+        status = files.read_json(self.status_file)
+        if not isinstance(status, dict) or "task" not in status:
+            raise ArtifactError(f"{self.status_file}: not a run of rlctl: it names no task")
+        return status
+
+    def write_status(self, changes: Mapping[str, Any]) -> None:
+        """Put some values into `run.json`."""
+        known = files.read_json(self.status_file) if self.status_file.exists() else {}
+        files.write_json(self.status_file, {**known, **changes})
+
+    def policy_file(self, which: str = "best") -> Path:
+        """Return the policy `best`, `last`, or of a checkpoint's step; raises `ArtifactError` if there is none."""
+        if which in ("best", "last"):
+            file = self.best_policy if which == "best" else self.last_policy
+            if not file.is_file():
+                hint = "train longer, or use --checkpoint last" if which == "best" else "it saved none"
+                raise ArtifactError(f"{self.path}: no {which} policy yet; {hint}")
+            return file
+        if not which.isdigit():
+            raise UsageError(f"--checkpoint {which!r}: give best, last, or the step of a checkpoint")
+        file = self.checkpoint(int(which)) / "policy.safetensors"
+        if not file.is_file():
+            steps = ", ".join(str(int(each.name)) for each in self.checkpoints())
+            raise ArtifactError(f"{self.path}: no checkpoint at step {which}; there are: {steps or 'none'}")
+        return file
+
+    def lock(self) -> RunLock:
+        """Claim the folder for writing until the lock is released or the process ends."""
+        return RunLock(self.path)
+
+
+class RunLock:
+    """Keeps a second process from writing a run; the system lets go of it when the process ends, however it ends."""
+
+    def __init__(self, folder: Path) -> None:
+        self._descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            owner = os.read(self._descriptor, 100).decode(errors="replace").strip()
+            os.close(self._descriptor)
+            raise UsageError(f"{folder}: another process is writing this run ({owner or 'unknown'})") from None
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, f"pid {os.getpid()} on {os.uname().nodename}".encode(), 0)
+
+    def release(self) -> None:
+        os.close(self._descriptor)
+
+
+def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
+    """Make a new run folder, `<root>/<task>/<time>_s<seed>`, and point `<root>/latest` to it."""
+    now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder = root / registry.slug(task)
+    for attempt in range(1000):
+        name = f"{now}_s{seed}" + (f"_{attempt}" if attempt else "")
+        try:
+            (folder / name).mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ArtifactError(f"{folder}: cannot make a run folder: {error.strerror}") from None
+        _point_latest_to(root, folder / name)
+        return RunDirectory(folder / name)
+    raise ArtifactError(f"{folder}: cannot make a run folder")
+
+
+def _point_latest_to(root: Path, run: Path) -> None:
+    beside = root / f".latest.{os.getpid()}"
+    try:
+        beside.unlink(missing_ok=True)
+        beside.symlink_to(run.relative_to(root))
+        beside.replace(root / "latest")
+    except OSError:  # no links on this file system; runs are found by time without it
+        beside.unlink(missing_ok=True)
+
+
+def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
+    """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing."""
+    if text is None or text == "latest":
+        newest = _newest(root)
+        if newest is None:
+            raise ArtifactError(f"no run yet under {root.resolve()}; train one: rlctl train reach")
+        return newest
+    if (Path(text) / "run.json").is_file():
+        return RunDirectory(Path(text))
+    folder = root / registry.slug(text)
+    if (newest := _newest(folder, depth=1)) is not None:
+        return newest
+    if Path(text).is_dir():
+        raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
+    names = [each.name for each in root.iterdir() if each.is_dir()] if root.is_dir() else []
+    if registry.find(text):
+        raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}")
+    raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{did_you_mean(text, names)}")
+
+
+def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> tuple[Path, RunDirectory | None]:
+    """Return the policy file for a user's word, which may be a policy file itself, and its run if it has one."""
+    if text is not None and Path(text).suffix in (".safetensors", ".onnx"):
+        path = Path(text)
+        if not path.is_file():
+            raise ArtifactError(f"{path}: no such file")
+        owner = path.parent.parent
+        return path, RunDirectory(owner) if (owner / "run.json").is_file() else None
+    run = find_run(text, root)
+    return run.policy_file(which), run
+
+
+_RUN_NAME = re.compile(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_s\d+(_\d+)?$")
+
+
+def _newest(root: Path, depth: int = 2) -> RunDirectory | None:
+    pattern = "*/run.json" if depth == 1 else "*/*/run.json"
+    runs = [file.parent for file in root.glob(pattern) if _RUN_NAME.match(file.parent.name)]
+    if not runs:
+        return None
+    return RunDirectory(max(runs, key=lambda run: (run.name[:19], (run / "run.json").stat().st_mtime_ns)))

@@ -1,0 +1,102 @@
+"""Recorded episodes: `.npz` files with everything needed to live one again, bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydantic
+from numpy.typing import NDArray
+
+from rlctl.errors import ArtifactError
+from rlctl.registry import EnvSpec
+from rlctl.run import files
+
+FORMAT = 1
+Observations = NDArray[Any] | dict[str, NDArray[Any]]
+
+
+class EpisodeInfo(pydantic.BaseModel):
+    """What an episode was: its environment, its seed, how it ended."""
+
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+    format: int = FORMAT
+    task: str
+    task_parameters: dict[str, Any] = {}
+    reward_weights: dict[str, float] = {}
+    randomize: bool = False
+    events: dict[str, dict[str, Any]] = {}
+    frame_stack: int = 1
+    stage: int = 0
+    """Level of the curriculum."""
+    seed: int
+    policy: str = ""
+    """What chose the actions, for people: a file name and a training step."""
+    success: bool | None = None
+    total_reward: float
+    term_names: list[str] = []
+    versions: dict[str, str] = {}
+
+    def env_spec(self) -> EnvSpec:
+        """Return what the episode was lived in."""
+        return EnvSpec(
+            self.task, self.task_parameters, self.reward_weights, self.randomize, self.events, self.frame_stack
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedEpisode:
+    """An episode of T steps."""
+
+    info: EpisodeInfo
+    actions: NDArray[Any]
+    """Shape (T, ...)."""
+    observations: Observations
+    """Shape (T + 1, ...), or a dict of such: the first is of the reset."""
+    rewards: NDArray[np.float64]
+    """Shape (T,)."""
+    terms: NDArray[np.float64]
+    """Raw reward terms in the order of `info.term_names`, shape (T, terms)."""
+
+
+def save_episode(path: Path, episode: RecordedEpisode) -> None:
+    """Write an episode, whole or not at all."""
+    observations = episode.observations
+    if isinstance(observations, dict):
+        parts = {f"observations/{key}": value for key, value in observations.items()}
+    else:
+        parts = {"observations": observations}
+    files.write_npz(
+        path,
+        {
+            "info": np.array(episode.info.model_dump_json()),
+            "actions": episode.actions,
+            "rewards": episode.rewards,
+            "terms": episode.terms,
+            **parts,
+        },
+    )
+
+
+def load_episode(path: Path) -> RecordedEpisode:
+    """Read an episode; raises `ArtifactError` if the file is missing, damaged, not ours or of a newer format."""
+    arrays = files.read_npz(path)
+    if not {"info", "actions", "rewards", "terms"} <= arrays.keys():
+        raise ArtifactError(f"{path}: not an episode of rlctl: it has no info, actions, rewards and terms")
+    try:
+        data = json.loads(str(arrays["info"]))
+        if isinstance(data.get("format"), int) and data["format"] > FORMAT:
+            raise ArtifactError(f"{path}: episode format {data['format']} is newer than this rlctl can read ({FORMAT})")
+        info = EpisodeInfo.model_validate(data)
+    except (ValueError, AttributeError, pydantic.ValidationError) as error:
+        raise ArtifactError(f"{path}: its description is damaged: {str(error).splitlines()[0]}") from None
+    prefix = "observations/"
+    observations: Observations = arrays.get(
+        "observations",
+        {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)},  # type: ignore[arg-type]
+    )
+    return RecordedEpisode(info, arrays["actions"], observations, arrays["rewards"], arrays["terms"])

@@ -1,0 +1,225 @@
+"""Policy files, and policies to run: numpy in, numpy out.
+
+A policy is a `.safetensors` file: tensors, normalisation, and as JSON everything needed to use it. The format is
+read without pickle. An exported `.onnx` file is a policy too.
+"""
+
+from __future__ import annotations
+
+import abc
+import json
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydantic
+from numpy.typing import NDArray
+
+import rlctl
+from rlctl.errors import ArtifactError
+from rlctl.registry import EnvSpec
+from rlctl.run import files
+from rlctl.run.env_info import EnvInfo
+
+FORMAT = 1
+ROWS = 64
+"""Every forward pass has this many rows: the last bit of a result depends on the size of the batch, and an episode
+must not depend on how many others run beside it."""
+
+Observations = NDArray[Any] | dict[str, NDArray[Any]]
+State = tuple[NDArray[np.float32], ...]
+"""Recurrent state: arrays of shape (layers, rows, size)."""
+
+
+class PolicyInfo(pydantic.BaseModel):
+    """Everything about a policy but its numbers."""
+
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+    format: int = FORMAT
+    algo: str
+    policy: str
+    """SB3's name of the policy class: MlpPolicy, CnnPolicy, MultiInputPolicy, MlpLstmPolicy, ..."""
+    policy_kwargs: dict[str, Any] = {}
+    clip_observation: float | None = None
+    """Clip of normalised observations; None where observations are not normalised."""
+    normalized_keys: list[str] = []
+    """Which entries of a dict observation are normalised."""
+    env: EnvInfo
+    task: str
+    task_parameters: dict[str, Any] = {}
+    reward_weights: dict[str, float] = {}
+    randomize: bool = False
+    events: dict[str, dict[str, Any]] = {}
+    frame_stack: int = 1
+    training_steps: int = 0
+    versions: dict[str, str] = {}
+
+    def env_spec(self) -> EnvSpec:
+        """Return what this policy was trained on."""
+        return EnvSpec(
+            self.task, self.task_parameters, self.reward_weights, self.randomize, self.events, self.frame_stack
+        )
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    found = {"python": platform.python_version(), "rlctl": rlctl.__version__}
+    for name in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def save_policy(path: Path, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
+    """Write a policy file, whole or not at all.
+
+    `tensors` has the network's under `policy/`, and mean and variance per observation key under `normalize/`.
+    """
+    from safetensors.numpy import save
+
+    contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    files.write_bytes(path, save(contiguous, metadata={"rlctl": info.model_dump_json()}))
+
+
+def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
+    """Read a policy file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise ArtifactError(f"{path}: no such file")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
+        raise ArtifactError(f"{path}: damaged, or not a .safetensors file: {error}") from None
+    return parse_info(metadata.get("rlctl"), path), tensors
+
+
+def parse_info(text: str | None, path: Path) -> PolicyInfo:
+    """Check the metadata of a policy; `path` is for the error."""
+    if text is None:
+        raise ArtifactError(f"{path}: not an rlctl policy: its metadata has no 'rlctl' entry")
+    try:
+        data = json.loads(text)
+        if isinstance(data, dict) and isinstance(data.get("format"), int) and data["format"] > FORMAT:
+            raise ArtifactError(
+                f"{path}: policy format {data['format']} is newer than this rlctl {rlctl.__version__} can read "
+                f"({FORMAT}); upgrade rlctl"
+            )
+        return PolicyInfo.model_validate(data)
+    except (ValueError, pydantic.ValidationError) as error:
+        raise ArtifactError(f"{path}: its rlctl metadata is damaged: {str(error).splitlines()[0]}") from None
+
+
+class Policy(abc.ABC):
+    """A policy that can be run."""
+
+    def __init__(self, info: PolicyInfo) -> None:
+        self.info = info
+        self.observation_space, self.action_space = info.env.spaces()
+        self._own: BatchActor | None = None
+        self._starts = True
+
+    @abc.abstractmethod
+    def forward(self, observations: Observations, state: State | None, deterministic: bool) -> tuple[NDArray[Any], State | None]:
+        """Return the actions for `ROWS` observations, as the environment takes them, and the next state."""
+
+    @abc.abstractmethod
+    def initial_state(self) -> State | None:
+        """Return the recurrent state of `ROWS` episodes that begin; None if the policy has none."""
+
+    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
+        """Return the action for one observation.
+
+        A recurrent policy remembers; call `reset` when an episode begins.
+        """
+        if self._own is None:
+            self._own = BatchActor(self, 1)
+        self._own.deterministic = deterministic
+        if isinstance(observation, dict):
+            batch: Observations = {key: np.asarray(value)[None] for key, value in observation.items()}
+            shapes = {key: value.shape[1:] for key, value in batch.items()}
+            expected: Any = {key: space.shape for key, space in self.observation_space.spaces.items()}  # type: ignore[attr-defined]
+        else:
+            batch = np.asarray(observation)[None]
+            shapes, expected = batch.shape[1:], self.observation_space.shape  # type: ignore[assignment]
+        if shapes != expected:
+            raise ValueError(f"observation of shape {shapes}, the policy wants {expected}")
+        action = self._own.act(batch, np.array([0]), np.array([self._starts]))[0]
+        self._starts = False
+        return np.asarray(action)
+
+    def reset(self) -> None:
+        """Begin an episode: forget the recurrent state."""
+        self._starts = True
+
+
+class BatchActor:
+    """Runs a policy for many environments, in forward passes of `ROWS` rows; keeps a recurrent state for each."""
+
+    def __init__(self, policy: Policy, n_envs: int, *, deterministic: bool = True) -> None:
+        self.policy = policy
+        self.deterministic = deterministic
+        initial = policy.initial_state()
+        self._state = None
+        if initial is not None:
+            self._state = tuple(np.repeat(part[:, :1], n_envs, axis=1) for part in initial)
+
+    def act(self, observations: Observations, rows: NDArray[np.int64], starts: NDArray[np.bool_]) -> NDArray[Any]:
+        """Return an action per row; see `rollout.collect.Actor`."""
+        if self._state is not None:
+            for part in self._state:
+                part[:, rows[starts]] = 0.0
+        blocks = []
+        for low in range(0, len(rows), ROWS):
+            block = rows[low : low + ROWS]
+            state = None
+            if self._state is not None:
+                state = tuple(_padded(part[:, block], axis=1) for part in self._state)
+            actions, after = self.policy.forward(
+                _map(observations, lambda value, low=low: _padded(value[low : low + ROWS])),  # type: ignore[misc]
+                state,
+                self.deterministic,
+            )
+            if self._state is not None and after is not None:
+                for part, new in zip(self._state, after, strict=True):
+                    part[:, block] = new[:, : len(block)]
+            blocks.append(actions[: len(block)])
+        return np.concatenate(blocks)
+
+
+def _map(observations: Observations, function: Any) -> Observations:
+    if isinstance(observations, dict):
+        return {key: function(value) for key, value in observations.items()}
+    result: NDArray[Any] = function(observations)
+    return result
+
+
+def _padded(values: NDArray[Any], axis: int = 0) -> NDArray[Any]:
+    missing = ROWS - values.shape[axis]
+    if missing == 0:
+        return values
+    shape = list(values.shape)
+    shape[axis] = missing
+    return np.concatenate([values, np.zeros(shape, values.dtype)], axis=axis)
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Load a policy from a `.safetensors` file, or an exported `.onnx` file (torch is then not imported).
+
+    `load_policy(path).predict(observation)` returns the action. Raises `ArtifactError` for a file that is not one.
+    """
+    path = Path(path)
+    if path.suffix == ".onnx":
+        from rlctl.run.onnx_policy import OnnxPolicy
+
+        return OnnxPolicy.load(path)
+    from rlctl.run.torch_policy import TorchPolicy
+
+    return TorchPolicy.load(path)

@@ -1,0 +1,246 @@
+"""Recipes: how to train a task. YAML, typed, every key checked.
+
+A recipe is made from the task's packaged YAML, then `--config`, then `--set` and the command line's own flags.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import pydantic
+from pydantic import Field
+
+from rlctl import registry
+from rlctl.errors import ArtifactError, RecipeError, did_you_mean
+from rlctl.run import yaml_text
+
+Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
+ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
+ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
+
+_DEFAULT_ROLLOUT = 4096  # [steps], all environments together
+
+
+class _Section(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class Normalize(_Section):
+    """Running normalisation, as SB3's VecNormalize does it."""
+
+    observation: bool = True
+    reward: bool = True
+    clip_observation: float = Field(10.0, gt=0)
+    clip_reward: float = Field(10.0, gt=0)
+
+
+class Evaluation(_Section):
+    """Evaluation while training; steps are environment steps, all environments together."""
+
+    every_steps: int | None = Field(None, ge=1)
+    episodes: int = Field(100, ge=1)
+
+
+class Checkpoints(_Section):
+    keep: int = Field(3, ge=1)
+
+
+class Recipe(_Section):
+    """How to train a task. `algo_kwargs` and `policy_kwargs` are SB3's own names."""
+
+    task: dict[str, Any] = {}
+    reward_weights: dict[str, float] = {}
+    randomize: bool = False
+    events: dict[str, dict[str, Any]] = {}
+    algo: Algorithm = "ppo"
+    algo_kwargs: dict[str, Any] = {}
+    policy_kwargs: dict[str, Any] = {}
+    normalize: Normalize | None = None
+    frame_stack: int = Field(1, ge=1)
+    n_envs: int = Field(8, ge=1)
+    total_timesteps: int = Field(300_000, ge=1)
+    seed: int = Field(0, ge=0, lt=2**32)
+    eval: Evaluation = Evaluation()
+    stop_success: float | None = Field(None, gt=0, le=1)
+    checkpoint: Checkpoints = Checkpoints()
+
+    @pydantic.field_validator("algo_kwargs")
+    @classmethod
+    def _in_range(cls, values: dict[str, Any]) -> dict[str, Any]:
+        for name, value in values.items():
+            if name in _RANGES:
+                _RANGES[name].check(name, value)
+        return values
+
+    def env_spec(self, task: str) -> registry.EnvSpec:
+        """Return what the environments of this recipe are made from."""
+        return registry.EnvSpec(
+            task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack
+        )
+
+    def to_yaml(self) -> str:
+        """Return the recipe as YAML that is itself valid for `--config`."""
+        return yaml_text.dump(self.model_dump(mode="json"))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Range:
+    """Where a numeric hyperparameter makes sense; `text` values such as SAC's `auto` pass where allowed."""
+
+    low: float
+    high: float = math.inf
+    integer: bool = False
+    text: tuple[str, ...] = ()
+    open_low: bool = False
+
+    def check(self, name: str, value: Any) -> None:
+        if isinstance(value, str) and value.startswith(self.text or ("\0",)):
+            return
+        kind = "a whole number" if self.integer else "a number"
+        good = isinstance(value, int | float) and not isinstance(value, bool)
+        if good and self.integer:
+            good = float(value).is_integer()
+        if not good:
+            raise ValueError(f"{name}: expected {kind}, got {value!r}")
+        if not (self.low < value if self.open_low else self.low <= value) or not value <= self.high:
+            raise ValueError(f"{name}: {value} is not in {self}")
+
+    def __str__(self) -> str:
+        return f"{'(' if self.open_low else '['}{self.low:g}, {self.high:g}]"
+
+
+_COUNT = _Range(1, integer=True)
+_FRACTION = _Range(0, 1)
+_PART = _Range(0, 1, open_low=True)
+_RANGES = {
+    "learning_rate": _Range(0, 1, text=("lin_",), open_low=True),
+    "n_steps": _COUNT,
+    "batch_size": _Range(2, integer=True),
+    "n_epochs": _COUNT,
+    "gamma": _PART,
+    "gae_lambda": _FRACTION,
+    "clip_range": _Range(0, 10, text=("lin_",), open_low=True),
+    "ent_coef": _Range(0, text=("auto",)),
+    "vf_coef": _Range(0),
+    "max_grad_norm": _Range(0, open_low=True),
+    "target_kl": _Range(0, open_low=True),
+    "buffer_size": _COUNT,
+    "learning_starts": _Range(0, integer=True),
+    "gradient_steps": _Range(-1, integer=True),
+    "tau": _PART,
+    "target_update_interval": _COUNT,
+    "policy_delay": _COUNT,
+    "exploration_fraction": _FRACTION,
+    "exploration_initial_eps": _FRACTION,
+    "exploration_final_eps": _FRACTION,
+    "top_quantiles_to_drop_per_net": _Range(0, integer=True),
+}
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read a recipe file as plain data, unchecked."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ArtifactError(f"no recipe file {path}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ArtifactError(f"{path}: cannot be read: {error}") from None
+    content = yaml_text.load(text, str(path))
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise RecipeError(f"{path}: a recipe is a mapping of keys to values, this is a {type(content).__name__}")
+    return content
+
+
+def parse_settings(settings: list[str]) -> dict[str, Any]:
+    """Turn `--set` texts such as `algo_kwargs.gamma=0.97` into a nested mapping."""
+    result: dict[str, Any] = {}
+    for text in settings:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise RecipeError(f"--set {text!r}: write key=value, for example --set task.tolerance=0.02")
+        *path, last = key.strip().split(".")
+        place = result
+        for part in path:
+            place = place.setdefault(part, {})
+            if not isinstance(place, dict):
+                raise RecipeError(f"--set {text!r}: {part!r} has been given a value already")
+        place[last] = yaml_text.load(value, f"--set {key}")
+    return result
+
+
+def resolve(task: str, config: Path | None, settings: Mapping[str, Any]) -> Recipe:
+    """Merge the packaged recipe, `--config` and the command line's settings, and check every key."""
+    packaged_file = registry.recipe_file(task)
+    packaged = read(packaged_file) if packaged_file else {}
+    given = merge(read(config) if config else {}, settings)
+    algo = given.get("algo", packaged.get("algo", "ppo"))
+    if packaged.get("algo", "ppo") != algo:
+        # Hyperparameters of another algorithm would be wrong here, and so would its number of environments.
+        packaged = {k: v for k, v in packaged.items() if k not in _OF_THE_ALGORITHM}
+    merged = merge(packaged, given)
+    source = "recipe" if not config else f"recipe {config}"
+    return with_defaults(validate(merged, source))
+
+
+_OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "normalize", "n_envs", "total_timesteps")
+
+
+def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `below` with the values of `above` put over it, mapping by mapping."""
+    result = dict(below)
+    for key, value in above.items():
+        known = result.get(key)
+        both = isinstance(known, Mapping) and isinstance(value, Mapping)
+        result[key] = merge(known, value) if both else value  # type: ignore[arg-type]
+    return result
+
+
+def validate(values: Mapping[str, Any], source: str) -> Recipe:
+    """Check plain data; raises `RecipeError` that names the key, what was expected, and the closest name."""
+    try:
+        return Recipe.model_validate(values)
+    except pydantic.ValidationError as error:
+        raise RecipeError(f"{source}: {_explain(error.errors()[0])}") from None
+
+
+def _explain(problem: Any) -> str:
+    path = [str(part) for part in problem["loc"]]
+    key = ".".join(path)
+    if problem["type"] == "extra_forbidden":
+        model: type[pydantic.BaseModel] = {"normalize": Normalize, "eval": Evaluation, "checkpoint": Checkpoints}.get(
+            path[0], Recipe
+        )
+        names = list(model.model_fields)
+        return f"no key {key!r}.{did_you_mean(path[-1], names)} Keys here: {', '.join(names)}."
+    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    if problem["type"] == "value_error":
+        return f"{key}.{message}"
+    return f"{key}: {message}, got {problem['input']!r}"
+
+
+def with_defaults(recipe: Recipe) -> Recipe:
+    """Fill in what the algorithm decides: rollout length, normalisation, how often to evaluate."""
+    changes: dict[str, Any] = {}
+    kwargs = dict(recipe.algo_kwargs)
+    on_policy = recipe.algo in ON_POLICY
+    if recipe.algo in ("ppo", "recurrent_ppo"):
+        n_steps = min(max(_DEFAULT_ROLLOUT // recipe.n_envs, 16), 2048)
+        kwargs.setdefault("n_steps", n_steps)
+        kwargs.setdefault("batch_size", min(128, int(kwargs["n_steps"]) * recipe.n_envs))
+    if not on_policy:
+        # One gradient step per environment step, however many environments there are.
+        kwargs.setdefault("gradient_steps", -1)
+        kwargs.setdefault("train_freq", 1)
+        kwargs.setdefault("buffer_size", min(1_000_000, max(recipe.total_timesteps, 1_000)))
+    changes["algo_kwargs"] = kwargs
+    if recipe.normalize is None:
+        changes["normalize"] = Normalize(observation=on_policy, reward=on_policy)
+    if recipe.eval.every_steps is None:
+        changes["eval"] = recipe.eval.model_copy(update={"every_steps": max(1, recipe.total_timesteps // 10)})
+    return recipe.model_copy(update=changes)

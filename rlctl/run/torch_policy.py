@@ -1,0 +1,190 @@
+"""Policies on SB3's own networks. The only place besides `train/` that imports torch and SB3."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sb3_contrib
+import stable_baselines3
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.vec_env import VecTransposeImage
+
+from rlctl.errors import ArtifactError, RecipeError, did_you_mean
+from rlctl.run.policy import ROWS, Observations, Policy, PolicyInfo, State, read_policy
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "ppo": stable_baselines3.PPO,
+    "a2c": stable_baselines3.A2C,
+    "sac": stable_baselines3.SAC,
+    "td3": stable_baselines3.TD3,
+    "ddpg": stable_baselines3.DDPG,
+    "dqn": stable_baselines3.DQN,
+    "tqc": sb3_contrib.TQC,
+    "crossq": sb3_contrib.CrossQ,
+    "recurrent_ppo": sb3_contrib.RecurrentPPO,
+}
+
+ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
+    "tanh": torch.nn.Tanh,
+    "relu": torch.nn.ReLU,
+    "elu": torch.nn.ELU,
+    "leaky_relu": torch.nn.LeakyReLU,
+    "silu": torch.nn.SiLU,
+    "gelu": torch.nn.GELU,
+}
+
+NORMALIZE_EPSILON = 1e-8
+"""What SB3's VecNormalize adds to the variance."""
+
+# Of no use to a policy that is run, and no plain data.
+_NOT_KEPT = frozenset(
+    {
+        "observation_space",
+        "action_space",
+        "lr_schedule",
+        "optimizer_class",
+        "optimizer_kwargs",
+        "features_extractor_class",
+        "normalize_images",
+        "dist_kwargs",
+    }
+)
+
+
+def pin_threads(threads: int = 1) -> None:
+    """Fix torch's thread count: the last bit of a result depends on it, and small networks gain nothing by more."""
+    torch.set_num_threads(threads)
+
+
+def policy_name(algo: str, observation_space: spaces.Space[Any]) -> str:
+    """Return SB3's name of the policy for an observation space."""
+    kind = "Mlp"
+    if isinstance(observation_space, spaces.Dict):
+        kind = "MultiInput"
+    elif is_image_space(observation_space):
+        kind = "Cnn"
+    return f"{kind}{'Lstm' if algo == 'recurrent_ppo' else ''}Policy"
+
+
+def activation(name: str) -> type[torch.nn.Module]:
+    """Return the activation of a name; raises `RecipeError` with the closest one."""
+    if name not in ACTIVATIONS:
+        raise RecipeError(
+            f"policy_kwargs.activation_fn: no activation {name!r}.{did_you_mean(name, ACTIVATIONS)} "
+            f"There are: {', '.join(ACTIVATIONS)}."
+        )
+    return ACTIVATIONS[name]
+
+
+def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """Return the observation space as SB3's networks see it: images with channels first."""
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: network_space(value) for key, value in space.spaces.items()})
+    if is_image_space(space) and not is_image_space_channels_first(space):
+        return VecTransposeImage.transpose_space(space)
+    return space
+
+
+def describe_network(policy: BasePolicy) -> dict[str, Any]:
+    """Return the constructor's arguments of a network as plain data, for `build_network`."""
+    described = {}
+    for name, value in policy._get_constructor_parameters().items():
+        if name in _NOT_KEPT or value is None:
+            continue
+        if name == "activation_fn":
+            value = next(known for known, cls in ACTIVATIONS.items() if cls is value)
+        described[name] = value
+    return described
+
+
+def build_network(info: PolicyInfo) -> BasePolicy:
+    """Build an untrained network from a policy's description."""
+    observation_space, action_space = info.env.spaces()
+    if info.algo not in ALGORITHMS:
+        raise ArtifactError(f"policy for an unknown algorithm {info.algo!r}")
+    cls = ALGORITHMS[info.algo].policy_aliases.get(info.policy)
+    if cls is None:
+        raise ArtifactError(f"policy of an unknown kind {info.policy!r} for {info.algo}")
+    kwargs = dict(info.policy_kwargs)
+    if "activation_fn" in kwargs:
+        kwargs["activation_fn"] = activation(kwargs["activation_fn"])
+    return cls(network_space(observation_space), action_space, lr_schedule=lambda _: 0.0, **kwargs)
+
+
+class Normalizer:
+    """The observation normalisation of a policy, in float64 as SB3's VecNormalize computes it."""
+
+    def __init__(self, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
+        self.clip = info.clip_observation
+        self._statistics = {
+            key: (tensors[f"normalize/{key}/mean"], np.sqrt(tensors[f"normalize/{key}/var"] + NORMALIZE_EPSILON))
+            for key in info.normalized_keys
+        }
+
+    def __call__(self, observations: Observations) -> Observations:
+        """Normalise a batch, shape (rows, ...)."""
+        if not self._statistics:
+            return observations
+        if isinstance(observations, dict):
+            return {
+                key: self._one(key, value) if key in self._statistics else value
+                for key, value in observations.items()
+            }
+        return self._one("", observations)
+
+    def _one(self, key: str, values: NDArray[Any]) -> NDArray[np.float32]:
+        mean, scale = self._statistics[key]
+        normalized: NDArray[np.float32] = np.clip((values - mean) / scale, -self.clip, self.clip).astype(np.float32)  # type: ignore[operator]
+        return normalized
+
+
+class TorchPolicy(Policy):
+    """A policy file on the network it was trained with."""
+
+    def __init__(self, info: PolicyInfo, network: BasePolicy, normalizer: Normalizer) -> None:
+        super().__init__(info)
+        self.network = network
+        self.normalizer = normalizer
+        network.set_training_mode(False)
+
+    @classmethod
+    def load(cls, path: Path) -> TorchPolicy:
+        """Read a policy file; raises `ArtifactError` if it is not one or does not fit together."""
+        info, tensors = read_policy(path)
+        try:
+            network = build_network(info)
+            prefix = "policy/"
+            state = {
+                name[len(prefix) :]: torch.from_numpy(value.copy())
+                for name, value in tensors.items()
+                if name.startswith(prefix)
+            }
+            network.load_state_dict(state)
+            return cls(info, network, Normalizer(info, tensors))
+        except (RuntimeError, KeyError, TypeError, ValueError, RecipeError) as error:
+            told = " ".join(str(error).split())[:200]
+            raise ArtifactError(f"{path}: its tensors do not fit its description: {told}") from None
+
+    def initial_state(self) -> State | None:
+        if self.info.algo != "recurrent_ppo":
+            return None
+        shape = (self.network.lstm_actor.num_layers, ROWS, self.network.lstm_actor.hidden_size)
+        return (np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+
+    def forward(
+        self, observations: Observations, state: State | None, deterministic: bool
+    ) -> tuple[NDArray[Any], State | None]:
+        actions, after = self.network.predict(
+            self.normalizer(observations),  # type: ignore[arg-type]
+            state=state,
+            episode_start=None if state is None else np.zeros(ROWS, np.bool_),
+            deterministic=deterministic,
+        )
+        return actions, after

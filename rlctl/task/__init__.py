@@ -1,0 +1,21 @@
+"""What a plugin author needs: `Task`, `Sim`, `Body`, `Event`, reward terms and spaces."""
+
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
+
+from rlctl.task import events, rewards
+from rlctl.task.events import Event
+from rlctl.task.sim import Body, Sim
+from rlctl.task.task import Task
+
+__all__ = [
+    "Body",
+    "Box",
+    "Discrete",
+    "Event",
+    "MultiBinary",
+    "MultiDiscrete",
+    "Sim",
+    "Task",
+    "events",
+    "rewards",
+]

@@ -1,0 +1,264 @@
+"""`TaskEnv`: the Gymnasium environment around a task."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.errors import RecipeError, TaskError, did_you_mean
+from rlctl.task.events import EventSettings
+from rlctl.task.sim import Sim
+from rlctl.task.task import Task, has_success
+
+Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+
+
+class TaskEnv(gymnasium.Env[Observation, Any]):
+    """Steps a `Task`: act, physics, terminated, rewards, interval events, observe.
+
+    `info` holds `reward_terms` (weighted; they add up to the reward), `metrics` (every raw term), `is_success`
+    where the task defines it, and `events` (what was drawn) on the steps that had any.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        render_mode: Literal["human", "rgb_array"] | None = None,
+        reward_weights: Mapping[str, float] | None = None,
+        events: EventSettings | None = None,
+    ) -> None:
+        self.task = task
+        self.name = type(task).__name__
+        # Of the instance: gymnasium.Env shares one dict between all environments.
+        self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / task.control_dt)}
+        if render_mode not in (None, "human", "rgb_array"):
+            raise RecipeError(f"render_mode {render_mode!r} is not one of: human, rgb_array")
+        self.render_mode = render_mode
+        self.reward_weights = _weights(task, reward_weights or {})
+        self.events = (events or EventSettings()).apply(task.events)
+        self.has_success = has_success(task)
+        self.max_steps = task.max_steps
+        # A space holds a random generator: one on the class would be shared by every instance.
+        self.action_space = copy.deepcopy(task.action_space)
+        self._interval_events = {
+            name: (event, max(1, round(event.every_s / task.control_dt)))
+            for name, event in self.events.items()
+            if event.when == "interval"
+        }
+        self.sim = Sim(
+            control_dt=task.control_dt,
+            substeps=task.substeps,
+            solver_iterations=task.solver_iterations,
+            gui=render_mode == "human",
+        )
+        self._step = 0
+        self._running = False
+        self._markers: dict[str, int] = {}
+        try:
+            self._build()
+            task.reset(np.random.default_rng(0))
+            first = task.observe()
+        except BaseException:
+            self.sim.close()
+            raise
+        self.observation_sizes = {name: int(np.size(value)) for name, value in first.items()}
+        self._shapes = {name: np.shape(value) for name, value in first.items()}
+        self.observation_space = self._make_observation_space()
+
+    def _build(self) -> None:
+        self.task.sim = self.sim
+        self.task.build(self.sim)
+        if self.render_mode is not None:
+            self._markers = {
+                name: self.sim.add_marker((0, 0, -10), radius=0.03, color=(0.1, 0.8, 0.3, 0.8))
+                for name in self.task.markers()
+            }
+        self.sim.save()
+
+    def _make_observation_space(self) -> Any:
+        task = self.task
+        for name in [*task.observation_bounds, *task.observation_units]:
+            if name not in self._shapes:
+                raise TaskError(
+                    f"{self.name}: bounds or units for {name!r}, which is not observed."
+                    f"{did_you_mean(name, self._shapes)}"
+                )
+
+        def bounds(name: str) -> tuple[float, float]:
+            return task.observation_bounds.get(name, (-math.inf, math.inf))
+
+        if task.observation_layout == "dict":
+            return spaces.Dict(
+                {name: spaces.Box(*bounds(name), shape, np.float32) for name, shape in self._shapes.items()}
+            )
+        low = np.concatenate([np.full(size, bounds(name)[0]) for name, size in self.observation_sizes.items()])
+        high = np.concatenate([np.full(size, bounds(name)[1]) for name, size in self.observation_sizes.items()])
+        return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; equal seeds give equal episodes, whatever was simulated before."""
+        super().reset(seed=seed)
+        if self.task.fast_reset:
+            self.sim.restore()
+        else:
+            self.sim.clear()
+            self._build()
+        drawn = {
+            name: event(self.sim, self.np_random)
+            for name, event in self.events.items()
+            if event.when == "reset"
+        }
+        self.task.reset(self.np_random)
+        self._step = 0
+        self._running = True
+        info: dict[str, Any] = {"events": drawn} if drawn else {}
+        observation = self._observe()
+        if self.render_mode == "human":
+            self._move_markers()
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Advance one control step of `control_dt` seconds."""
+        if not self._running:
+            raise TaskError(f"{self.name}: step() before reset(), or after the episode's end")
+        task = self.task
+        action = self._checked(action)
+        task.act(action)
+        self.sim.step()
+        self._step += 1
+        terminated = bool(task.is_terminated())
+        truncated = not terminated and self._step >= self.max_steps
+        raw = task.rewards(action)
+        weights = self.reward_weights
+        if raw.keys() != weights.keys():
+            raise _terms_differ(self.name, raw, weights)
+        terms = {name: weight * raw[name] for name, weight in weights.items()}
+        reward = float(sum(terms.values()))
+        if not math.isfinite(reward):
+            bad = next(name for name, value in raw.items() if not math.isfinite(value))
+            raise TaskError(f"{self.name}: reward term {bad!r} is {raw[bad]} at step {self._step}")
+        info: dict[str, Any] = {"reward_terms": terms, "metrics": raw}
+        if self._interval_events:
+            self._run_interval_events(info)
+        if self.has_success:
+            info["is_success"] = bool(task.is_success())
+        self._running = not (terminated or truncated)
+        observation = self._observe()
+        if self.render_mode == "human":
+            self._move_markers()
+        return observation, reward, terminated, truncated, info
+
+    def _checked(self, action: Any) -> Any:
+        space = self.action_space
+        if not isinstance(space, spaces.Box):
+            if not space.contains(action):
+                raise TaskError(f"{self.name}: action {action!r} is not in {space}")
+            return action
+        action = np.asarray(action, dtype=space.dtype)
+        if action.shape != space.shape:
+            raise TaskError(f"{self.name}: action of shape {action.shape}, the space has {space.shape}")
+        action = np.minimum(np.maximum(action, space.low), space.high)
+        if not math.isfinite(action.sum()):
+            raise TaskError(f"{self.name}: action is not finite at step {self._step + 1}")
+        return action
+
+    def _run_interval_events(self, info: dict[str, Any]) -> None:
+        for name, (event, period) in self._interval_events.items():
+            if self._step % period == 0:
+                info.setdefault("events", {})[name] = event(self.sim, self.np_random)
+
+    def _observe(self) -> Observation:
+        parts = self.task.observe()
+        if self.task.observation_layout == "dict":
+            dictionary = {name: np.asarray(value, np.float32) for name, value in parts.items()}
+            if {name: value.shape for name, value in dictionary.items()} != self._shapes:
+                raise self._observation_differs(parts)
+            if not all(math.isfinite(value.sum()) for value in dictionary.values()):
+                raise self._not_finite(parts)
+            return dictionary
+        try:
+            observation = np.concatenate(list(parts.values()), axis=None, dtype=np.float32)
+        except ValueError:
+            raise self._observation_differs(parts) from None
+        if observation.shape != self.observation_space.shape:
+            raise self._observation_differs(parts)
+        if not math.isfinite(observation.sum()):
+            raise self._not_finite(parts)
+        if self.task.observation_bounds:
+            low, high = self.observation_space.low, self.observation_space.high  # type: ignore[attr-defined]
+            # Float rounding only: a value well outside its declared range is an error of the task.
+            clipped: NDArray[np.float32] = np.minimum(np.maximum(observation, low), high)
+            if np.abs(clipped - observation).max() > 1e-4:
+                raise self._out_of_bounds(parts)
+            observation = clipped
+        return observation
+
+    def _observation_differs(self, parts: Mapping[str, Any]) -> TaskError:
+        now = {name: np.shape(value) for name, value in parts.items()}
+        names = [name for name in {**self._shapes, **now} if self._shapes.get(name) != now.get(name)]
+        name = names[0] if names else "order"
+        return TaskError(
+            f"{self.name}: observation {name!r} has shape {now.get(name)} at step {self._step}, "
+            f"{self._shapes.get(name)} at the first observation"
+        )
+
+    def _not_finite(self, parts: Mapping[str, Any]) -> TaskError:
+        for name, value in parts.items():
+            if not np.isfinite(value).all():
+                return TaskError(f"{self.name}: observation {name!r} is not finite at step {self._step}: {value}")
+        return TaskError(f"{self.name}: observation overflows float32 at step {self._step}")
+
+    def _out_of_bounds(self, parts: Mapping[str, Any]) -> TaskError:
+        for name, (low, high) in self.task.observation_bounds.items():
+            values = np.ravel(parts[name])
+            worst = values[np.argmax(np.maximum(low - values, values - high))]
+            if worst < low or worst > high:
+                return TaskError(
+                    f"{self.name}: observation {name!r} is {worst:g} at step {self._step}, "
+                    f"outside its bounds [{low:g}, {high:g}]"
+                )
+        return TaskError(f"{self.name}: observation outside its bounds at step {self._step}")
+
+    def _move_markers(self) -> None:
+        positions = self.task.markers()
+        for name, marker in self._markers.items():
+            self.sim.move_marker(marker, positions[name])
+
+    def render(self) -> Any:
+        """Return an RGB image of shape (240, 320, 3) in `rgb_array` mode; the window shows itself in `human`."""
+        if self.render_mode == "rgb_array":
+            self._move_markers()
+            return self.sim.render()
+        return None
+
+    def close(self) -> None:
+        self.sim.close()
+
+
+def _weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:
+    weights = {name: float(weight) for name, weight in task.reward_weights.items()}
+    for name, weight in changes.items():
+        if name not in weights:
+            raise RecipeError(
+                f"reward_weights: {type(task).__name__} has no term {name!r}.{did_you_mean(name, weights)} "
+                f"It has: {', '.join(weights)}."
+            )
+        weights[name] = float(weight)
+    return weights
+
+
+def _terms_differ(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:
+    if extra := [name for name in raw if name not in weights]:
+        return TaskError(f"{task}: reward term {extra[0]!r} has no weight.{did_you_mean(extra[0], weights)}")
+    missing = next(name for name in weights if name not in raw)
+    return TaskError(f"{task}: rewards() gave no term {missing!r}, which reward_weights names")

@@ -1,0 +1,106 @@
+"""`Task`: what a plugin author writes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError
+from rlctl.task.events import Event
+from rlctl.task.sim import Sim
+
+
+class Task:
+    """One robot-learning problem: a world, what is observed, what is rewarded.
+
+    Subclass it as a dataclass. Annotated fields are the task's parameters (`--set task.tolerance=0.02`);
+    the attributes below are its definition and are assigned without an annotation.
+    """
+
+    robot: ClassVar[str] = ""
+    control_dt: ClassVar[float] = 1 / 60
+    """Time between two actions [s]."""
+    substeps: ClassVar[int] = 4
+    """Physics steps per action; each takes `control_dt / substeps`."""
+    solver_iterations: ClassVar[int] = 50
+    episode_s: ClassVar[float] = 5.0
+    """Time limit of an episode [s]; reaching it truncates, never terminates."""
+    action_space: ClassVar[spaces.Space[Any]]
+    action_meaning: ClassVar[str] = ""
+    observation_layout: ClassVar[Literal["flat", "dict"]] = "flat"
+    """One flat Box in the order of `observe`, or a Dict space with one entry per name."""
+    observation_units: ClassVar[Mapping[str, str]] = {}
+    observation_bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """Range per observation name, in its unit; unbounded where nothing is given."""
+    reward_weights: ClassVar[Mapping[str, float]] = {}
+    """Weight per reward term; a term with weight 0 is a metric."""
+    events: ClassVar[Mapping[str, Event]] = {}
+    fast_reset: ClassVar[bool] = True
+    """Reset by restoring the built world. False loads the world anew at every reset: slower by a factor of
+    a hundred, for worlds whose contacts do not repeat bit for bit after a restore."""
+
+    sim: Sim
+    """The simulation this task was built in; set before `build`."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        definition = {name for name, hint in Task.__annotations__.items() if "ClassVar" in str(hint)}
+        for name, hint in cls.__dict__.get("__annotations__", {}).items():
+            if name in definition and "ClassVar" not in str(hint):
+                raise TaskError(
+                    f"{cls.__name__}.{name} is annotated, which would make it a parameter: "
+                    f"write `{name} = ...` without the annotation"
+                )
+
+    def build(self, sim: Sim) -> None:
+        """Load the bodies into `sim`. Called once; the world is saved after it."""
+        raise NotImplementedError
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Start an episode in the restored world; all chance comes from `rng`."""
+
+    def act(self, action: NDArray[Any]) -> None:
+        """Set motor targets from an action that is inside `action_space`."""
+        raise NotImplementedError
+
+    def observe(self) -> dict[str, NDArray[np.float64]]:
+        """Return what the policy sees, by name; the order is the order in the observation."""
+        raise NotImplementedError
+
+    def rewards(self, action: NDArray[Any]) -> dict[str, float]:
+        """Return the raw reward terms, by the names of `reward_weights`."""
+        raise NotImplementedError
+
+    def is_success(self) -> bool | None:
+        """Say whether the goal holds now; an episode succeeds if it does at its end. Optional."""
+        return None
+
+    def is_terminated(self) -> bool:
+        """Say whether the episode is over for a reason of its own (a fall); never for time. Optional."""
+        return False
+
+    def markers(self) -> dict[str, NDArray[np.float64]]:
+        """Return points worth drawing, such as the goal: name -> world position of shape (3,) [m]. Optional."""
+        return {}
+
+    @classmethod
+    def parameters(cls) -> dict[str, dataclasses.Field[Any]]:
+        """Return the constructor's parameters by name."""
+        if not dataclasses.is_dataclass(cls):
+            return {}
+        return {field.name: field for field in dataclasses.fields(cls) if field.init}
+
+    @property
+    def max_steps(self) -> int:
+        """Steps until the time limit."""
+        return max(1, round(self.episode_s / self.control_dt))
+
+
+def has_success(task: Task) -> bool:
+    """Say whether the task defines success."""
+    return type(task).is_success is not Task.is_success
