@@ -244,3 +244,24 @@ def with_defaults(recipe: Recipe) -> Recipe:
     if recipe.eval.every_steps is None:
         changes["eval"] = recipe.eval.model_copy(update={"every_steps": max(1, recipe.total_timesteps // 10)})
     return recipe.model_copy(update=changes)
+
+
+def task_settings(settings: list[str]) -> dict[str, Any]:
+    """Return the constructor arguments in `--set task.key=value`; raises `RecipeError` for any other key."""
+    values = parse_settings(settings)
+    for key in values:
+        if key != "task":
+            raise RecipeError(f"--set {key}: only task.* can be set here.{did_you_mean(key, ['task'])}")
+    parameters = values.get("task", {})
+    if not isinstance(parameters, dict):
+        raise RecipeError("--set task: write task.key=value")
+    return parameters
+
+
+def from_command_line(settings: list[str], **flags: Any) -> dict[str, Any]:
+    """Return the settings of `--set` with those of the flags that were given put over them."""
+    values = parse_settings(settings)
+    for name, value in flags.items():
+        if value is not None:
+            values[name] = yaml_text.load(value, name) if isinstance(value, str) else value
+    return values

@@ -1,0 +1,347 @@
+"""The command line: parse, call one function, print. What a verb needs is imported inside its command."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+from rlctl import __version__
+from rlctl.errors import RlctlError
+
+app = typer.Typer(
+    name="rlctl",
+    help="Robot learning in simulation, end to end: check an environment, train, evaluate, export, replay.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "token_normalize_func": lambda token: {"--num-envs": "--n-envs"}.get(
+            token.replace("_", "-"), token.replace("_", "-")
+        ),
+    },
+)
+
+Task = Annotated[
+    str,
+    typer.Argument(
+        help="Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id.", show_default=False
+    ),
+]
+Run = Annotated[
+    Optional[str],  # noqa: UP045 (Typer evaluates it)
+    typer.Argument(help="Run folder, policy file, task name, or latest.", show_default="latest"),
+]
+Set = Annotated[
+    list[str],
+    typer.Option("--set", metavar="KEY=VALUE", help="Set a recipe key, e.g. task.tolerance=0.02.", show_default=False),
+]
+Json = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - for stdout.", show_default=False),
+]
+Seed = Annotated[Optional[int], typer.Option(help="Seed.", min=0)]  # noqa: UP045
+EnvTimeout = Annotated[
+    float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1)
+]
+NEnvs = Annotated[Optional[int], typer.Option(help="Environments stepped side by side.", min=1, show_default=False)]  # noqa: UP045
+Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"rlctl {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command("check-env")
+def check_env(
+    task: Task,
+    settings: Set = [],  # noqa: B006 (Typer copies it)
+    env_timeout: EnvTimeout = 10.0,
+    json: Json = None,
+) -> None:
+    """Find what is wrong with an environment before hours of training do."""
+    from rlctl.check_env.check import check
+    from rlctl.check_env.report import show
+
+    report = check(task, _task_settings(settings), env_timeout_s=env_timeout)
+    show(report, json)
+    raise typer.Exit(report.exit_code)
+
+
+@app.command()
+def train(
+    task: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Argument(
+            help="Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id.", show_default=False
+        ),
+    ] = None,
+    resume: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(metavar="RUN", help="Go on with a run instead: a folder, a task's name, or latest.", show_default=False),
+    ] = None,
+    config: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(metavar="FILE", help="Recipe that goes over the task's own.", show_default=False),
+    ] = None,
+    settings: Set = [],  # noqa: B006
+    algo: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.", show_default=False),
+    ] = None,
+    seed: Annotated[Optional[int], typer.Option(help="Seed of everything random.", show_default=False)] = None,  # noqa: UP045
+    total_timesteps: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--total-timesteps", "-n", metavar="STEPS", help="Environment steps; 1e6 is fine.", show_default=False),
+    ] = None,
+    n_envs: NEnvs = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, or auto.")] = "cpu",
+    stop_success: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(metavar="RATE", help="Stop after two evaluations in a row at this success rate.", show_default=False),
+    ] = None,
+    record: Annotated[int, typer.Option(metavar="N", help="Write the last N evaluation episodes as .rrd.", min=0)] = 0,
+    env_timeout: EnvTimeout = 60.0,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where run folders go.")
+    ] = Path("runs"),
+    json: Json = None,
+) -> None:
+    """Train a policy, evaluate as it goes, and keep the best and the last."""
+    from rlctl.run.recipe import from_command_line
+    from rlctl.train.request import TrainRequest, run_training
+    from rlctl.train.summary import show
+
+    request = TrainRequest(
+        task=task,
+        resume=resume,
+        config=config,
+        settings=from_command_line(
+            settings, algo=algo, seed=seed, total_timesteps=total_timesteps, n_envs=n_envs, stop_success=stop_success
+        ),
+        device=device,
+        record=record,
+        env_timeout_s=env_timeout,
+        root=output,
+    )
+    show(run_training(request), json)
+
+
+@app.command("eval")
+def evaluate(
+    run: Run = None,
+    task: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Evaluate on this task instead of the one it was trained on.", show_default=False),
+    ] = None,
+    checkpoint: Checkpoint = "best",
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes, each with its own seed.", min=1)] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    settings: Set = [],  # noqa: B006
+    stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions instead of taking the mean.")] = False,
+    n_envs: NEnvs = None,
+    min_success: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(metavar="RATE", help="Gate: exit 1 below this success rate.", show_default=False),
+    ] = None,
+    min_success_lower: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(metavar="RATE", help="Gate on the lower bound of the 95 % interval.", show_default=False),
+    ] = None,
+    min_return: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(metavar="RETURN", help="Gate: exit 1 below this mean return.", show_default=False),
+    ] = None,
+    env_timeout: EnvTimeout = 60.0,
+    json: Json = None,
+) -> None:
+    """Say how good a policy is: success rate with its interval, returns, reward terms."""
+    from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
+    from rlctl.eval.report import show
+
+    gates = Gates(min_success, min_success_lower, min_return)
+    result = run_evaluation(
+        EvalRequest(
+            run=run,
+            task=task,
+            checkpoint=checkpoint,
+            episodes=episodes,
+            seed=seed,
+            task_parameters=_task_settings(settings),
+            deterministic=not stochastic,
+            n_envs=n_envs,
+            env_timeout_s=env_timeout,
+        ),
+        gates,
+    )
+    show(result, json)
+    gates.check(result)
+
+
+@app.command()
+def export(
+    run: Run = None,
+    onnx: Annotated[bool, typer.Option("--onnx", help="Write an ONNX file (the one format there is).")] = False,
+    checkpoint: Checkpoint = "best",
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--output", "-o", metavar="FILE", help="Default: exports/policy.onnx of the run.", show_default=False),
+    ] = None,
+    json: Json = None,
+) -> None:
+    """Turn a policy into a self-contained ONNX file, and verify that it acts the same."""
+    from rlctl.errors import UsageError
+    from rlctl.export.export import export_onnx
+    from rlctl.export.report import show
+
+    if not onnx:
+        raise UsageError("say what to export to: rlctl export --onnx")
+    show(export_onnx(run, checkpoint=checkpoint, output=output), json)
+
+
+@app.command()
+def replay(
+    source: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Argument(
+            metavar="[RUN or EPISODE]",
+            help="A run or policy to roll out, or a recorded episode (.npz).",
+            show_default="latest",
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes to roll out.", min=1)] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    checkpoint: Checkpoint = "best",
+    task: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Roll out on this task instead of the one it was trained on.", show_default=False),
+    ] = None,
+    settings: Set = [],  # noqa: B006
+    verify: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(metavar="EPISODE", help="Live a recorded episode again; exit 1 unless identical.", show_default=False),
+    ] = None,
+    gui: Annotated[bool, typer.Option("--gui", help="Show it in PyBullet's window instead of recording.")] = False,
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--output", "-o", metavar="PATH", help="An .rrd file or a folder. Default: episodes/ of the run.", show_default=False),
+    ] = None,
+    json: Json = None,
+) -> None:
+    """Show what a policy does: rollouts as Rerun recordings, without a display."""
+    from rlctl.replay.replay import ReplayRequest, run_replay
+    from rlctl.replay.report import show
+
+    result = run_replay(
+        ReplayRequest(
+            source=source,
+            episodes=episodes,
+            seed=seed,
+            checkpoint=checkpoint,
+            task=task,
+            task_parameters=_task_settings(settings),
+            verify=verify,
+            gui=gui,
+            output=output,
+        )
+    )
+    show(result, json)
+    result.check()
+
+
+@app.command()
+def tasks(
+    check: Annotated[bool, typer.Option("--check", help="Import each task, in a process of its own.")] = False,
+    json: Json = None,
+) -> None:
+    """List the installed tasks."""
+    from rlctl.task_list import list_tasks, show
+
+    show(list_tasks(check=check), json)
+
+
+def _task_settings(settings: list[str]) -> dict[str, Any]:
+    """The constructor arguments in `--set task.key=value`, for the verbs that take nothing else."""
+    from rlctl.run.recipe import task_settings
+
+    return task_settings(settings)
+
+
+def main() -> None:
+    """Run the command line and end the process with its exit code: the one error boundary."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run a command line; return the exit code."""
+    try:
+        code = app(arguments, standalone_mode=False)
+        _flush()
+        return code if isinstance(code, int) else 0
+    except RlctlError as error:
+        return _tell(error)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        _close_stdout()
+        return 141
+    except Exception as error:
+        return _tell_unexpected(error)
+
+
+def _flush() -> None:
+    from rlctl import output
+
+    sys.stdout.flush()
+    if output.results.cache_info().currsize:
+        output.results().flush()
+
+
+def _close_stdout() -> None:
+    # Whatever is still buffered for the closed stdout must not raise again when the interpreter ends.
+    from rlctl import output
+
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    if output.results.cache_info().currsize:
+        os.dup2(nowhere, output.results().fileno())
+
+
+def _tell(error: RlctlError) -> int:
+    if error.details:
+        print(error.details.rstrip(), file=sys.stderr)
+    first, *rest = str(error).splitlines()
+    print(f"error: {first}", *rest, sep="\n", file=sys.stderr)
+    return error.exit_code
+
+
+def _tell_unexpected(error: Exception) -> int:
+    usage = getattr(error, "exit_code", None)
+    show = getattr(error, "show", None)
+    if usage is not None and show is not None:  # Typer's own usage errors
+        show()
+        return int(usage)
+    if isinstance(error, OSError) and error.strerror:
+        place = f"{error.filename}: " if error.filename else ""
+        print(f"error: {place}{error.strerror}", file=sys.stderr)
+        return 5
+    import traceback
+
+    traceback.print_exc()
+    print(f"error: a bug in rlctl {__version__} or a library; please report it with the lines above", file=sys.stderr)
+    return 70

@@ -1,0 +1,85 @@
+"""`rlctl tasks`: what is installed, where it comes from, and what is broken."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from rlctl import registry
+from rlctl.errors import RecipeError
+
+
+@dataclasses.dataclass(frozen=True)
+class ListedTask:
+    """A row of the table."""
+
+    entry: registry.TaskEntry
+    algo: str | None
+    problem: str | None
+
+
+def list_tasks(*, check: bool = False) -> list[ListedTask]:
+    """List the installed tasks; `check` imports each in a child process."""
+    listed = []
+    for entry in registry.installed():
+        problem = entry.problem
+        algo = None
+        try:
+            algo = _algorithm(entry)
+        except RecipeError as error:
+            problem = problem or str(error)
+        if check and problem is None:
+            problem = registry.check_import(entry)
+        listed.append(ListedTask(entry, algo, problem))
+    return listed
+
+
+def _algorithm(entry: registry.TaskEntry) -> str | None:
+    """Read the algorithm off the packaged recipe; the full check of a recipe would cost its imports."""
+    file = entry.recipe_file
+    if file is None:
+        return None
+    from rlctl.run import yaml_text
+
+    content = yaml_text.load(file.read_text(encoding="utf-8"), str(file))
+    algo = content.get("algo", "ppo") if isinstance(content, dict) else "ppo"
+    return str(algo)
+
+
+def show(listed: list[ListedTask], json: str | None) -> None:
+    """Print the table, or write it as JSON."""
+    from rlctl import output
+
+    if json is not None:
+        output.write_result_json(json, {"tasks": [_as_json(each) for each in listed]})
+        return
+    out = output.out()
+    if not listed:
+        out.print("no tasks are installed")
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False)
+    for column in ("task", "origin", "algorithm", "problem"):
+        if column != "problem" or any(each.problem for each in listed):
+            table.add_column(column, header_style="bold", overflow="fold")
+    for each in listed:
+        origin = f"{each.entry.distribution} {each.entry.version}"
+        row: list[Any] = [each.entry.name, origin, each.algo or "ppo (default)"]
+        if each.problem:
+            row.append(Text(each.problem, style="red"))
+        table.add_row(*row)
+    out.print(table)
+
+
+def _as_json(each: ListedTask) -> dict[str, Any]:
+    entry = each.entry
+    return {
+        "name": entry.name,
+        "target": entry.target,
+        "distribution": entry.distribution,
+        "version": entry.version,
+        "algo": each.algo,
+        "problem": each.problem,
+    }
