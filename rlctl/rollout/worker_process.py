@@ -6,6 +6,7 @@ with the episodes that ended. Observations, actions, rewards and flags travel in
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -197,6 +198,11 @@ def main() -> None:
     """Serve commands until the connection closes. Arguments: connection, descriptor, and the job as JSON."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the main process decides
     _end_with_parent()
+    with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the main process has heard enough
+        _serve()
+
+
+def _serve() -> None:
     connection = Connection(int(sys.argv[1]))
     job = json.loads(sys.argv[3])
 

@@ -13,8 +13,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -57,7 +58,8 @@ class Workers:
 
     Building starts at once and is waited for by the first use, so that a caller can do its own slow imports
     meanwhile. Errors in an environment raise `TaskError` with the episode's seed and step; a worker that dies or
-    does not answer within `timeout_s` does too. After an error the workers are gone.
+    does not answer within `timeout_s` does too. After an error the workers are gone. What environments print goes to
+    `on_output`, line by line, from a thread; without it to stderr.
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class Workers:
         *,
         n_workers: int | None = None,
         timeout_s: float = DEFAULT_TIMEOUT_S,
+        on_output: Callable[[str], None] | None = None,
     ) -> None:
         self.n_envs = n_envs
         self.timeout_s = timeout_s
@@ -79,12 +82,17 @@ class Workers:
         self._connections: list[Connection] = []
         self._ready = False
         self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
+        read_end, self._printing = os.pipe()
+        self._output = threading.Thread(target=_forward, args=(read_end, on_output or _to_stderr), daemon=True)
+        self._output.start()
         try:
             for first, last in self._ranges:
                 self._start(first, last - first)
         except BaseException:
             self.close()
             raise
+        finally:
+            os.close(self._printing)
 
     def _start(self, first: int, count: int) -> None:
         ours, theirs = socket.socketpair()
@@ -101,7 +109,8 @@ class Workers:
                 [sys.executable, "-c", _BOOTSTRAP, str(theirs.fileno()), str(self._memory), json.dumps(job)],
                 pass_fds=(theirs.fileno(), self._memory),
                 stdin=subprocess.DEVNULL,
-                stdout=2,  # results own stdout; what an environment prints goes to stderr
+                stdout=self._printing,
+                stderr=self._printing,
                 env=environment,
             )
         self._processes.append(process)
@@ -252,6 +261,7 @@ class Workers:
                 process.kill()
                 process.wait()
         self._processes = []
+        self._output.join(timeout=1.0)
         if self._memory >= 0:
             os.close(self._memory)
             self._memory = -1
@@ -267,6 +277,17 @@ def _picked(arrays: dict[str, NDArray[Any]], rows: Any) -> Observations:
     if SINGLE in arrays:
         return arrays[SINGLE][rows].copy()
     return {key: array[rows].copy() for key, array in arrays.items()}
+
+
+def _forward(read_end: int, receive: Callable[[str], None]) -> None:
+    with os.fdopen(read_end, encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if not line.startswith("pybullet build time"):
+                receive(line.rstrip("\n"))
+
+
+def _to_stderr(line: str) -> None:
+    print(line, file=sys.stderr)
 
 
 def available_cores() -> int:

@@ -11,6 +11,7 @@ import stable_baselines3
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
@@ -86,7 +87,8 @@ def activation(name: str) -> type[torch.nn.Module]:
 def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
     """Return the observation space as SB3's networks see it: images with channels first."""
     if isinstance(space, spaces.Dict):
-        return spaces.Dict({key: network_space(value) for key, value in space.spaces.items()})
+        # Pairs, because from a plain dict Gymnasium would sort the keys, and the network takes them in their order.
+        return spaces.Dict([(key, network_space(value)) for key, value in space.spaces.items()])
     if is_image_space(space) and not is_image_space_channels_first(space):
         return VecTransposeImage.transpose_space(space)
     return space
@@ -95,13 +97,29 @@ def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
 def describe_network(policy: BasePolicy) -> dict[str, Any]:
     """Return the constructor's arguments of a network as plain data, for `build_network`."""
     described = {}
-    for name, value in policy._get_constructor_parameters().items():
+    for name, value in {**policy._get_constructor_parameters(), **_not_told(policy)}.items():
         if name in _NOT_KEPT or value is None:
             continue
         if name == "activation_fn":
             value = next(known for known, cls in ACTIVATIONS.items() if cls is value)
         described[name] = value
     return described
+
+
+def _not_told(policy: BasePolicy) -> dict[str, Any]:
+    """Arguments that change a network and that its own `_get_constructor_parameters` leaves out."""
+    left_out = {}
+    if hasattr(policy, "share_features_extractor"):
+        left_out["share_features_extractor"] = policy.share_features_extractor
+    if isinstance(policy, RecurrentActorCriticPolicy):
+        left_out |= {
+            "lstm_hidden_size": policy.lstm_actor.hidden_size,
+            "n_lstm_layers": policy.lstm_actor.num_layers,
+            "shared_lstm": policy.shared_lstm,
+            "enable_critic_lstm": policy.enable_critic_lstm,
+            "lstm_kwargs": policy.lstm_kwargs,
+        }
+    return left_out
 
 
 def build_network(info: PolicyInfo) -> BasePolicy:

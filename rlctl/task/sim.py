@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pybullet
-import pybullet_data
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, did_you_mean
+from rlctl.task.bullet import pybullet, pybullet_data
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,153 @@
+"""`rlctl eval`: many episodes, each with its own seed, and honest numbers from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rlctl import output
+from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
+from rlctl.registry import EnvSpec
+from rlctl.rollout.collect import Episode, run_episodes
+from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.rollout.workers import Workers
+from rlctl.run import directory
+from rlctl.run.policy import BatchActor, Policy, load_policy
+
+_ENVS = 32
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalRequest:
+    """What the command line asks for."""
+
+    run: str | None
+    task: str | None = None
+    checkpoint: str = "best"
+    episodes: int = 100
+    seed: int = 0
+    task_parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    deterministic: bool = True
+    n_envs: int | None = None
+    env_timeout_s: float = 60.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """The numbers of an evaluation."""
+
+    policy_file: Path
+    policy: Policy
+    spec: EnvSpec
+    seed: int
+    deterministic: bool
+    episodes: list[Episode]
+    success_rate: float | None
+    success_interval: tuple[float, float] | None
+    returns: Spread
+    lengths: Spread
+    terms: dict[str, float]
+    """Mean over episodes of each weighted term's sum."""
+    final_distance: Spread | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Gates:
+    """What an evaluation must reach."""
+
+    min_success: float | None = None
+    min_success_lower: float | None = None
+    min_return: float | None = None
+
+    def check_possible(self, has_success: bool) -> None:
+        """Raise `UsageError` for a gate on success where the environment does not report it."""
+        if not has_success and (self.min_success is not None or self.min_success_lower is not None):
+            raise UsageError("--min-success: this task reports no success (no is_success); use --min-return")
+
+    def check(self, result: Evaluation) -> None:
+        """Raise `AnswerIsNo`, naming every gate that was missed."""
+        rate, interval = result.success_rate, result.success_interval
+        missed = []
+        if self.min_success is not None and rate is not None and rate < self.min_success:
+            missed.append(f"success rate {rate:.3f} is below {self.min_success:g}")
+        if self.min_success_lower is not None and interval is not None and interval[0] < self.min_success_lower:
+            missed.append(f"lower bound {interval[0]:.3f} of the success rate is below {self.min_success_lower:g}")
+        if self.min_return is not None and result.returns.mean < self.min_return:
+            missed.append(f"mean return {result.returns.mean:.3f} is below {self.min_return:g}")
+        if missed:
+            raise AnswerIsNo("gate missed: " + "; ".join(missed))
+
+
+def run_evaluation(request: EvalRequest, gates: Gates) -> Evaluation:
+    """Find the policy, live its episodes, and return their statistics."""
+    path, _ = directory.find_policy(request.run, request.checkpoint)
+    if path.suffix == ".safetensors":
+        from rlctl.run.torch_policy import pin_threads
+
+        pin_threads()
+    policy = load_policy(path)
+    spec = evaluation_spec(policy, request.task, request.task_parameters)
+    n_envs = min(request.n_envs or _ENVS, request.episodes)
+    with Workers(spec, n_envs, timeout_s=request.env_timeout_s) as workers:
+        check_fits(path, policy, workers)
+        if workers.info.reward_weights:
+            gates.check_possible(workers.info.has_success)
+        episodes = _live(workers, policy, request)
+    evaluation = _statistics(path, policy, spec, request, episodes)
+    gates.check_possible(evaluation.success_rate is not None)
+    return evaluation
+
+
+def evaluation_spec(policy: Policy, task: str | None, parameters: Mapping[str, Any]) -> EnvSpec:
+    """Return the environment a policy was trained on, or that of another task, with parameters put over it."""
+    spec = policy.info.env_spec()
+    if task is not None and task != spec.task:
+        spec = EnvSpec(task, frame_stack=spec.frame_stack)
+    return dataclasses.replace(spec, parameters={**spec.parameters, **parameters})
+
+
+def check_fits(path: Path, policy: Policy, workers: Workers) -> None:
+    """Raise `ArtifactError` if the policy was made for other spaces than these environments have."""
+    if difference := policy.info.env.difference(workers.info):
+        raise ArtifactError(f"{path}: this policy is not for this task: {difference}")
+
+
+def _live(workers: Workers, policy: Policy, request: EvalRequest) -> list[Episode]:
+    seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
+    actor = BatchActor(policy, workers.n_envs, deterministic=request.deterministic)
+    if not request.deterministic and "torch" in sys.modules:
+        import torch
+
+        torch.manual_seed(request.seed)
+    console = output.err()
+    if not console.is_terminal:
+        return run_episodes(workers, actor, seeds)
+    with console.status("evaluating") as status:
+        return run_episodes(
+            workers, actor, seeds, on_episode=lambda done: status.update(f"evaluating: {done}/{len(seeds)} episodes")
+        )
+
+
+def _statistics(
+    path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, episodes: list[Episode]
+) -> Evaluation:
+    results = [episode.result for episode in episodes]
+    distances = [result.final_distance for result in results if result.final_distance is not None]
+    return Evaluation(
+        policy_file=path,
+        policy=policy,
+        spec=spec,
+        seed=request.seed,
+        deterministic=request.deterministic,
+        episodes=episodes,
+        success_rate=success_rate(results),
+        success_interval=success_interval(results),
+        returns=Spread.of([result.total_reward for result in results]),
+        lengths=Spread.of([result.length for result in results]),
+        terms=mean_terms(results),
+        final_distance=Spread.of(distances) if distances else None,
+    )

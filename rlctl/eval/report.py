@@ -1,0 +1,78 @@
+"""What an evaluation prints."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from rlctl import output
+from rlctl.eval.evaluate import Evaluation
+from rlctl.eval.statistics import Spread
+from rlctl.run.policy import versions
+
+
+def show(result: Evaluation, json: str | None) -> None:
+    """Print the numbers, or write them as JSON."""
+    if json is not None:
+        output.write_result_json(json, as_json(result))
+        return
+    from rich.table import Table
+
+    out = output.out()
+    info = result.policy.info
+    mode = "" if result.deterministic else ", sampled actions"
+    out.print(f"{result.spec.task}: {result.policy_file} ({info.algo}, step {info.training_steps:,})", markup=False)
+    out.print(f"{len(result.episodes)} episodes, seed {result.seed}{mode}")
+    if result.success_rate is not None and result.success_interval is not None:
+        low, high = result.success_interval
+        out.print(f"success rate {result.success_rate:.1%}  (95 % interval {low:.1%} to {high:.1%})")
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for column in ("mean", "IQM", "std", "min", "max"):
+        table.add_column(column, justify="right", header_style="bold")
+    table.add_row("return", *_numbers(result.returns))
+    table.add_row("length", *_numbers(result.lengths))
+    if result.final_distance is not None:
+        table.add_row("final distance", *_numbers(result.final_distance))
+    for name, mean in result.terms.items():
+        table.add_row(f"term {name}", f"{mean:.4g}")
+    out.print(table)
+
+
+def _numbers(spread: Spread) -> list[str]:
+    return [f"{value:.4g}" for value in (spread.mean, spread.iqm, spread.std, spread.min, spread.max)]
+
+
+def as_json(result: Evaluation) -> dict[str, Any]:
+    """Return the result as plain data."""
+    info = result.policy.info
+    return {
+        "task": {"name": result.spec.task, "parameters": dict(result.spec.parameters)},
+        "policy": {
+            "file": str(result.policy_file),
+            "algo": info.algo,
+            "training_steps": info.training_steps,
+            "versions": info.versions,
+        },
+        "versions": versions(),
+        "seed": result.seed,
+        "deterministic": result.deterministic,
+        "success_rate": result.success_rate,
+        "success_interval": result.success_interval,
+        "return": dataclasses.asdict(result.returns),
+        "length": dataclasses.asdict(result.lengths),
+        "terms": result.terms,
+        "final_distance": dataclasses.asdict(result.final_distance) if result.final_distance else None,
+        "episodes": [
+            {
+                "index": episode.index,
+                "seed": episode.seed,
+                "success": episode.result.success,
+                "return": episode.result.total_reward,
+                "length": episode.result.length,
+                "terms": episode.result.terms,
+                "final_distance": episode.result.final_distance,
+            }
+            for episode in result.episodes
+        ],
+    }

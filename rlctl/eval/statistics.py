@@ -1,0 +1,65 @@
+"""Honest numbers from a list of episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rlctl.rollout.workers import EpisodeResult
+
+
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """How a quantity is distributed over episodes."""
+
+    mean: float
+    iqm: float
+    """Interquartile mean: of the middle half, so that a few odd episodes do not decide."""
+    std: float
+    """Sample standard deviation; 0 for one episode."""
+    min: float
+    max: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        from scipy.stats import trim_mean
+
+        array = np.asarray(values, np.float64)
+        return cls(
+            mean=float(array.mean()),
+            iqm=float(trim_mean(array, 0.25)),
+            std=float(array.std(ddof=1)) if array.size > 1 else 0.0,
+            min=float(array.min()),
+            max=float(array.max()),
+        )
+
+
+def success_rate(results: Sequence[EpisodeResult]) -> float | None:
+    """Return the part of episodes that succeeded; None where the environment does not say."""
+    known = [result.success for result in results if result.success is not None]
+    return sum(known) / len(known) if known else None
+
+
+def success_interval(results: Sequence[EpisodeResult]) -> tuple[float, float] | None:
+    """Return the 95 % Wilson score interval of the success rate (E. B. Wilson, 1927)."""
+    from scipy.stats import binomtest
+
+    known = [result.success for result in results if result.success is not None]
+    if not known:
+        return None
+    interval: Any = binomtest(sum(known), len(known)).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def mean_return(results: Sequence[EpisodeResult]) -> float:
+    """Return the mean of the episodes' sums of rewards."""
+    return float(np.mean([result.total_reward for result in results]))
+
+
+def mean_terms(results: Sequence[EpisodeResult]) -> dict[str, float]:
+    """Return the mean over episodes of each weighted reward term's sum; the values add up to the mean return."""
+    names = dict.fromkeys(name for result in results for name in result.terms)
+    return {name: float(np.mean([result.terms.get(name, 0.0) for result in results])) for name in names}

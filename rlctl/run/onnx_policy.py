@@ -1,0 +1,135 @@
+"""Exported policies on onnxruntime. Imports neither torch nor SB3."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.run.policy import ROWS, Observations, Policy, PolicyInfo, State, parse_info
+
+METADATA_KEY = "rlctl"
+"""Where an exported file keeps its description."""
+SINGLE_INPUT = "obs"
+"""Name of the input of an observation that is no dictionary; those of a dictionary are named by their keys."""
+ACTION = "action"
+STATE_INPUTS = ("state_h", "state_c")
+"""LSTM state of a recurrent policy, each of shape (layers, batch, hidden); zeros when an episode begins."""
+STATE_OUTPUTS = ("state_h_out", "state_c_out")
+"""The LSTM state for the next step."""
+
+_FATAL_ONLY = 4
+
+
+class OnnxPolicy(Policy):
+    """An ONNX file written by `rlctl export`, with the description it carries. Deterministic."""
+
+    def __init__(self, info: PolicyInfo, session: onnxruntime.InferenceSession) -> None:
+        super().__init__(info)
+        self.session = session
+        self._fields = _fields(self.observation_space)
+        inputs = {each.name: each.shape for each in session.get_inputs()}
+        for name, (shape, _) in self._fields.items():
+            if inputs.get(name, [None])[1:] != list(shape):
+                raise ValueError(f"no input {name!r} of shape {('batch', *shape)}")
+        self._recurrent = STATE_INPUTS[0] in inputs
+        if self._recurrent:
+            layers, _, hidden = inputs[STATE_INPUTS[0]]
+            self._state_size = (int(layers), int(hidden))
+        self._outputs = [ACTION, *STATE_OUTPUTS] if self._recurrent else [ACTION]
+        self._state = self._zeros(1)
+
+    @classmethod
+    def load(cls, path: Path) -> OnnxPolicy:
+        """Read an exported file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise ArtifactError(f"{path}: {error.strerror or error}") from None
+        try:
+            session = onnxruntime.InferenceSession(content, _options(), providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's own errors have no public base class
+            raise ArtifactError(
+                f"{path}: damaged, or not an ONNX file that onnxruntime {onnxruntime.__version__} can read: "
+                f"{' '.join(str(error).split())[:200]}"
+            ) from None
+        text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        if text is None:
+            raise ArtifactError(
+                f"{path}: not an ONNX file of rlctl: its metadata has no {METADATA_KEY!r} entry; "
+                "make one with rlctl export --onnx"
+            )
+        info = parse_info(text, path)
+        try:
+            return cls(info, session)
+        except ValueError as error:
+            raise ArtifactError(f"{path}: its graph does not fit its description: {error}; export it again") from None
+
+    def initial_state(self) -> State | None:
+        return self._zeros(ROWS)
+
+    def forward(
+        self, observations: Observations, state: State | None, deterministic: bool
+    ) -> tuple[NDArray[Any], State | None]:
+        if isinstance(observations, dict):
+            batch = {name: np.asarray(observations[name], dtype) for name, (_, dtype) in self._fields.items()}
+        else:
+            batch = {SINGLE_INPUT: np.asarray(observations, self._fields[SINGLE_INPUT][1])}
+        return self._run(batch, state, deterministic)
+
+    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
+        """Return the action for one observation, in a forward pass of one row.
+
+        A recurrent policy remembers; call `reset` when an episode begins.
+        """
+        # A row costs less than the ROWS rows that keep an evaluation independent of its width.
+        given = observation if isinstance(observation, dict) else {SINGLE_INPUT: observation}
+        batch = {}
+        for name, (shape, dtype) in self._fields.items():
+            value = np.asarray(given[name], dtype) if name in given else np.empty(())
+            if name not in given or value.shape != shape:
+                raise ValueError(f"observation {name!r}: shape {value.shape}, the policy wants {shape}")
+            batch[name] = value[None]
+        actions, self._state = self._run(batch, self._state, deterministic)
+        return np.asarray(actions[0])
+
+    def reset(self) -> None:
+        """Begin an episode: forget the recurrent state."""
+        self._state = self._zeros(1)
+
+    def _run(
+        self, batch: dict[str, NDArray[Any]], state: State | None, deterministic: bool
+    ) -> tuple[NDArray[Any], State | None]:
+        if not deterministic:
+            raise UsageError("an exported policy cannot sample: only its deterministic action is in the ONNX file")
+        if state is not None:
+            batch.update(zip(STATE_INPUTS, state, strict=True))
+        actions, *after = self.session.run(self._outputs, batch)
+        return actions, tuple(after) or None
+
+    def _zeros(self, rows: int) -> State | None:
+        if not self._recurrent:
+            return None
+        layers, hidden = self._state_size
+        return tuple(np.zeros((layers, rows, hidden), np.float32) for _ in STATE_INPUTS)
+
+
+def _fields(space: spaces.Space[Any]) -> dict[str, tuple[tuple[int, ...], Any]]:
+    """Shape and dtype of every input that is an observation."""
+    if isinstance(space, spaces.Dict):
+        return {key: (each.shape or (), each.dtype) for key, each in space.spaces.items()}
+    return {SINGLE_INPUT: (space.shape or (), space.dtype)}
+
+
+def _options() -> onnxruntime.SessionOptions:
+    options = onnxruntime.SessionOptions()
+    # These networks are too small to share among threads, and the result must not depend on the machine's cores.
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = _FATAL_ONLY
+    return options

@@ -1,0 +1,148 @@
+"""From a recipe to an SB3 model: names checked against SB3's own signatures."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from rlctl.errors import RecipeError, did_you_mean
+from rlctl.run.recipe import Normalize, Recipe
+from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
+
+# Set by rlctl itself, or not plain data.
+_NOT_FOR_RECIPES = frozenset(
+    {
+        "self", "policy", "env", "seed", "device", "verbose", "tensorboard_log", "policy_kwargs", "_init_setup_model",
+        "rollout_buffer_class", "rollout_buffer_kwargs", "replay_buffer_class", "replay_buffer_kwargs",
+    }
+)  # fmt: skip
+_NOT_FOR_POLICIES = frozenset(
+    {
+        "self", "observation_space", "action_space", "lr_schedule", "optimizer_class", "optimizer_kwargs",
+        "features_extractor_class", "use_sde", "normalize_images",
+    }
+)  # fmt: skip
+_DETERMINISTIC_EXPLORERS = frozenset({"td3", "ddpg"})
+
+
+def build_model(recipe: Recipe, env: VecEnv, device: str) -> BaseAlgorithm:
+    """Build the model of a recipe on vector environments; raises `RecipeError` for what does not fit."""
+    cls = ALGORITHMS[recipe.algo]
+    kwargs = _algorithm_kwargs(recipe, cls, env.action_space)
+    env = normalized(env, recipe.normalize, kwargs.get("gamma", 0.99))
+    name = policy_name(recipe.algo, env.observation_space)
+    policy_kwargs = _policy_kwargs(recipe, cls.policy_aliases[name])
+    _check_rollout(recipe, env.num_envs)
+    try:
+        return cls(
+            name,
+            env,
+            policy_kwargs=policy_kwargs,
+            seed=recipe.seed,
+            device=device,
+            **kwargs,
+        )
+    except (AssertionError, ValueError, TypeError) as error:
+        raise RecipeError(f"{recipe.algo} cannot be used here: {' '.join(str(error).split())}") from error
+    except RuntimeError as error:
+        if "device" in str(error).lower() or "cuda" in str(error).lower():
+            raise RecipeError(f"--device {device}: {str(error).splitlines()[0]}") from None
+        raise
+
+
+def _algorithm_kwargs(recipe: Recipe, cls: type[BaseAlgorithm], action_space: spaces.Space[Any]) -> dict[str, Any]:
+    known = _names(cls.__init__, _NOT_FOR_RECIPES)
+    kwargs: dict[str, Any] = {}
+    for name, value in recipe.algo_kwargs.items():
+        if name not in known:
+            raise RecipeError(
+                f"algo_kwargs.{name}: {recipe.algo} has no parameter {name!r}.{did_you_mean(name, known)} "
+                f"It has: {', '.join(known)}."
+            )
+        kwargs[name] = _value(name, value)
+    if recipe.algo in _DETERMINISTIC_EXPLORERS:
+        # Their policies are deterministic: without noise they would not explore at all.
+        kwargs.setdefault("action_noise", 0.1)
+    if isinstance(sigma := kwargs.get("action_noise"), int | float) and action_space.shape is not None:
+        size = int(np.prod(action_space.shape))
+        kwargs["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, float(sigma)))
+    return kwargs
+
+
+def _value(name: str, value: Any) -> Any:
+    if isinstance(value, str) and value.startswith("lin_"):
+        return _linear(name, value)
+    if isinstance(value, list):
+        return tuple(value)
+    if isinstance(value, float) and value.is_integer() and name in _COUNTS:
+        return int(value)
+    return value
+
+
+_COUNTS = frozenset({"n_steps", "batch_size", "n_epochs", "buffer_size", "learning_starts", "gradient_steps"})
+
+
+def _linear(name: str, text: str) -> Callable[[float], float]:
+    """A schedule that falls from a value to zero over the training, written `lin_3e-4` as rl-zoo does."""
+    try:
+        start = float(text.removeprefix("lin_"))
+    except ValueError:
+        raise RecipeError(f"algo_kwargs.{name}: {text!r} is not lin_ and a number, such as lin_3e-4") from None
+    return lambda remaining: remaining * start
+
+
+def _policy_kwargs(recipe: Recipe, policy_class: Any) -> dict[str, Any]:
+    known = _names(policy_class.__init__, _NOT_FOR_POLICIES)
+    kwargs = {}
+    for name, value in recipe.policy_kwargs.items():
+        if name not in known:
+            raise RecipeError(
+                f"policy_kwargs.{name}: {policy_class.__name__} has no parameter {name!r}."
+                f"{did_you_mean(name, known)} It has: {', '.join(known)}."
+            )
+        kwargs[name] = activation(value) if name == "activation_fn" else value
+    return kwargs
+
+
+def _names(function: Any, without: Iterable[str]) -> list[str]:
+    return [name for name in inspect.signature(function).parameters if name not in without]
+
+
+def _check_rollout(recipe: Recipe, n_envs: int) -> None:
+    kwargs: Mapping[str, Any] = recipe.algo_kwargs
+    if recipe.algo == "ppo" and int(kwargs["n_steps"]) * n_envs < 2:
+        raise RecipeError("algo_kwargs.n_steps: one environment needs at least 2 steps a rollout")
+
+
+def normalized(env: VecEnv, settings: Normalize | None, gamma: float) -> VecEnv:
+    """Wrap environments in SB3's VecNormalize, as far as their observations are real numbers."""
+    if settings is None:
+        return env
+    space = env.observation_space
+    keys = None
+    if isinstance(space, spaces.Dict):
+        keys = [key for key, each in space.spaces.items() if _is_real(each)]
+    observation = settings.observation and (bool(keys) if keys is not None else _is_real(space))
+    if not observation and not settings.reward:
+        return env
+    return VecNormalize(
+        env,
+        norm_obs=observation,
+        norm_reward=settings.reward,
+        clip_obs=settings.clip_observation,
+        clip_reward=settings.clip_reward,
+        gamma=gamma,
+        norm_obs_keys=keys if observation else None,
+    )
+
+
+def _is_real(space: spaces.Space[Any]) -> bool:
+    return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and not is_image_space(space)

@@ -1,0 +1,66 @@
+"""Which evaluation episodes a training keeps: the first and the worst of each evaluation."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+
+from rlctl.registry import EnvSpec
+from rlctl.rollout.collect import Episode
+from rlctl.run.directory import RunDirectory
+from rlctl.run.env_info import EnvInfo
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
+from rlctl.run.policy import versions
+
+_LATEST = 1000
+
+
+class EpisodeKeeper:
+    """Writes episodes into a run folder."""
+
+    def __init__(self, run: RunDirectory, spec: EnvSpec, info: EnvInfo) -> None:
+        self.run = run
+        self.spec = spec
+        self.info = info
+        self._next = run.next_episode_number()
+        self._latest: deque[RecordedEpisode] = deque(maxlen=_LATEST)
+
+    def keep(self, episodes: list[Episode], steps: int) -> None:
+        """Write the first and the worst of an evaluation; remember all of it for `latest`."""
+        recorded = [self._recorded(episode, steps) for episode in episodes]
+        self._latest = deque(recorded, maxlen=_LATEST)
+        worst = min(range(len(episodes)), key=lambda i: (episodes[i].result.success is True, episodes[i].result.total_reward))
+        for index in dict.fromkeys((0, worst)):
+            self._write(recorded[index])
+
+    def latest(self, count: int) -> list[tuple[Path, RecordedEpisode]]:
+        """Write the last `count` episodes of the last evaluation, and return them with their files."""
+        return [(self._write(episode), episode) for episode in list(self._latest)[-count:]] if count else []
+
+    def _write(self, episode: RecordedEpisode) -> Path:
+        path = self.run.episode_file(self._next)
+        self._next += 1
+        save_episode(path, episode)
+        return path
+
+    def _recorded(self, episode: Episode, steps: int) -> RecordedEpisode:
+        trajectory = episode.trajectory
+        assert trajectory is not None  # evaluations record
+        spec = self.spec
+        info = EpisodeInfo(
+            task=spec.task,
+            task_parameters=dict(spec.parameters),
+            reward_weights=dict(spec.reward_weights),
+            randomize=spec.randomize,
+            events={name: dict(changes) for name, changes in spec.events.items()},
+            frame_stack=spec.frame_stack,
+            seed=episode.seed,
+            policy=f"training step {steps}",
+            success=episode.result.success,
+            total_reward=episode.result.total_reward,
+            term_names=list(self.info.reward_weights),
+            versions=versions(),
+        )
+        return RecordedEpisode(
+            info, trajectory.actions, trajectory.observations, trajectory.rewards, trajectory.terms
+        )

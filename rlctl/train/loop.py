@@ -1,0 +1,303 @@
+"""What happens at the boundaries between updates: metrics, evaluation, checkpoints, stopping.
+
+SB3 calls `on_rollout_start` after each update and before the next step. All of rlctl's own work is done there, so
+that a checkpoint never falls inside a rollout, and a run can be resumed.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+
+from rlctl.errors import ArtifactError, DivergedError, Interrupted
+from rlctl.eval.statistics import mean_return, mean_terms, success_rate
+from rlctl.registry import EnvSpec
+from rlctl.rollout.collect import Episode, run_episodes
+from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.run import files
+from rlctl.run.directory import RunDirectory
+from rlctl.run.policy import BatchActor, PolicyInfo, save_policy
+from rlctl.run.recipe import ON_POLICY, Recipe
+from rlctl.run.torch_policy import Normalizer, TorchPolicy
+from rlctl.train import checkpoint
+from rlctl.train.display import Display
+from rlctl.train.episodes import EpisodeKeeper
+from rlctl.train.pack import pack
+from rlctl.train.vec_env import WorkerVecEnv
+
+_LOSSES = (
+    "learning_rate", "loss", "policy_gradient_loss", "policy_loss", "value_loss", "entropy_loss", "approx_kl",
+    "clip_fraction", "clip_range", "explained_variance", "std", "actor_loss", "critic_loss", "ent_coef",
+    "ent_coef_loss", "n_updates",
+)  # fmt: skip
+_OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
+
+
+@dataclasses.dataclass
+class Progress:
+    """What the loop must remember over a resume; plain data."""
+
+    next_eval: int
+    best_success: float | None = None
+    best_return: float = -math.inf
+    best_step: int | None = None
+    last_eval_step: int | None = None
+    good_in_a_row: int = 0
+    evals: int = 0
+    seconds: float = 0.0
+    metrics_bytes: int = 0
+    evals_bytes: int = 0
+    episodes_started: list[int] = dataclasses.field(default_factory=list)
+
+
+class TrainingStopped(Exception):
+    """Ends SB3's `learn` at a boundary; nothing is wrong."""
+
+
+class TrainingLoop(BaseCallback):
+    """Runs at every boundary; raises `TrainingStopped` when the recipe's success rate holds."""
+
+    def __init__(
+        self,
+        run: RunDirectory,
+        recipe: Recipe,
+        env: WorkerVecEnv,
+        make_eval_workers: Callable[[], Workers],
+        progress: Progress,
+        display: Display,
+        spec: EnvSpec,
+    ) -> None:
+        super().__init__()
+        self.run_directory = run
+        self.recipe = recipe
+        self.env = env
+        self.progress = progress
+        self.display = display
+        self.spec = spec
+        self.stop_signal: int | None = None
+        self.episodes = EpisodeKeeper(run, spec, env.workers.info)
+        self._make_eval_workers = make_eval_workers
+        self._eval_workers: Workers | None = None
+        self._started = time.monotonic() - progress.seconds
+        self._last_row = (time.monotonic(), 0)
+        self._next_row = 0
+        self._recent: list[EpisodeResult] = []
+        self._boundary_steps = 0
+        self._unsaved: str | None = None
+
+    def _on_step(self) -> bool:
+        self.display.steps(self.num_timesteps)
+        return True
+
+    def _on_training_start(self) -> None:
+        self._started_at = self.model.num_timesteps
+        self._last_row = (time.monotonic(), self._started_at)
+        self._next_row = self._started_at
+
+    def _on_rollout_start(self) -> None:
+        # The first boundary comes before any step, or right after a resume, and repeats what is there.
+        first = self.model.num_timesteps == self._started_at
+        self._boundary_steps = self.model.num_timesteps
+        if not first:
+            self.boundary()
+
+    def boundary(self) -> None:
+        """Do everything that is due after an update."""
+        steps = self.model.num_timesteps
+        self._recent += self.env.take_ended()
+        on_policy = self.recipe.algo in ON_POLICY
+        if on_policy or steps >= self._next_row:
+            self.check_finite()
+            self._write_metrics(steps)
+            self._next_row = steps + max(1, self.recipe.total_timesteps // _OFF_POLICY_ROWS)
+        self._stop_if_asked()
+        if steps >= self.progress.next_eval:
+            self.evaluate()
+            self.save_checkpoint()
+            self._stop_if_asked()
+            if self.recipe.stop_success is not None and self.progress.good_in_a_row >= 2:
+                raise TrainingStopped
+
+    def _stop_if_asked(self) -> None:
+        if self.stop_signal is None:
+            return
+        saved = self.save_checkpoint()
+        told = "checkpoint saved" if saved else "the last saved checkpoint stands"
+        raise Interrupted(
+            f"interrupted at step {self.model.num_timesteps:,}; {told}. Go on with: "
+            f"rlctl train --resume {self.run_directory.path}",
+            self.stop_signal,
+        )
+
+    def finish(self) -> None:
+        """Evaluate and save what the training ended with; raises `ArtifactError` if it cannot be saved."""
+        self._boundary_steps = self.model.num_timesteps
+        self.check_finite()
+        self._recent += self.env.take_ended()
+        self._write_metrics(self.model.num_timesteps)
+        self.evaluate()
+        self.logger.dump(self.model.num_timesteps)
+        if not self.save_checkpoint():
+            raise ArtifactError(f"{self.run_directory.path}: the training is done, but could not be saved: {self._unsaved}")
+
+    def save_after_fault(self) -> None:
+        """Save the last boundary: what was collected since is lost, the network is still that of the boundary."""
+        if self._boundary_steps > 0:
+            self.model.num_timesteps = self._boundary_steps
+            self.save_checkpoint()
+
+    def check_finite(self) -> None:
+        """Raise `DivergedError` if a weight is not finite."""
+        for name, parameter in self.model.policy.named_parameters():
+            if not bool(torch.isfinite(parameter).all()):
+                raise DivergedError(
+                    f"training diverged: {name} is not finite at step {self.model.num_timesteps:,}. "
+                    "A smaller algo_kwargs.learning_rate or a smaller reward scale helps most often.\n"
+                    f"The last good checkpoint and policies are in {self.run_directory.path}"
+                )
+
+    def _write_metrics(self, steps: int) -> None:
+        now = time.monotonic()
+        before, steps_before = self._last_row
+        self._last_row = (now, steps)
+        row: dict[str, Any] = {
+            "steps": steps,
+            "seconds": round(now - self._started, 3),
+            "fps": round((steps - steps_before) / max(now - before, 1e-9), 1),
+        }
+        terms = dict.fromkeys(self.env.workers.info.reward_weights)
+        row.update({"return": None, "length": None, "success": None})
+        if self._recent:
+            row["return"] = mean_return(self._recent)
+            row["length"] = float(np.mean([result.length for result in self._recent]))
+            row["success"] = success_rate(self._recent)
+            known = mean_terms(self._recent)
+            terms.update({name: known.get(name) for name in terms})
+        row.update({f"term/{name}": value for name, value in terms.items()})
+        losses = self.logger.name_to_value
+        row.update({name: losses.get(f"train/{name}") for name in _LOSSES})
+        self._saving("metrics", lambda: _append_row(self.run_directory.metrics_file, row))
+        for name, value in terms.items():
+            if value is not None:
+                self.logger.record(f"reward_terms/{name}", value)
+        self.display.metrics(steps, row["fps"], row["return"], row["success"])
+        self._recent = []
+
+    def evaluate(self) -> None:
+        """Live the evaluation episodes, keep the best policy, and write the row and the episodes."""
+        steps = self.model.num_timesteps
+        if self._eval_workers is None:
+            self._eval_workers = self._make_eval_workers()
+        packed = pack(self.model, self.recipe.algo, self.spec, self.env.workers.info)
+        episodes = self._live_episodes(*packed)
+        results = [episode.result for episode in episodes]
+        success, mean = success_rate(results), mean_return(results)
+        progress = self.progress
+        better = self._is_better(success, mean)
+        if better and self._saving("best policy", lambda: save_policy(self.run_directory.best_policy, *packed)):
+            progress.best_success, progress.best_return, progress.best_step = success, mean, steps
+        threshold = self.recipe.stop_success
+        good = threshold is not None and success is not None and success >= threshold
+        progress.good_in_a_row = progress.good_in_a_row + 1 if good else 0
+        progress.evals += 1
+        progress.last_eval_step = steps
+        while progress.next_eval <= steps:
+            progress.next_eval += self.recipe.eval.every_steps or self.recipe.total_timesteps
+        row = {
+            "steps": steps,
+            "seconds": round(time.monotonic() - self._started, 3),
+            "episodes": len(results),
+            "success": success,
+            "return": mean,
+            "length": float(np.mean([result.length for result in results])),
+            **{f"term/{name}": value for name, value in mean_terms(results).items()},
+        }
+        self._saving("evaluation", lambda: _append_row(self.run_directory.evals_file, row))
+        self.logger.record("eval/mean_reward", mean)
+        if success is not None:
+            self.logger.record("eval/success_rate", success)
+        self._saving("episodes", lambda: self.episodes.keep(episodes, steps))
+        self.display.evaluation(steps, success, mean, better)
+
+    def _live_episodes(self, info: PolicyInfo, tensors: dict[str, Any]) -> list[Episode]:
+        assert self._eval_workers is not None
+        was_training = self.model.policy.training
+        policy = TorchPolicy(info, self.model.policy, Normalizer(info, tensors))
+        count = self.recipe.eval.episodes
+        seeds = episode_seeds(self.recipe.seed, Stream.EVAL_IN_TRAINING, count)
+        actor = BatchActor(policy, self._eval_workers.n_envs)
+        episodes = run_episodes(self._eval_workers, actor, seeds, record=True)
+        self.model.policy.set_training_mode(was_training)
+        return episodes
+
+    def _is_better(self, success: float | None, mean: float) -> bool:
+        best = self.progress
+        if best.best_step is None:
+            return True
+        if success is not None and best.best_success is not None and success != best.best_success:
+            return success > best.best_success
+        return mean > best.best_return
+
+    def save_checkpoint(self) -> bool:
+        """Write a checkpoint of the present boundary; False, with a warning, if the disk does not take it."""
+        progress = self.progress
+        progress.seconds = time.monotonic() - self._started
+        progress.metrics_bytes = _size(self.run_directory.metrics_file)
+        progress.evals_bytes = _size(self.run_directory.evals_file)
+        progress.episodes_started = list(self.env.episodes_started)
+        packed = pack(self.model, self.recipe.algo, self.spec, self.env.workers.info)
+        return self._saving(
+            "checkpoint",
+            lambda: self._save(packed, dataclasses.asdict(progress)),
+        )
+
+    def _save(self, packed: Any, progress: dict[str, Any]) -> None:
+        save_policy(self.run_directory.last_policy, *packed)
+        checkpoint.save(self.run_directory, self.model, packed, progress, self.recipe.checkpoint.keep)
+
+    def _saving(self, what: str, write: Callable[[], object]) -> bool:
+        """Write something; a disk that does not take it costs a warning, and the next boundary tries again."""
+        try:
+            write()
+        except OSError as error:
+            self._unsaved = f"{what}: {error.strerror or error}"
+            self.display.message(f"warning: not saved: {self._unsaved}; training goes on")
+            return False
+        return True
+
+    def close(self) -> None:
+        """End the evaluation workers."""
+        if self._eval_workers is not None:
+            self._eval_workers.close()
+
+
+def _append_row(path: Path, row: dict[str, Any]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, row)
+    if not path.exists():
+        writer.writeheader()
+    writer.writerow({key: "" if value is None else value for key, value in row.items()})
+    files.append_line(path, text.getvalue().replace("\r\n", "\n").rstrip("\n"))
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
+
+
+def cut_back(run: RunDirectory, progress: Progress) -> None:
+    """Cut the growing tables back to a checkpoint, so that no row is there twice."""
+    for path, size in ((run.metrics_file, progress.metrics_bytes), (run.evals_file, progress.evals_bytes)):
+        if path.exists() and path.stat().st_size > size:
+            with path.open("r+b") as file:
+                file.truncate(size)

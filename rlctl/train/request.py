@@ -1,0 +1,306 @@
+"""`rlctl train`: from what was asked for to a finished run."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import os
+import platform
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlctl import registry
+from rlctl.errors import DivergedError, Interrupted, RecipeError, RlctlError, TaskError, UsageError
+from rlctl.rollout.workers import Workers
+from rlctl.run import directory, files
+from rlctl.run.directory import RunDirectory
+from rlctl.run.policy import versions
+from rlctl.run.recipe import Recipe, resolve, validate
+from rlctl.train.display import Display, make_display
+
+if TYPE_CHECKING:
+    from rlctl.train.loop import Progress, TrainingLoop
+
+_EVAL_ENVS = 32
+_FOR_RESUME = ("total_timesteps", "stop_success")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainRequest:
+    """What the command line asks for."""
+
+    task: str | None
+    resume: str | None = None
+    config: Path | None = None
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    device: str = "cpu"
+    record: int = 0
+    env_timeout_s: float = 60.0
+    root: Path = directory.ROOT
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainResult:
+    """How a training ended."""
+
+    run: RunDirectory
+    task: str
+    steps: int
+    seconds: float
+    best_step: int | None
+    best_success: float | None
+    best_return: float | None
+    eval_episodes: int
+    recordings: list[Path]
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Start:
+    """Where a training starts: at nothing, or at a checkpoint."""
+
+    task: str
+    recipe: Recipe
+    run: RunDirectory | None = None
+    checkpoint: Path | None = None
+    state: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def run_training(request: TrainRequest) -> TrainResult:
+    """Train, or go on with a run; returns when it is done. Raises `Interrupted` after a signal."""
+    if (request.task is None) == (request.resume is None):
+        raise UsageError("give a task to train, or --resume RUN to go on with a run; one of the two")
+    start = _new(request) if request.task is not None else _resumed(request)
+    if start.state and start.state["counters"]["num_timesteps"] >= start.recipe.total_timesteps:
+        return _nothing_to_do(start)
+    spec = start.recipe.env_spec(start.task)
+    title = f"{'resume' if start.state else 'train'} {start.task} ({start.recipe.algo})"
+    with make_display(title, start.recipe.total_timesteps) as display:
+        # The workers build their environments while this process imports torch.
+        workers = _workers(spec, start.recipe.n_envs, request, display)
+        try:
+            return _train(request, start, spec, workers, display)
+        finally:
+            workers.close()
+
+
+def _new(request: TrainRequest) -> _Start:
+    task = request.task or ""
+    registry.load(task)
+    return _Start(task, resolve(task, request.config, request.settings))
+
+
+def _resumed(request: TrainRequest) -> _Start:
+    from rlctl.train import checkpoint
+
+    for key in request.settings:
+        if key not in _FOR_RESUME:
+            raise UsageError(f"--resume goes on with the run's own recipe: {key} cannot be changed, only -n")
+    if request.config is not None:
+        raise UsageError("--resume goes on with the run's own recipe: leave out --config")
+    run = directory.find_run(request.resume, request.root)
+    recipe = run.recipe()
+    recipe = validate({**recipe.model_dump(), **request.settings}, "recipe")
+    folder, state = checkpoint.newest(run)
+    return _Start(run.status()["task"], recipe, run, folder, state)
+
+
+def _nothing_to_do(start: _Start) -> TrainResult:
+    assert start.run is not None
+    progress = start.state["progress"]
+    return TrainResult(
+        start.run,
+        start.task,
+        start.state["counters"]["num_timesteps"],
+        progress["seconds"],
+        progress["best_step"],
+        progress["best_success"],
+        progress["best_return"],
+        start.recipe.eval.episodes,
+        [],
+        note="this run is finished already: nothing to do; -n makes it longer",
+    )
+
+
+def _workers(spec: registry.EnvSpec, n_envs: int, request: TrainRequest, display: Display) -> Workers:
+    return Workers(spec, n_envs, timeout_s=request.env_timeout_s, on_output=display.message)
+
+
+def _train(
+    request: TrainRequest, start: _Start, spec: registry.EnvSpec, workers: Workers, display: Display
+) -> TrainResult:
+    from rlctl.run.torch_policy import pin_threads
+    from rlctl.train import checkpoint
+    from rlctl.train.algorithms import build_model
+    from rlctl.train.loop import Progress, TrainingLoop, cut_back
+    from rlctl.train.tensorboard import make_logger
+    from rlctl.train.vec_env import WorkerVecEnv
+
+    pin_threads()
+    recipe = start.recipe
+    if recipe.stop_success is not None and not _may_succeed(workers):
+        raise RecipeError(f"stop_success: {start.task} does not report success; leave it out")
+    progress = Progress(next_eval=recipe.eval.every_steps or recipe.total_timesteps)
+    if start.state:
+        progress = Progress(**start.state["progress"])
+    env = WorkerVecEnv(workers, recipe.seed, list(progress.episodes_started) or None)
+    model = build_model(recipe, env, request.device)
+    if start.checkpoint is not None:
+        checkpoint.restore(model, start.checkpoint, dict(start.state))
+    run = start.run or directory.create(start.task, recipe.seed, request.root)
+    lock = run.lock()
+    if start.state:
+        cut_back(run, progress)
+    _write_start(run, start, request)
+    model.set_logger(make_logger(run.tensorboard, display.message))
+
+    def make_eval_workers() -> Workers:
+        return _workers(spec, min(recipe.eval.episodes, _EVAL_ENVS), request, display)
+
+    loop = TrainingLoop(run, recipe, env, make_eval_workers, progress, display, spec)
+    try:
+        with _signals(loop, display):
+            _learn(model, loop, recipe)
+        recordings = _record(loop, request.record)
+    except RlctlError as error:
+        run.write_status({"status": _STATUS.get(type(error), "failed"), "error": str(error), "ended": _now()})
+        raise
+    finally:
+        loop.close()
+        lock.release()
+    _write_end(run, model.num_timesteps, loop)
+    return _result(run, start, model.num_timesteps, progress, recordings)
+
+
+_STATUS: dict[type[RlctlError], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
+
+
+def _may_succeed(workers: Workers) -> bool:
+    # Of a plain environment it is not known before an episode has ended.
+    return workers.info.has_success or not workers.info.reward_weights
+
+
+def _learn(model: Any, loop: TrainingLoop, recipe: Recipe) -> None:
+    from rlctl.train.loop import TrainingStopped
+
+    try:
+        model.learn(
+            max(recipe.total_timesteps - model.num_timesteps, 1),
+            callback=loop,
+            reset_num_timesteps=False,
+        )
+    except TrainingStopped:
+        return
+    except TaskError:
+        loop.save_after_fault()
+        raise
+    except ValueError:
+        loop.check_finite()  # SB3 notices NaN weights by a distribution's complaint
+        raise
+    loop.finish()
+
+
+@contextlib.contextmanager
+def _signals(loop: TrainingLoop, display: Display) -> Iterator[None]:
+    """Let SIGINT and SIGTERM end the training at the next boundary; a second one ends it now."""
+
+    def handle(number: int, frame: Any) -> None:
+        if loop.stop_signal is not None:
+            raise Interrupted("interrupted again: stopped at once, the last checkpoint stands", number)
+        loop.stop_signal = number
+        display.message("stopping after this update, with a checkpoint; once more to stop now")
+
+    # Set even where a shell has made SIGINT ignored, as for a command in the background.
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _record(loop: TrainingLoop, count: int) -> list[Path]:
+    if not count:
+        return []
+    from rlctl.replay.recording import record_episode
+
+    recordings = []
+    for path, episode in loop.episodes.latest(count):
+        recording = path.with_suffix(".rrd")
+        record_episode(episode, recording, title=f"{loop.run_directory.path.name} / episode {path.stem}")
+        recordings.append(recording)
+    return recordings
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def _write_start(run: RunDirectory, start: _Start, request: TrainRequest) -> None:
+    files.write_text(run.recipe_file, start.recipe.to_yaml())
+    changes: dict[str, Any] = {
+        "status": "running",
+        "error": None,
+        "task": start.task,
+        "origin": registry.origin(start.task),
+        "algo": start.recipe.algo,
+        "seed": start.recipe.seed,
+        "device": request.device,
+        "versions": versions(),
+        "git_commit": _git_commit(),
+        "command": ["rlctl", *sys.argv[1:]],
+        "host": platform.node(),
+        "pid": os.getpid(),
+    }
+    if start.state:
+        changes["resumed"] = _now()
+        changes["resumed_at_step"] = start.state["counters"]["num_timesteps"]
+    else:
+        changes["started"] = _now()
+    run.write_status(changes)
+
+
+def _git_commit() -> str | None:
+    try:
+        found = subprocess.run(
+            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5.0, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return found.stdout.strip() or None
+
+
+def _write_end(run: RunDirectory, steps: int, loop: TrainingLoop) -> None:
+    progress = loop.progress
+    run.write_status(
+        {
+            "status": "finished",
+            "ended": _now(),
+            "steps": steps,
+            "seconds": round(progress.seconds, 3),
+            "best_step": progress.best_step,
+            "best_success": progress.best_success,
+            "best_return": progress.best_return,
+        }
+    )
+
+
+def _result(
+    run: RunDirectory, start: _Start, steps: int, progress: Progress, recordings: list[Path]
+) -> TrainResult:
+    return TrainResult(
+        run,
+        start.task,
+        steps,
+        progress.seconds,
+        progress.best_step,
+        progress.best_success,
+        progress.best_return,
+        start.recipe.eval.episodes,
+        recordings,
+    )

@@ -1,0 +1,53 @@
+"""What a training prints at its end."""
+
+from __future__ import annotations
+
+from rlctl import output
+from rlctl.train.display import duration, percent
+from rlctl.train.request import TrainResult
+
+
+def show(result: TrainResult, json: str | None) -> None:
+    """Print the result and what to type next, or write it as JSON."""
+    if json is not None:
+        output.write_result_json(
+            json,
+            {
+                "run": str(result.run.path),
+                "task": result.task,
+                "steps": result.steps,
+                "seconds": round(result.seconds, 3),
+                "best": {
+                    "step": result.best_step,
+                    "success_rate": result.best_success,
+                    "mean_return": result.best_return,
+                    "episodes": result.eval_episodes,
+                    "policy": str(result.run.best_policy),
+                },
+                "recordings": [str(path) for path in result.recordings],
+                "note": result.note,
+            },
+        )
+        return
+    out = output.out()
+    run = result.run.path
+    if result.note:
+        out.print(result.note)
+    out.print(f"trained {result.task}: {result.steps:,} steps in {duration(result.seconds)}")
+    if result.best_return is not None and result.best_step is not None:
+        success = "" if result.best_success is None else f"success {percent(result.best_success)}, "
+        out.print(
+            f"best at step {result.best_step:,}: {success}return {result.best_return:.2f} "
+            f"(mean of {result.eval_episodes} episodes)"
+        )
+    for path in result.recordings:
+        out.print(f"recording: rerun {path}")
+    out.print(f"run: {run}")
+    out.print("next:")
+    for command in (
+        f"rlctl eval {run}",
+        f"rlctl export {run} --onnx",
+        f"rlctl replay {run}",
+        f"tensorboard --logdir {result.run.tensorboard}",
+    ):
+        out.print(f"  {command}", markup=False)

@@ -1,0 +1,35 @@
+"""SB3's logger, writing TensorBoard files; a full disk costs the log, not the training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
+
+
+class _TensorBoard(KVWriter):
+    def __init__(self, folder: Path, warn: Callable[[str], None]) -> None:
+        self._format: TensorBoardOutputFormat | None = TensorBoardOutputFormat(str(folder))
+        self._warn = warn
+
+    def write(self, key_values: dict[str, Any], key_excluded: Mapping[str, tuple[str, ...]], step: int = 0) -> None:
+        if self._format is None:
+            return
+        try:
+            self._format.write(key_values, dict(key_excluded), step)
+        except OSError as error:
+            self._warn(f"warning: no more TensorBoard logs: {error.strerror or error}")
+            self._format = None
+
+    def close(self) -> None:
+        if self._format is not None:
+            self._format.close()
+            self._format = None
+
+
+def make_logger(folder: Path, warn: Callable[[str], None]) -> Logger:
+    """Return a logger that writes to a TensorBoard folder; `warn` is told if it cannot."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return Logger(str(folder), [_TensorBoard(folder, warn)])
