@@ -44,9 +44,7 @@ Json = Annotated[
     typer.Option("--json", metavar="FILE", help="Write the result as JSON; - for stdout.", show_default=False),
 ]
 Seed = Annotated[Optional[int], typer.Option(help="Seed.", min=0)]  # noqa: UP045
-EnvTimeout = Annotated[
-    float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1)
-]
+EnvTimeout = Annotated[float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1)]
 NEnvs = Annotated[Optional[int], typer.Option(help="Environments stepped side by side.", min=1, show_default=False)]  # noqa: UP045
 Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]
 
@@ -92,7 +90,9 @@ def train(
     ] = None,
     resume: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(metavar="RUN", help="Go on with a run instead: a folder, a task's name, or latest.", show_default=False),
+        typer.Option(
+            metavar="RUN", help="Go on with a run instead: a folder, a task's name, or latest.", show_default=False
+        ),
     ] = None,
     config: Annotated[
         Optional[Path],  # noqa: UP045
@@ -106,19 +106,23 @@ def train(
     seed: Annotated[Optional[int], typer.Option(help="Seed of everything random.", show_default=False)] = None,  # noqa: UP045
     total_timesteps: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option("--total-timesteps", "-n", metavar="STEPS", help="Environment steps; 1e6 is fine.", show_default=False),
+        typer.Option(
+            "--total-timesteps", "-n", metavar="STEPS", help="Environment steps; 1e6 is fine.", show_default=False
+        ),
     ] = None,
     n_envs: NEnvs = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, or auto.")] = "cpu",
     stop_success: Annotated[
         Optional[float],  # noqa: UP045
-        typer.Option(metavar="RATE", help="Stop after two evaluations in a row at this success rate.", show_default=False),
+        typer.Option(
+            metavar="RATE", help="Stop after two evaluations in a row at this success rate.", show_default=False
+        ),
     ] = None,
     record: Annotated[int, typer.Option(metavar="N", help="Write the last N evaluation episodes as .rrd.", min=0)] = 0,
     env_timeout: EnvTimeout = 60.0,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where run folders go.")
-    ] = Path("runs"),
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where run folders go.")] = Path(
+        "runs"
+    ),
     json: Json = None,
 ) -> None:
     """Train a policy, evaluate as it goes, and keep the best and the last."""
@@ -152,7 +156,9 @@ def evaluate(
     episodes: Annotated[int, typer.Option("--episodes", help="Episodes, each with its own seed.", min=1)] = 100,
     seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
     settings: Set = [],  # noqa: B006
-    stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions instead of taking the mean.")] = False,
+    stochastic: Annotated[
+        bool, typer.Option("--stochastic", help="Sample actions instead of taking the mean.")
+    ] = False,
     n_envs: NEnvs = None,
     min_success: Annotated[
         Optional[float],  # noqa: UP045
@@ -199,7 +205,9 @@ def export(
     checkpoint: Checkpoint = "best",
     output: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option("--output", "-o", metavar="FILE", help="Default: exports/policy.onnx of the run.", show_default=False),
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Default: exports/policy.onnx of the run.", show_default=False
+        ),
     ] = None,
     json: Json = None,
 ) -> None:
@@ -233,12 +241,20 @@ def replay(
     settings: Set = [],  # noqa: B006
     verify: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(metavar="EPISODE", help="Live a recorded episode again; exit 1 unless identical.", show_default=False),
+        typer.Option(
+            metavar="EPISODE", help="Live a recorded episode again; exit 1 unless identical.", show_default=False
+        ),
     ] = None,
     gui: Annotated[bool, typer.Option("--gui", help="Show it in PyBullet's window instead of recording.")] = False,
     output: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option("--output", "-o", metavar="PATH", help="An .rrd file or a folder. Default: episodes/ of the run.", show_default=False),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="PATH",
+            help="An .rrd file or a folder. Default: episodes/ of the run.",
+            show_default=False,
+        ),
     ] = None,
     json: Json = None,
 ) -> None:

@@ -134,7 +134,7 @@ class EnvSpec:
         from rlctl.task.events import EventSettings
 
         parameters = _task_parameters(constructor, self.parameters)
-        return _guarded(
+        env: gymnasium.Env[Any, Any] = _guarded(
             self.task,
             lambda: TaskEnv(
                 constructor(**parameters),
@@ -143,6 +143,7 @@ class EnvSpec:
                 events=EventSettings(self.randomize, self.events),
             ),
         )
+        return env
 
     def _make_plain_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
         parameters = dict(self.parameters)
@@ -338,8 +339,7 @@ def _check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) 
 
 def _no_parameter(task: str, key: str, known: list[str]) -> RecipeError:
     return RecipeError(
-        f"task.{key}: {task} has no parameter {key!r}.{did_you_mean(key, known)} "
-        f"It has: {', '.join(known) or 'none'}."
+        f"task.{key}: {task} has no parameter {key!r}.{did_you_mean(key, known)} It has: {', '.join(known) or 'none'}."
     )
 
 
@@ -365,7 +365,6 @@ def _task_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 
 def _stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any, Any]:
     """Observe the last `frames` observations, oldest first, along the last axis."""
-    import gymnasium
     import numpy as np
     from gymnasium import spaces
     from gymnasium.wrappers import FrameStackObservation, TransformObservation
@@ -377,7 +376,7 @@ def _stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[An
     stacked = spaces.Box(
         np.concatenate([space.low] * frames, axis=-1),
         np.concatenate([space.high] * frames, axis=-1),
-        dtype=space.dtype.type,  # type: ignore[arg-type]
+        dtype=space.dtype.type,
     )
     wrapped = FrameStackObservation(env, frames)
     flat: gymnasium.Env[Any, Any] = TransformObservation(

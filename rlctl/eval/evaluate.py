@@ -132,9 +132,7 @@ def _live(workers: Workers, policy: Policy, request: EvalRequest) -> list[Episod
         )
 
 
-def _statistics(
-    path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, episodes: list[Episode]
-) -> Evaluation:
+def _statistics(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, episodes: list[Episode]) -> Evaluation:
     results = [episode.result for episode in episodes]
     distances = [result.final_distance for result in results if result.final_distance is not None]
     return Evaluation(

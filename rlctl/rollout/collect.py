@@ -122,9 +122,7 @@ class _Recorder:
             observations: Observations = {key: np.stack([step[key] for step in steps]) for key in last}
         else:
             observations = np.stack(steps)
-        return Trajectory(
-            observations, np.stack(self._actions), np.array(self._rewards), np.stack(self._terms)
-        )
+        return Trajectory(observations, np.stack(self._actions), np.array(self._rewards), np.stack(self._terms))
 
 
 def _row(observations: Observations, place: int) -> Any:

@@ -31,9 +31,7 @@ class EpisodeAddress:
     @property
     def seed(self) -> int:
         """The seed given to `env.reset`, in [0, 2**31)."""
-        sequence = np.random.SeedSequence(
-            self.run_seed, spawn_key=(int(self.stream), self.env_index, self.episode)
-        )
+        sequence = np.random.SeedSequence(self.run_seed, spawn_key=(int(self.stream), self.env_index, self.episode))
         # Some environments hand the seed to a 32-bit signed generator.
         return int(sequence.generate_state(1)[0]) >> 1
 

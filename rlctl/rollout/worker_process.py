@@ -14,6 +14,7 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -81,9 +82,7 @@ class _Worker:
         self.arrays: SharedArrays
 
     def attach(self) -> None:
-        self.arrays = SharedArrays(
-            self.descriptor, self.total, self.space, self.action_space, len(self.term_names)
-        )
+        self.arrays = SharedArrays(self.descriptor, self.total, self.space, self.action_space, len(self.term_names))
 
     def store(self, place: dict[str, Any], episode: _Episode, observation: Any) -> None:
         parts = observation if isinstance(observation, dict) else {SINGLE: observation}
@@ -107,7 +106,7 @@ class _Worker:
             if seed < 0:
                 episode.active = False
             else:
-                self.guarded(episode, lambda e=episode, s=seed: self.begin(e, s))  # type: ignore[misc]
+                self.guarded(episode, self.begin, seed)
         return []
 
     def begin(self, episode: _Episode, seed: int) -> None:
@@ -117,7 +116,7 @@ class _Worker:
         ended: list[dict[str, Any]] = []
         for episode in self.episodes:
             if episode.active:
-                self.guarded(episode, lambda e=episode: self.step_one(e, ended))  # type: ignore[misc]
+                self.guarded(episode, self.step_one, ended)
         return ended
 
     def step_one(self, episode: _Episode, ended: list[dict[str, Any]]) -> None:
@@ -147,9 +146,9 @@ class _Worker:
         else:
             episode.active = False
 
-    def guarded(self, episode: _Episode, call: Any) -> None:
+    def guarded(self, episode: _Episode, call: Callable[[_Episode, Any], None], argument: Any) -> None:
         try:
-            call()
+            call(episode, argument)
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             raise _EpisodeFailed(episode) from error
 
@@ -180,10 +179,8 @@ def _end_with_parent() -> None:
         if hasattr(os, "pidfd_open"):
             import select
 
-            try:
+            with contextlib.suppress(ProcessLookupError):
                 select.select([os.pidfd_open(parent)], [], [])
-            except ProcessLookupError:
-                pass
         else:
             import time
 
@@ -238,4 +235,3 @@ def _serve() -> None:
             connection.send_bytes(b"")
     for episode in worker.episodes:
         episode.env.close()
-

@@ -7,6 +7,7 @@ ended. Workers are fresh interpreters, never forks, with one thread each.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import signal
@@ -76,7 +77,7 @@ class Workers:
         self._spec = spec
         n_workers = min(n_envs, n_workers or available_cores())
         bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
-        self._ranges = list(zip(bounds[:-1], bounds[1:], strict=True))
+        self._ranges = list(itertools.pairwise(bounds))
         self._memory = anonymous_file()
         self._processes: list[subprocess.Popen[bytes]] = []
         self._connections: list[Connection] = []
@@ -201,9 +202,9 @@ class Workers:
             if not ready:
                 self._fail(self._hang(list(pending.values()), timeout_s, doing))
             for connection in ready:
-                worker = pending.pop(connection)  # type: ignore[arg-type]
+                worker = pending.pop(connection)
                 try:
-                    content = connection.recv_bytes()  # type: ignore[union-attr]
+                    content = self._connections[worker].recv_bytes()
                 except (EOFError, OSError):
                     self._fail(self._death(worker, doing))
                 answer = json.loads(content) if content else {}
@@ -274,9 +275,9 @@ class Workers:
 
 
 def _picked(arrays: dict[str, NDArray[Any]], rows: Any) -> Observations:
-    if SINGLE in arrays:
-        return arrays[SINGLE][rows].copy()
-    return {key: array[rows].copy() for key, array in arrays.items()}
+    picked: dict[str, Any] = {key: array[rows].copy() for key, array in arrays.items()}
+    result: Observations = picked.get(SINGLE, picked)
+    return result
 
 
 def _forward(read_end: int, receive: Callable[[str], None]) -> None:
@@ -295,4 +296,3 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-

@@ -85,7 +85,8 @@ def save_episode(path: Path, episode: RecordedEpisode) -> None:
 def load_episode(path: Path) -> RecordedEpisode:
     """Read an episode; raises `ArtifactError` if the file is missing, damaged, not ours or of a newer format."""
     arrays = files.read_npz(path)
-    if not {"info", "actions", "rewards", "terms"} <= arrays.keys():
+    observed = any(key.startswith("observations") for key in arrays)
+    if not observed or not {"info", "actions", "rewards", "terms"} <= arrays.keys():
         raise ArtifactError(f"{path}: not an episode of rlctl: it has no info, actions, rewards and terms")
     try:
         data = json.loads(str(arrays["info"]))
@@ -95,8 +96,6 @@ def load_episode(path: Path) -> RecordedEpisode:
     except (ValueError, AttributeError, pydantic.ValidationError) as error:
         raise ArtifactError(f"{path}: its description is damaged: {str(error).splitlines()[0]}") from None
     prefix = "observations/"
-    observations: Observations = arrays.get(
-        "observations",
-        {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)},  # type: ignore[arg-type]
-    )
+    parts = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
+    observations: Observations = parts or arrays["observations"]
     return RecordedEpisode(info, arrays["actions"], observations, arrays["rewards"], arrays["terms"])

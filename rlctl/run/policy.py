@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pydantic
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 import rlctl
@@ -123,11 +124,18 @@ class Policy(abc.ABC):
     def __init__(self, info: PolicyInfo) -> None:
         self.info = info
         self.observation_space, self.action_space = info.env.spaces()
+        self._expected = (
+            {key: space.shape for key, space in self.observation_space.spaces.items()}
+            if isinstance(self.observation_space, spaces.Dict)
+            else self.observation_space.shape
+        )
         self._own: BatchActor | None = None
         self._starts = True
 
     @abc.abstractmethod
-    def forward(self, observations: Observations, state: State | None, deterministic: bool) -> tuple[NDArray[Any], State | None]:
+    def forward(
+        self, observations: Observations, state: State | None, deterministic: bool
+    ) -> tuple[NDArray[Any], State | None]:
         """Return the actions for `ROWS` observations, as the environment takes them, and the next state."""
 
     @abc.abstractmethod
@@ -142,13 +150,8 @@ class Policy(abc.ABC):
         if self._own is None:
             self._own = BatchActor(self, 1)
         self._own.deterministic = deterministic
-        if isinstance(observation, dict):
-            batch: Observations = {key: np.asarray(value)[None] for key, value in observation.items()}
-            shapes = {key: value.shape[1:] for key, value in batch.items()}
-            expected: Any = {key: space.shape for key, space in self.observation_space.spaces.items()}  # type: ignore[attr-defined]
-        else:
-            batch = np.asarray(observation)[None]
-            shapes, expected = batch.shape[1:], self.observation_space.shape  # type: ignore[assignment]
+        batch = _map(observation, lambda value: np.asarray(value)[None])
+        shapes, expected = _shapes(_map(batch, lambda value: value[0])), self._expected
         if shapes != expected:
             raise ValueError(f"observation of shape {shapes}, the policy wants {expected}")
         action = self._own.act(batch, np.array([0]), np.array([self._starts]))[0]
@@ -183,7 +186,7 @@ class BatchActor:
             if self._state is not None:
                 state = tuple(_padded(part[:, block], axis=1) for part in self._state)
             actions, after = self.policy.forward(
-                _map(observations, lambda value, low=low: _padded(value[low : low + ROWS])),  # type: ignore[misc]
+                _map(observations, lambda value, low=low: _padded(value[low : low + ROWS])),
                 state,
                 self.deterministic,
             )
@@ -194,11 +197,14 @@ class BatchActor:
         return np.concatenate(blocks)
 
 
-def _map(observations: Observations, function: Any) -> Observations:
+def _map(observations: Any, function: Any) -> Any:
     if isinstance(observations, dict):
         return {key: function(value) for key, value in observations.items()}
-    result: NDArray[Any] = function(observations)
-    return result
+    return function(observations)
+
+
+def _shapes(observation: Any) -> Any:
+    return _map(observation, np.shape)
 
 
 def _padded(values: NDArray[Any], axis: int = 0) -> NDArray[Any]:

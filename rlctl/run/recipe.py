@@ -78,9 +78,7 @@ class Recipe(_Section):
 
     def env_spec(self, task: str) -> registry.EnvSpec:
         """Return what the environments of this recipe are made from."""
-        return registry.EnvSpec(
-            task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack
-        )
+        return registry.EnvSpec(task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack)
 
     def to_yaml(self) -> str:
         """Return the recipe as YAML that is itself valid for `--config`."""
@@ -213,10 +211,8 @@ def _explain(problem: Any) -> str:
     path = [str(part) for part in problem["loc"]]
     key = ".".join(path)
     if problem["type"] == "extra_forbidden":
-        model: type[pydantic.BaseModel] = {"normalize": Normalize, "eval": Evaluation, "checkpoint": Checkpoints}.get(
-            path[0], Recipe
-        )
-        names = list(model.model_fields)
+        sections: dict[str, type[_Section]] = {"normalize": Normalize, "eval": Evaluation, "checkpoint": Checkpoints}
+        names = list(sections.get(path[0], Recipe).model_fields)
         return f"no key {key!r}.{did_you_mean(path[-1], names)} Keys here: {', '.join(names)}."
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if problem["type"] == "value_error":

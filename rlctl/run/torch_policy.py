@@ -89,7 +89,7 @@ def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
     if isinstance(space, spaces.Dict):
         # Pairs, because from a plain dict Gymnasium would sort the keys, and the network takes them in their order.
         return spaces.Dict([(key, network_space(value)) for key, value in space.spaces.items()])
-    if is_image_space(space) and not is_image_space_channels_first(space):
+    if isinstance(space, spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
         return VecTransposeImage.transpose_space(space)
     return space
 
@@ -108,7 +108,7 @@ def describe_network(policy: BasePolicy) -> dict[str, Any]:
 
 def _not_told(policy: BasePolicy) -> dict[str, Any]:
     """Arguments that change a network and that its own `_get_constructor_parameters` leaves out."""
-    left_out = {}
+    left_out: dict[str, Any] = {}
     if hasattr(policy, "share_features_extractor"):
         left_out["share_features_extractor"] = policy.share_features_extractor
     if isinstance(policy, RecurrentActorCriticPolicy):
@@ -152,8 +152,7 @@ class Normalizer:
             return observations
         if isinstance(observations, dict):
             return {
-                key: self._one(key, value) if key in self._statistics else value
-                for key, value in observations.items()
+                key: self._one(key, value) if key in self._statistics else value for key, value in observations.items()
             }
         return self._one("", observations)
 
@@ -193,14 +192,15 @@ class TorchPolicy(Policy):
     def initial_state(self) -> State | None:
         if self.info.algo != "recurrent_ppo":
             return None
-        shape = (self.network.lstm_actor.num_layers, ROWS, self.network.lstm_actor.hidden_size)
+        lstm: Any = self.network.lstm_actor
+        shape = (lstm.num_layers, ROWS, lstm.hidden_size)
         return (np.zeros(shape, np.float32), np.zeros(shape, np.float32))
 
     def forward(
         self, observations: Observations, state: State | None, deterministic: bool
     ) -> tuple[NDArray[Any], State | None]:
         actions, after = self.network.predict(
-            self.normalizer(observations),  # type: ignore[arg-type]
+            self.normalizer(observations),
             state=state,
             episode_start=None if state is None else np.zeros(ROWS, np.bool_),
             deterministic=deterministic,

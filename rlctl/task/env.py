@@ -113,11 +113,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         else:
             self.sim.clear()
             self._build()
-        drawn = {
-            name: event(self.sim, self.np_random)
-            for name, event in self.events.items()
-            if event.when == "reset"
-        }
+        drawn = {name: event(self.sim, self.np_random) for name, event in self.events.items() if event.when == "reset"}
         self.task.reset(self.np_random)
         self._step = 0
         self._running = True

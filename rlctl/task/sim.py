@@ -180,9 +180,7 @@ class Sim:
     `control_dt` [s] is simulated by one call with `substeps` physics steps: forces then act on every one of them.
     """
 
-    def __init__(
-        self, *, control_dt: float, substeps: int, solver_iterations: int = 50, gui: bool = False
-    ) -> None:
+    def __init__(self, *, control_dt: float, substeps: int, solver_iterations: int = 50, gui: bool = False) -> None:
         self.client: int = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self.client < 0:
             raise TaskError("PyBullet could not open a window: is there a display? Leave out --gui to do without.")
@@ -268,7 +266,7 @@ class Sim:
         )
         return marker
 
-    def move_marker(self, marker: int, position: Sequence[float]) -> None:
+    def move_marker(self, marker: int, position: Sequence[float] | Array) -> None:
         """Move a marker to a world position [m]."""
         pybullet.resetBasePositionAndOrientation(marker, position, (0, 0, 0, 1), physicsClientId=self.client)
 

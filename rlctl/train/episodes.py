@@ -29,7 +29,9 @@ class EpisodeKeeper:
         """Write the first and the worst of an evaluation; remember all of it for `latest`."""
         recorded = [self._recorded(episode, steps) for episode in episodes]
         self._latest = deque(recorded, maxlen=_LATEST)
-        worst = min(range(len(episodes)), key=lambda i: (episodes[i].result.success is True, episodes[i].result.total_reward))
+        worst = min(
+            range(len(episodes)), key=lambda i: (episodes[i].result.success is True, episodes[i].result.total_reward)
+        )
         for index in dict.fromkeys((0, worst)):
             self._write(recorded[index])
 
@@ -61,6 +63,4 @@ class EpisodeKeeper:
             term_names=list(self.info.reward_weights),
             versions=versions(),
         )
-        return RecordedEpisode(
-            info, trajectory.actions, trajectory.observations, trajectory.rewards, trajectory.terms
-        )
+        return RecordedEpisode(info, trajectory.actions, trajectory.observations, trajectory.rewards, trajectory.terms)

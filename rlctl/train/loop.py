@@ -149,7 +149,9 @@ class TrainingLoop(BaseCallback):
         self.evaluate()
         self.logger.dump(self.model.num_timesteps)
         if not self.save_checkpoint():
-            raise ArtifactError(f"{self.run_directory.path}: the training is done, but could not be saved: {self._unsaved}")
+            raise ArtifactError(
+                f"{self.run_directory.path}: the training is done, but could not be saved: {self._unsaved}"
+            )
 
     def save_after_fault(self) -> None:
         """Save the last boundary: what was collected since is lost, the network is still that of the boundary."""
@@ -196,7 +198,7 @@ class TrainingLoop(BaseCallback):
 
     def evaluate(self) -> None:
         """Live the evaluation episodes, keep the best policy, and write the row and the episodes."""
-        steps = self.model.num_timesteps
+        steps, began = self.model.num_timesteps, time.monotonic()
         if self._eval_workers is None:
             self._eval_workers = self._make_eval_workers()
         packed = pack(self.model, self.recipe.algo, self.spec, self.env.workers.info)
@@ -229,6 +231,8 @@ class TrainingLoop(BaseCallback):
             self.logger.record("eval/success_rate", success)
         self._saving("episodes", lambda: self.episodes.keep(episodes, steps))
         self.display.evaluation(steps, success, mean, better)
+        # The rate of training is without the time of evaluations.
+        self._last_row = (self._last_row[0] + time.monotonic() - began, steps)
 
     def _live_episodes(self, info: PolicyInfo, tensors: dict[str, Any]) -> list[Episode]:
         assert self._eval_workers is not None

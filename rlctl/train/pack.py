@@ -15,9 +15,7 @@ from rlctl.run.policy import PolicyInfo, versions
 from rlctl.run.torch_policy import describe_network, policy_name
 
 
-def pack(
-    model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo
-) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
+def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
     """Return description and tensors of a model's policy, with the normalisation it has now.
 
     The arrays are copies: training may go on.

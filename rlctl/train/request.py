@@ -267,9 +267,7 @@ def _write_start(run: RunDirectory, start: _Start, request: TrainRequest) -> Non
 
 def _git_commit() -> str | None:
     try:
-        found = subprocess.run(
-            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5.0, check=False
-        )
+        found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5.0, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return found.stdout.strip() or None
@@ -290,9 +288,7 @@ def _write_end(run: RunDirectory, steps: int, loop: TrainingLoop) -> None:
     )
 
 
-def _result(
-    run: RunDirectory, start: _Start, steps: int, progress: Progress, recordings: list[Path]
-) -> TrainResult:
+def _result(run: RunDirectory, start: _Start, steps: int, progress: Progress, recordings: list[Path]) -> TrainResult:
     return TrainResult(
         run,
         start.task,

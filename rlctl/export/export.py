@@ -1,0 +1,104 @@
+"""`rlctl export`: a policy file becomes an ONNX file, which is kept only if it acts the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
+from rlctl.export.report import ExportReport, Port, agreement_line, closed_loop_line
+from rlctl.rollout.workers import Workers
+from rlctl.run import directory, files
+from rlctl.run.policy import PolicyInfo, read_policy
+
+if TYPE_CHECKING:
+    import onnx
+
+
+def export_onnx(run: str | None, *, checkpoint: str, output: Path | None) -> ExportReport:
+    """Export a policy to ONNX and verify it in its own environment.
+
+    `run` is what the user typed: a run, a policy file, or None for the latest run. The file is written to `output`,
+    by default into the run's folder, or beside a policy file that belongs to none. Raises `UsageError` for a policy
+    that cannot be written as ONNX, and `AnswerIsNo` with the numbers if the file does not act as the policy does;
+    then no file is left.
+    """
+    policy_file, owner = directory.find_policy(run, checkpoint)
+    if policy_file.suffix == ".onnx":
+        raise UsageError(f"{policy_file}: an ONNX file already; give the run or the .safetensors file to export it anew")
+    if output is None:
+        output = owner.onnx_file if owner else policy_file.with_suffix(".onnx")
+    if output.suffix != ".onnx":
+        raise UsageError(f"--output {output}: the name of an ONNX file ends in .onnx")
+    return _export(policy_file, output)
+
+
+def _export(policy_file: Path, target: Path) -> ExportReport:
+    from rlctl.export.verify import N_ENVS
+
+    info, tensors = read_policy(policy_file)
+    # The environments are built while torch is imported.
+    with Workers(info.env_spec(), N_ENVS) as workers:
+        from rlctl.export.actor import build
+        from rlctl.run.torch_policy import TorchPolicy, pin_threads
+
+        pin_threads()
+        policy = TorchPolicy.load(policy_file)
+        model = build(info, policy.network, tensors)
+        _check_environment(policy_file, info, workers)
+        reports: list[ExportReport] = []
+
+        def write(part: Path) -> None:
+            part.write_bytes(model.SerializeToString())
+            reports.append(_verified(policy_file, target, part, policy, model, workers))
+
+        files.write_with(target, write)
+    return reports[0]
+
+
+def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) -> None:
+    try:
+        built = workers.info
+    except (UsageError, TaskError) as error:
+        message = f"{policy_file}: the export cannot be verified, its environment does not build: {error}"
+        raise type(error)(message, details=error.details) from None
+    if difference := info.env.difference(built):
+        raise ArtifactError(
+            f"{policy_file}: the export cannot be verified, its environment has changed: {difference}; "
+            "train again, or go back to the task's former version"
+        )
+
+
+def _verified(
+    policy_file: Path, target: Path, part: Path, policy: Any, model: onnx.ModelProto, workers: Workers
+) -> ExportReport:
+    from rlctl.export.latency import measure
+    from rlctl.export.verify import verify
+    from rlctl.run.onnx_policy import OnnxPolicy
+
+    exported = OnnxPolicy.load(part)
+    seen = verify(policy, exported, workers)
+    if not seen.passed:
+        raise AnswerIsNo(
+            f"{target}: not verified, not kept: the ONNX file does not act as {policy_file} does\n"
+            f"{agreement_line(seen.agreement)}\n{closed_loop_line(seen.closed_loop)}"
+        )
+    info = policy.info
+    return ExportReport(
+        path=target,
+        policy=policy_file,
+        task=info.task,
+        algo=info.algo,
+        training_steps=info.training_steps,
+        size=part.stat().st_size,
+        opset=model.opset_import[0].version,
+        inputs=_ports(exported.session.get_inputs()),
+        outputs=_ports(exported.session.get_outputs()),
+        agreement=seen.agreement,
+        closed_loop=seen.closed_loop,
+        latency=measure(policy, exported),
+    )
+
+
+def _ports(found: Any) -> list[Port]:
+    return [Port(each.name, each.type[len("tensor(") : -1], tuple(each.shape)) for each in found]
