@@ -316,6 +316,11 @@ def run(arguments: list[str]) -> int:
     except BrokenPipeError:
         _close_stdout()
         return 141
+    except SystemExit as end:
+        if isinstance(end.__context__, BrokenPipeError):  # what Typer and Rich make of it
+            _close_stdout()
+            return 141
+        raise
     except Exception as error:
         return _tell_unexpected(error)
 

@@ -62,8 +62,8 @@ def installed() -> list[TaskEntry]:
         if (point.name, point.value) in seen:  # a checkout on sys.path beside its own installation
             continue
         seen.add((point.name, point.value))
-        distribution = point.dist.name if point.dist else "?"
-        version = point.dist.version if point.dist else "?"
+        distribution = (point.dist and point.dist.name) or "?"
+        version = (point.dist and point.dist.version) or "?"
         found.append(TaskEntry(point.name, point.value, distribution, version))
     found.sort(key=lambda entry: (entry.name, entry.distribution != OURS, entry.distribution))
     entries: list[TaskEntry] = []
@@ -90,18 +90,25 @@ def check_import(entry: TaskEntry, timeout_s: float = 60.0) -> str | None:
     code = (
         "import sys; sys.path.insert(0, ''); from rlctl import registry; from rlctl.errors import RlctlError\n"
         f"try: registry.load({entry.target!r})\n"
-        "except RlctlError as error: print('\\n@' + str(error).splitlines()[0]); sys.exit(3)"
+        "except RlctlError as error: print('\\n@' + str(error).splitlines()[0]); sys.exit(3)\n"
+        "print('\\n@')"
     )
     try:
         child = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, timeout=timeout_s, check=False
+            [sys.executable, "-c", code],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=timeout_s,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return f"import did not end within {timeout_s:.0f} s"
-    if child.returncode == 0:
-        return None
     told = [line[1:] for line in child.stdout.splitlines() if line.startswith("@")]
-    return told[-1] if told else f"import ended the process with exit code {child.returncode}"
+    if not told:
+        return f"import ended the process with exit code {child.returncode}"
+    return told[-1] or None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -292,9 +299,9 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
     def constructor(**parameters: Any) -> Any:
         try:
             return gymnasium.make(task, disable_env_checker=True, **parameters)
-        except gymnasium.error.UnregisteredEnv as error:
-            names = list(gymnasium.registry)
-            raise UsageError(f"Gymnasium: {error}.{did_you_mean(task, names)}") from None
+        except gymnasium.error.UnregisteredEnv:
+            close = did_you_mean(task.rpartition(":")[2], gymnasium.registry)
+            raise UsageError(f"Gymnasium has no environment {task!r}.{close}") from None
         except ModuleNotFoundError as error:
             raise UsageError(f"Gymnasium: {task}: {error}") from None
 
@@ -313,7 +320,8 @@ def _guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:
     except BaseException as error:
         where = ""
         frames = traceback.extract_tb(error.__traceback__)
-        if frames and "rlctl" not in Path(frames[-1].filename).parts[-2:-1]:
+        own = frames and "rlctl" in Path(frames[-1].filename).parts[-2:-1]
+        if frames and not own and not frames[-1].filename.startswith("<frozen"):  # a syntax error names its place
             where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})"
         raise TaskError(
             f"task {task!r}: {doing}{type(error).__name__}: {error}{where}", details=traceback.format_exc()
@@ -323,12 +331,14 @@ def _guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:
 def _check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
     if hasattr(constructor, "gymnasium_id"):
         import gymnasium
+        from gymnasium.envs.registration import load_env_creator
 
-        # The class behind an id is only known once made; gymnasium reports what it does not take.
-        if parameters and (spec := gymnasium.registry.get(constructor.gymnasium_id)) and callable(spec.entry_point):
-            constructor = spec.entry_point
-        else:
+        spec = gymnasium.registry.get(constructor.gymnasium_id)
+        if not parameters or spec is None or spec.entry_point is None:
             return
+        parameters = {key: value for key, value in parameters.items() if key != "max_episode_steps"}  # of Gymnasium
+        entry_point = spec.entry_point
+        constructor = entry_point if callable(entry_point) else load_env_creator(entry_point)
     signature = inspect.signature(constructor)
     if any(p.kind is p.VAR_KEYWORD for p in signature.parameters.values()):
         return
@@ -350,7 +360,7 @@ def _task_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     import pydantic
 
     fields = task.parameters()
-    hints = typing.get_type_hints(task)
+    hints = _guarded(task.__name__, lambda: typing.get_type_hints(task)) if given else {}
     checked = {}
     for key, value in given.items():
         if key not in fields:

@@ -171,6 +171,8 @@ class Evidence:
     """Per checker that was tried: None, or why it could not run."""
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
     """Roles that were not lived, and why."""
+    crashes: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Per part of the probe that crashed by itself, its traceback."""
     printed_lines: int = 0
     """Lines that the probe's environment wrote to stdout."""
     printed_first: str = ""
@@ -200,6 +202,8 @@ class Evidence:
             else:
                 failed = Failure("raised", "build", str(part), "build", 0, 0, 0, content["message"])
                 self.failures.append(failed)
+        elif kind == "crashed":
+            self.crashes[str(part)] = content["traceback"]
         elif kind == "skipped":
             self.skipped[content["role"]] = content["reason"]
         elif kind == "checked":
@@ -223,9 +227,7 @@ def _trajectory(content: dict[str, Any], arrays: Arrays) -> Trajectory:
         Form(**{**each, "shape": None if each["shape"] is None else tuple(each["shape"])})
         for each in content.pop("forms")
     ]
-    observations = {
-        leaf: Series(arrays[f"steps/{leaf}"], arrays[f"values/{leaf}"]) for leaf in content.pop("recorded")
-    }
+    observations = {leaf: Series(arrays[f"steps/{leaf}"], arrays[f"values/{leaf}"]) for leaf in content.pop("recorded")}
     return Trajectory(
         **content,
         forms=forms,

@@ -19,7 +19,7 @@ def encode(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> byt
     """Return a message as bytes."""
     buffer = io.BytesIO()
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    np.savez(buffer, allow_pickle=False, **{_HEADER: text}, **arrays)  # type: ignore[arg-type]
+    np.savez(buffer, allow_pickle=False, **{_HEADER: text}, **arrays)
     return buffer.getvalue()
 
 

@@ -8,11 +8,10 @@ import numpy as np
 import onnx
 from gymnasium import spaces
 
-from rlctl.errors import UsageError
-from rlctl.export.graph import BATCH, Graph
+from rlctl.export.graph import BATCH, Graph, unsupported
 from rlctl.export.layers import emit, emit_lstm
 from rlctl.export.metadata import describe, metadata
-from rlctl.export.observation import Tensors, emit_features
+from rlctl.export.observation import Observations, Tensors
 from rlctl.run.onnx_policy import ACTION, STATE_INPUTS, STATE_OUTPUTS
 from rlctl.run.policy import PolicyInfo
 
@@ -26,26 +25,26 @@ def build(info: PolicyInfo, network: Any, tensors: Tensors) -> onnx.ModelProto:
     """
     graph = Graph()
     _, action_space = info.env.spaces()
-    value, *state = _ACTORS[info.algo](graph, info, network, tensors)
+    value, *state = _ACTORS[info.algo](graph, Observations(graph, info, tensors), network)
     if isinstance(action_space, spaces.Box):
         value, dtype = _continuous(graph, value, action_space, bool(network.squash_output))
     else:
         value, dtype = _discrete(graph, value, action_space), np.dtype(np.int64)
-    shape = (BATCH, *(action_space.shape or ()))
+    shape: tuple[int | str, ...] = (BATCH, *(action_space.shape or ()))
     graph.output(value, ACTION, dtype, shape, info.env.action_meaning or "action, as the environment takes it")
     for name, part in zip(STATE_OUTPUTS, state, strict=False):
         graph.output(part, name, np.float32, _state_shape(network), "LSTM state for the next step")
     return graph.model(metadata(info), describe(info))
 
 
-def _actor_critic(graph: Graph, info: PolicyInfo, network: Any, tensors: Tensors) -> list[str]:
+def _actor_critic(graph: Graph, observations: Observations, network: Any) -> list[str]:
     """PPO, A2C: the mean of the distribution, or the logits."""
-    value = emit_features(graph, info, tensors, network.pi_features_extractor, network.normalize_images)
+    value = observations.features(network.pi_features_extractor, scale_images=network.normalize_images)
     return [_action_net(graph, value, network)]
 
 
-def _recurrent(graph: Graph, info: PolicyInfo, network: Any, tensors: Tensors) -> list[str]:
-    value = emit_features(graph, info, tensors, network.pi_features_extractor, network.normalize_images)
+def _recurrent(graph: Graph, observations: Observations, network: Any) -> list[str]:
+    value = observations.features(network.pi_features_extractor, scale_images=network.normalize_images)
     hidden, cell = (graph.input(name, np.float32, _state_shape(network), _STATE_MEANING) for name in STATE_INPUTS)
     value, after = emit_lstm(graph, value, (hidden, cell), network.lstm_actor, "lstm_actor")
     return [_action_net(graph, value, network), *after]
@@ -62,24 +61,24 @@ def _action_net(graph: Graph, value: str, network: Any) -> str:
     return graph.add("Tanh", value) if network.squash_output else value
 
 
-def _squashed_gaussian(graph: Graph, info: PolicyInfo, network: Any, tensors: Tensors) -> list[str]:
+def _squashed_gaussian(graph: Graph, observations: Observations, network: Any) -> list[str]:
     """SAC, TQC, CrossQ, with gSDE or without: tanh of the mean."""
     actor = network.actor
-    value = emit_features(graph, info, tensors, actor.features_extractor, actor.normalize_images)
+    value = observations.features(actor.features_extractor, scale_images=actor.normalize_images)
     value = emit(graph, value, actor.latent_pi, "actor.latent_pi")
     return [graph.add("Tanh", emit(graph, value, actor.mu, "actor.mu"))]
 
 
-def _deterministic(graph: Graph, info: PolicyInfo, network: Any, tensors: Tensors) -> list[str]:
+def _deterministic(graph: Graph, observations: Observations, network: Any) -> list[str]:
     """TD3, DDPG: the network ends with its own tanh."""
     actor = network.actor
-    value = emit_features(graph, info, tensors, actor.features_extractor, actor.normalize_images)
+    value = observations.features(actor.features_extractor, scale_images=actor.normalize_images)
     return [emit(graph, value, actor.mu, "actor.mu")]
 
 
-def _q_values(graph: Graph, info: PolicyInfo, network: Any, tensors: Tensors) -> list[str]:
+def _q_values(graph: Graph, observations: Observations, network: Any) -> list[str]:
     q_net = network.q_net
-    value = emit_features(graph, info, tensors, q_net.features_extractor, q_net.normalize_images)
+    value = observations.features(q_net.features_extractor, scale_images=q_net.normalize_images)
     return [emit(graph, value, q_net.q_net, "q_net.q_net")]
 
 
@@ -99,7 +98,7 @@ _ACTORS = {
 
 def _continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool) -> tuple[str, np.dtype[Any]]:
     if not np.issubdtype(space.dtype, np.floating):
-        raise UsageError(f"export: actions of type {space.dtype} cannot be written as ONNX yet; float32 can")
+        raise unsupported(f"an action of type {space.dtype}")
     # As numpy promotes it in SB3: float32 stays, bounds in float64 make the action float64.
     dtype = np.result_type(np.float32, space.dtype)
     if len(space.shape) != 1:
@@ -129,4 +128,4 @@ def _discrete(graph: Graph, value: str, space: spaces.Space[Any]) -> str:
     if isinstance(space, spaces.MultiBinary):
         # SB3 rounds the probability, which is one half where the logit is zero, and rounds halves to zero.
         return graph.cast(graph.add("Greater", value, graph.constant("action/zero", np.float32(0.0))), np.int64)
-    raise UsageError(f"export: actions of the space {space} cannot be written as ONNX yet")
+    raise unsupported(f"an action of {space}")

@@ -47,7 +47,7 @@ class Comparison:
         if not isinstance(self._space, spaces.Box):
             network: Any = torch_policy.network
             head = network.q_net.q_net[-1] if torch_policy.info.algo == "dqn" else network.action_net
-            head.register_forward_hook(self._keep_logits)
+            self._hook = head.register_forward_hook(self._keep_logits)
 
     def _keep_logits(self, module: Any, inputs: Any, output: Any) -> None:
         self._logits = output.detach().cpu().numpy()
@@ -59,10 +59,10 @@ class Comparison:
         limit = MAX_DIFFERENCE * np.maximum(1.0, np.abs(expected)).reshape(difference.shape)
         differs = ~(difference <= limit).all(axis=1)
         if not isinstance(self._space, spaces.Box):
-            tied = np.array([self._is_near_tie(row, expected[row], actions[row]) for row in np.flatnonzero(differs)], bool)
-            self._near_ties += int(tied.sum())
-            differs[np.flatnonzero(differs)[tied]] = False
-            difference[~differs] = 0.0
+            for row in np.flatnonzero(differs).tolist():
+                if self._is_near_tie(row, expected[row], actions[row]):
+                    self._near_ties += 1
+                    differs[row], difference[row] = False, 0.0
         self._max_difference = max(self._max_difference, float(difference.max()))
         self._beyond_limit += int(differs.sum())
 
@@ -73,7 +73,9 @@ class Comparison:
         )
 
     def result(self) -> Agreement:
-        """Return what was seen so far."""
+        """Return what was seen, and stop looking."""
+        if not isinstance(self._space, spaces.Box):
+            self._hook.remove()
         return Agreement(self.observations, self._max_difference, self._beyond_limit, self._near_ties)
 
 

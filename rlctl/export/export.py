@@ -14,6 +14,8 @@ from rlctl.run.policy import PolicyInfo, read_policy
 if TYPE_CHECKING:
     import onnx
 
+    from rlctl.export.verify import Verification
+
 
 def export_onnx(run: str | None, *, checkpoint: str, output: Path | None) -> ExportReport:
     """Export a policy to ONNX and verify it in its own environment.
@@ -25,7 +27,7 @@ def export_onnx(run: str | None, *, checkpoint: str, output: Path | None) -> Exp
     """
     policy_file, owner = directory.find_policy(run, checkpoint)
     if policy_file.suffix == ".onnx":
-        raise UsageError(f"{policy_file}: an ONNX file already; give the run or the .safetensors file to export it anew")
+        raise UsageError(f"{policy_file}: an ONNX file already; export the run or its .safetensors file")
     if output is None:
         output = owner.onnx_file if owner else policy_file.with_suffix(".onnx")
     if output.suffix != ".onnx":
@@ -79,10 +81,7 @@ def _verified(
     exported = OnnxPolicy.load(part)
     seen = verify(policy, exported, workers)
     if not seen.passed:
-        raise AnswerIsNo(
-            f"{target}: not verified, not kept: the ONNX file does not act as {policy_file} does\n"
-            f"{agreement_line(seen.agreement)}\n{closed_loop_line(seen.closed_loop)}"
-        )
+        raise AnswerIsNo(_why_not(policy_file, target, policy.info.task, seen))
     info = policy.info
     return ExportReport(
         path=target,
@@ -98,6 +97,17 @@ def _verified(
         closed_loop=seen.closed_loop,
         latency=measure(policy, exported),
     )
+
+
+def _why_not(policy_file: Path, target: Path, task: str, seen: Verification) -> str:
+    why = f"the ONNX file does not act as {policy_file} does"
+    if seen.agreement.agrees:
+        why = (
+            "every action agrees, but the episodes do not: the environment is not reproducible, or magnifies "
+            f"differences of {seen.agreement.max_difference:.0e}; rlctl check-env {task} tells"
+        )
+    numbers = f"{agreement_line(seen.agreement)}\n{closed_loop_line(seen.closed_loop)}"
+    return f"{target}: not verified, not kept: {why}\n{numbers}"
 
 
 def _ports(found: Any) -> list[Port]:

@@ -88,5 +88,10 @@ class Graph:
         return model
 
 
+def unsupported(what: str) -> UsageError:
+    """Return the error for a part of a policy that has no translation."""
+    return UsageError(f"export: {what} cannot be written as ONNX yet")
+
+
 def _type(dtype: Any) -> int:
     return int(helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import UsageError
-from rlctl.export.graph import Graph
+from rlctl.export.graph import Graph, unsupported
 
 if TYPE_CHECKING:
     import torch
@@ -30,7 +29,7 @@ def emit(graph: Graph, value: str, module: torch.nn.Module, name: str) -> str:
             value = emit(graph, value, each, f"{name}.{index}")
         return value
     if kind not in _LAYERS:
-        raise UsageError(f"export: layer {name} is a {kind}, which cannot be written as ONNX yet")
+        raise unsupported(f"layer {name}, a {kind},")
     return _LAYERS[kind](graph, value, module, name)
 
 
@@ -49,7 +48,7 @@ def _linear(graph: Graph, value: str, module: Any, name: str) -> str:
 
 def _conv(graph: Graph, value: str, module: Any, name: str) -> str:
     if module.padding_mode != "zeros" or isinstance(module.padding, str):
-        raise UsageError(f"export: layer {name} pads with {module.padding_mode!r}, which cannot be written as ONNX yet")
+        raise unsupported(f"layer {name}, which pads with {module.padding_mode!r},")
     inputs = [value, graph.constant(f"{name}.weight", array(module.weight))]
     if module.bias is not None:
         inputs.append(graph.constant(f"{name}.bias", array(module.bias)))
@@ -83,7 +82,7 @@ def _silu(graph: Graph, value: str, module: Any, name: str) -> str:
 def _gelu(graph: Graph, value: str, module: Any, name: str) -> str:
     # 0.5 x (1 + erf(x / sqrt(2))); ONNX has an operator for it from opset 20 only.
     if module.approximate != "none":
-        raise UsageError(f"export: layer {name} is GELU({module.approximate!r}), which cannot be written as ONNX yet")
+        raise unsupported(f"layer {name}, GELU with approximate={module.approximate!r},")
     root = graph.constant(f"{name}.root2", np.float32(math.sqrt(2.0)))
     one, half = graph.constant(f"{name}.one", np.float32(1.0)), graph.constant(f"{name}.half", np.float32(0.5))
     erf = graph.add("Erf", graph.add("Div", value, root))
@@ -113,9 +112,7 @@ _LAYERS: dict[str, Emit] = {
     "Tanh": _simple("Tanh"),
     "ReLU": _simple("Relu"),
     "ELU": lambda graph, value, module, name: graph.add("Elu", value, alpha=float(module.alpha)),
-    "LeakyReLU": lambda graph, value, module, name: graph.add(
-        "LeakyRelu", value, alpha=float(module.negative_slope)
-    ),
+    "LeakyReLU": lambda graph, value, module, name: graph.add("LeakyRelu", value, alpha=float(module.negative_slope)),
     "SiLU": _silu,
     "GELU": _gelu,
     "Hardtanh": _hard_tanh,
@@ -132,7 +129,7 @@ def emit_lstm(
     """
     for option in ("bidirectional", "batch_first", "proj_size"):
         if getattr(module, option):
-            raise UsageError(f"export: {name} has {option}={getattr(module, option)}, which cannot be written as ONNX yet")
+            raise unsupported(f"{name} with {option}={getattr(module, option)}")
     time, layers = graph.constant(f"{name}.time", np.array([0])), module.num_layers
     before = [graph.add_with_outputs("Split", [part], layers, axis=0) if layers > 1 else [part] for part in state]
     sequence = graph.add("Unsqueeze", value, time)

@@ -52,6 +52,7 @@ class SharedArrays:
             "terminated": ((), np.dtype(np.bool_)),
             "truncated": ((), np.dtype(np.bool_)),
             "next_seed": ((), np.dtype(np.int64)),
+            "inside": ((2,), np.dtype(np.int64)),
             "terms": ((terms,), np.dtype(np.float64)),
         }
         for key, field in observation.items():
@@ -75,6 +76,9 @@ class SharedArrays:
         self.truncated = arrays["truncated"]
         self.next_seed = arrays["next_seed"]
         """Seed of the episode to start when the present one ends; negative: do not start one."""
+        self.inside = arrays["inside"]
+        """Episode seed and step of the call an environment is in, shape (n_envs, 2): to name it when its worker dies
+        or hangs. Step 0 is the reset; a negative step: in no call."""
         self.terms = arrays["terms"]
         """Raw reward terms of the last step, shape (n_envs, terms)."""
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}

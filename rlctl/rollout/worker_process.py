@@ -10,7 +10,6 @@ import contextlib
 import json
 import math
 import os
-import signal
 import sys
 import threading
 import traceback
@@ -54,6 +53,8 @@ class _Episode:
     def summary(self, info: dict[str, Any]) -> dict[str, Any]:
         success = info.get("is_success")
         distance = info.get("metrics", info).get("distance")
+        if not isinstance(distance, int | float | np.number):  # a plain environment may mean something else by it
+            distance = None
         return {
             "env": self.index,
             "seed": self.seed,
@@ -110,6 +111,7 @@ class _Worker:
         return []
 
     def begin(self, episode: _Episode, seed: int) -> None:
+        self.arrays.inside[episode.index] = seed, 0
         self.store(self.arrays.observation, episode, episode.start(seed))
 
     def step(self) -> list[dict[str, Any]]:
@@ -123,6 +125,7 @@ class _Worker:
         arrays, index = self.arrays, episode.index
         action = arrays.action[index]
         episode.step += 1
+        arrays.inside[index, 1] = episode.step
         observation, reward, terminated, truncated, info = episode.env.step(
             int(action) if self.discrete else action.copy()
         )
@@ -151,6 +154,7 @@ class _Worker:
             call(episode, argument)
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             raise _EpisodeFailed(episode) from error
+        self.arrays.inside[episode.index, 1] = -1
 
 
 class _EpisodeFailed(Exception):
@@ -171,21 +175,19 @@ def _error(error: BaseException) -> dict[str, Any]:
     }
 
 
-def _end_with_parent() -> None:
+def _end_with_parent(parent: int) -> None:
     """End this process when its parent ends, even while an environment is stuck in a step."""
-    parent = os.getppid()
 
     def watch() -> None:
-        if hasattr(os, "pidfd_open"):
-            import select
+        import select
+        import time
 
-            with contextlib.suppress(ProcessLookupError):
-                select.select([os.pidfd_open(parent)], [], [])
-        else:
-            import time
-
-            while os.getppid() == parent:
-                time.sleep(1.0)
+        with contextlib.suppress(AttributeError, OSError):  # not on every system, nor in every sandbox
+            descriptor = os.pidfd_open(parent)
+            if os.getppid() == parent:
+                select.select([descriptor], [], [])
+        while os.getppid() == parent:
+            time.sleep(1.0)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -193,15 +195,15 @@ def _end_with_parent() -> None:
 
 def main() -> None:
     """Serve commands until the connection closes. Arguments: connection, descriptor, and the job as JSON."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the main process decides
-    _end_with_parent()
-    with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the main process has heard enough
-        _serve()
-
-
-def _serve() -> None:
-    connection = Connection(int(sys.argv[1]))
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # what is printed is told at once
     job = json.loads(sys.argv[3])
+    _end_with_parent(job["parent"])
+    with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the main process has heard enough
+        _serve(job)
+
+
+def _serve(job: dict[str, Any]) -> None:
+    connection = Connection(int(sys.argv[1]))
 
     def answer(**content: Any) -> None:
         connection.send_bytes(json.dumps(content).encode())

@@ -32,8 +32,10 @@ from rlctl.run.env_info import EnvInfo
 Observations = NDArray[Any] | dict[str, NDArray[Any]]
 
 # Started this way a worker finds what its parent finds, and the caller's script is not run again.
+# Ctrl-C reaches the whole group, and the main process decides: ignored before anything slow is imported.
 _BOOTSTRAP = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[3])['sys_path']; "
+    "import json, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+    "sys.path[:] = json.loads(sys.argv[3])['sys_path']; "
     "from rlctl.rollout.worker_process import main; main()"
 )
 
@@ -103,6 +105,7 @@ class Workers:
             "count": count,
             "total": self.n_envs,
             "sys_path": sys.path,
+            "parent": os.getpid(),
         }
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
         with theirs:
@@ -137,6 +140,7 @@ class Workers:
         observation_space, action_space = self._info.spaces()
         terms = len(self._info.reward_weights)
         self._arrays = SharedArrays(self._memory, self.n_envs, observation_space, action_space, terms)
+        self._arrays.inside[:] = -1
         self._ready = True
         self._send_all(b"attach")
         self._answers(range(len(self._processes)), self.timeout_s, "attaching")
@@ -220,33 +224,43 @@ class Workers:
     def _raised(self, error: dict[str, Any]) -> RlctlError:
         message = error["message"]
         if "env" in error:
-            message += (
-                f"\nin environment {error['env']}, episode seed {error['seed']}, step {error['step']}; "
-                f"to see it alone: rlctl check-env {self._spec.task}"
-            )
+            message += self._place(error["env"], error["seed"], error["step"])
         kind = getattr(errors, error["kind"], TaskError) if error["kind"] else TaskError
-        if kind is TaskError and self._spec.task not in message:
+        if kind is TaskError and self._spec.task not in message.partition("\n")[0]:
             message = f"task {self._spec.task!r}: {message}"
         details = None if error["kind"] else error["traceback"]
         result: RlctlError = kind(message, details=details)
         return result
 
+    def _place(self, env: int, seed: int, step: int) -> str:
+        return (
+            f"\nin environment {env}, episode seed {seed}, step {step}; "
+            f"to see it alone: rlctl check-env {self._spec.task}"
+        )
+
+    def _stopped_in(self, worker: int) -> str:
+        """Name the episode a worker was in when it stopped answering, or the environments it ran."""
+        low, high = self._ranges[worker]
+        if self._ready:
+            for env, (seed, step) in enumerate(self._arrays.inside[low:high].tolist(), start=low):
+                if step >= 0:
+                    return self._place(env, seed, step)
+        return f"\nit ran the environments {low} to {high - 1}"
+
     def _death(self, worker: int, doing: str) -> TaskError:
         try:
             code = self._processes[worker].wait(timeout=5.0)
+            how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         except subprocess.TimeoutExpired:
-            code = 0
-        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+            how = "it closed its connection"
         return TaskError(
-            f"task {self._spec.task!r}: worker {worker} died while {doing} ({how}); it ran environments "
-            f"{self._ranges[worker][0]}-{self._ranges[worker][1] - 1}"
+            f"task {self._spec.task!r}: worker {worker} died while {doing} ({how}){self._stopped_in(worker)}"
         )
 
     def _hang(self, workers: list[int], timeout_s: float, doing: str) -> TaskError:
-        named = ", ".join(f"{self._ranges[w][0]}-{self._ranges[w][1] - 1}" for w in workers)
         return TaskError(
-            f"task {self._spec.task!r}: environments {named} gave no answer for {timeout_s:g} s while {doing}; "
-            "if a step may take that long, raise --env-timeout"
+            f"task {self._spec.task!r}: no answer for {timeout_s:g} s while {doing}; "
+            f"if that may take so long, raise --env-timeout{self._stopped_in(workers[0])}"
         )
 
     def close(self, grace_s: float = 2.0) -> None:

@@ -124,7 +124,8 @@ def space_from_json(data: dict[str, Any]) -> spaces.Space[Any]:
         if kind == "MultiBinary":
             return spaces.MultiBinary(data["n"])
         if kind == "Dict":
-            return spaces.Dict({key: space_from_json(value) for key, value in data["spaces"].items()})
+            # Pairs: a mapping would be sorted by key, and the order is part of the space.
+            return spaces.Dict([(key, space_from_json(value)) for key, value in data["spaces"].items()])
     except (KeyError, TypeError, ValueError, AssertionError) as error:
         raise ArtifactError(f"not a space: {error!r}") from None
     raise ArtifactError(f"not a space: type {kind!r}")

@@ -83,7 +83,7 @@ def save_policy(path: Path, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) 
     """
     from safetensors.numpy import save
 
-    contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    contiguous = {name: np.asarray(value, order="C") for name, value in tensors.items()}
     files.write_bytes(path, save(contiguous, metadata={"rlctl": info.model_dump_json()}))
 
 

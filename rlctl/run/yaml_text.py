@@ -11,6 +11,10 @@ import yaml
 from rlctl.errors import RecipeError
 
 
+class _Dumper(yaml.SafeDumper):
+    pass
+
+
 class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
 
@@ -48,7 +52,9 @@ for _tag, _pattern, _first in (
         list("-+0123456789."),
     ),
 ):
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
+    # Text that looks like a number in either version of YAML is written in quotes.
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
 
 
 def load(text: str, source: str) -> Any:
@@ -63,5 +69,5 @@ def load(text: str, source: str) -> Any:
 
 def dump(value: Any) -> str:
     """Write plain data as YAML, keys in the order they have."""
-    text: str = yaml.safe_dump(value, sort_keys=False, default_flow_style=None, width=100)
+    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=100)
     return text

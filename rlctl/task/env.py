@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import gymnasium
@@ -66,6 +66,11 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self._build()
             task.reset(np.random.default_rng(0))
             first = task.observe()
+            if render_mode is not None:
+                # A task knows its markers once an episode has begun; they join the world as it was built.
+                names = list(task.markers())
+                self.sim.restore()
+                self._add_markers(names)
         except BaseException:
             self.sim.close()
             raise
@@ -76,11 +81,12 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def _build(self) -> None:
         self.task.sim = self.sim
         self.task.build(self.sim)
-        if self.render_mode is not None:
-            self._markers = {
-                name: self.sim.add_marker((0, 0, -10), radius=0.03, color=(0.1, 0.8, 0.3, 0.8))
-                for name in self.task.markers()
-            }
+        self.sim.save()
+
+    def _add_markers(self, names: Iterable[str]) -> None:
+        self._markers = {
+            name: self.sim.add_marker((0, 0, -10), radius=0.03, color=(0.1, 0.8, 0.3, 0.8)) for name in names
+        }
         self.sim.save()
 
     def _make_observation_space(self) -> Any:
@@ -113,6 +119,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         else:
             self.sim.clear()
             self._build()
+            if self._markers:
+                self._add_markers(list(self._markers))
         drawn = {name: event(self.sim, self.np_random) for name, event in self.events.items() if event.when == "reset"}
         self.task.reset(self.np_random)
         self._step = 0
@@ -141,9 +149,11 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         terms = {name: weight * raw[name] for name, weight in weights.items()}
         reward = float(sum(terms.values()))
         if not math.isfinite(reward):
-            bad = next(name for name, value in raw.items() if not math.isfinite(value))
+            bad = next((name for name, value in raw.items() if not math.isfinite(value)), None)
+            if bad is None:
+                raise TaskError(f"{self.name}: the weighted reward terms overflow at step {self._step}: {terms}")
             raise TaskError(f"{self.name}: reward term {bad!r} is {raw[bad]} at step {self._step}")
-        info: dict[str, Any] = {"reward_terms": terms, "metrics": raw}
+        info: dict[str, Any] = {"reward_terms": terms, "metrics": {name: raw[name] for name in weights}}
         if self._interval_events:
             self._run_interval_events(info)
         if self.has_success:
@@ -176,7 +186,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def _observe(self) -> Observation:
         parts = self.task.observe()
         if self.task.observation_layout == "dict":
-            dictionary = {name: np.asarray(value, np.float32) for name, value in parts.items()}
+            dictionary = {name: np.array(value, np.float32) for name, value in parts.items()}
             if {name: value.shape for name, value in dictionary.items()} != self._shapes:
                 raise self._observation_differs(parts)
             if not all(math.isfinite(value.sum()) for value in dictionary.values()):

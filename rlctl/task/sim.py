@@ -31,6 +31,7 @@ class Body:
         self.fixed = fixed
         self._client = sim.client
         self._cache: dict[Any, Any] = {}
+        self._changed = False
         infos = [
             pybullet.getJointInfo(body_id, index, physicsClientId=sim.client)
             for index in range(pybullet.getNumJoints(body_id, physicsClientId=sim.client))
@@ -61,7 +62,8 @@ class Body:
     def _joint_states(self) -> tuple[Array, Array]:
         state = self._cache.get("joints")
         if state is None:
-            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self._client)
+            # None where a body has no joints.
+            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self._client) or ()
             state = (np.array([joint[0] for joint in raw]), np.array([joint[1] for joint in raw]))
             self._cache["joints"] = state
         return state
@@ -77,14 +79,14 @@ class Body:
         return self._joint_states()[1]
 
     def _link_state(self, link: str) -> tuple[Array, Array]:
-        state = self._cache.get(link)
+        state = self._cache.get(("link", link))  # a link may be called "base" or "joints"
         if state is None:
             raw = pybullet.getLinkState(
                 self.id, self._link_index(link), computeForwardKinematics=1, physicsClientId=self._client
             )
             # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
             state = (np.array(raw[4]), np.array(raw[5]))
-            self._cache[link] = state
+            self._cache["link", link] = state
         return state
 
     def link_position(self, link: str) -> Array:
@@ -152,14 +154,35 @@ class Body:
             )
 
     @cached_property
-    def _nominal(self) -> list[tuple[int, float, tuple[float, float, float]]]:
+    def _nominal(self) -> list[tuple[int, float, float, tuple[float, float, float]]]:
         links = range(-1, len(self._links))
         infos = [pybullet.getDynamicsInfo(self.id, link, physicsClientId=self._client) for link in links]
-        return [(link, info[0], info[2]) for link, info in zip(links, infos, strict=True)]
+        return [(link, info[0], info[1], info[2]) for link, info in zip(links, infos, strict=True)]
+
+    def _save_nominal(self) -> None:
+        self._changed = False
+        self.__dict__.pop("_nominal", None)  # read again when needed: `build` may have set other values
+
+    def _restore_nominal(self) -> None:
+        # PyBullet's saved states have positions and velocities, but neither masses nor friction.
+        if not self._changed:
+            return
+        self._changed = False
+        for link, mass, friction, inertia in self._nominal:
+            pybullet.changeDynamics(
+                self.id,
+                link,
+                mass=mass,
+                lateralFriction=friction,
+                localInertiaDiagonal=inertia,
+                physicsClientId=self._client,
+            )
 
     def scale_mass(self, factor: float) -> None:
-        """Set mass and inertia of every link to `factor` times the loaded value."""
-        for link, mass, inertia in self._nominal:
+        """Set mass and inertia of every link to `factor` times the built world's value, until the next reset."""
+        nominal = self._nominal
+        self._changed = True
+        for link, mass, _, inertia in nominal:
             pybullet.changeDynamics(
                 self.id,
                 link,
@@ -169,8 +192,10 @@ class Body:
             )
 
     def set_friction(self, friction: float) -> None:
-        """Set the lateral friction of every link."""
-        for link in range(-1, len(self._links)):
+        """Set the lateral friction of every link, until the next reset."""
+        nominal = self._nominal
+        self._changed = True
+        for link, *_ in nominal:
             pybullet.changeDynamics(self.id, link, lateralFriction=friction, physicsClientId=self._client)
 
 
@@ -242,12 +267,15 @@ class Sim:
     def save(self) -> None:
         """Remember the world as it is now, for `restore`."""
         self._saved = pybullet.saveState(physicsClientId=self.client)
+        for body in self.bodies.values():
+            body._save_nominal()
 
     def restore(self) -> None:
         """Put the world back as `save` found it."""
         pybullet.restoreState(self._saved, physicsClientId=self.client)
         for body in self.bodies.values():
             body._cache.clear()
+            body._restore_nominal()
 
     def clear(self) -> None:
         """Empty the world, as if it had just been made."""

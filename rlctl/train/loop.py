@@ -41,6 +41,8 @@ _LOSSES = (
     "clip_fraction", "clip_range", "explained_variance", "std", "actor_loss", "critic_loss", "ent_coef",
     "ent_coef_loss", "n_updates",
 )  # fmt: skip
+# Explained variance, for one, is not a number where rewards are constant, and nothing is wrong.
+_MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", "actor_loss", "critic_loss")
 _OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
 
 
@@ -160,14 +162,21 @@ class TrainingLoop(BaseCallback):
             self.save_checkpoint()
 
     def check_finite(self) -> None:
-        """Raise `DivergedError` if a weight is not finite."""
+        """Raise `DivergedError` if a weight or a loss is not finite."""
         for name, parameter in self.model.policy.named_parameters():
             if not bool(torch.isfinite(parameter).all()):
-                raise DivergedError(
-                    f"training diverged: {name} is not finite at step {self.model.num_timesteps:,}. "
-                    "A smaller algo_kwargs.learning_rate or a smaller reward scale helps most often.\n"
-                    f"The last good checkpoint and policies are in {self.run_directory.path}"
-                )
+                raise self._diverged(f"weights {name} are")
+        losses = self.logger.name_to_value
+        for name in _MUST_BE_FINITE:
+            if not math.isfinite(losses.get(f"train/{name}", 0.0)):
+                raise self._diverged(f"{name} is")
+
+    def _diverged(self, what: str) -> DivergedError:
+        return DivergedError(
+            f"training diverged: {what} not finite at step {self.model.num_timesteps:,}. A smaller "
+            "algo_kwargs.learning_rate or a smaller reward helps most often.\n"
+            f"What was saved before is in {self.run_directory.path}"
+        )
 
     def _write_metrics(self, steps: int) -> None:
         now = time.monotonic()

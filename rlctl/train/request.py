@@ -18,7 +18,7 @@ from rlctl import registry
 from rlctl.errors import DivergedError, Interrupted, RecipeError, RlctlError, TaskError, UsageError
 from rlctl.rollout.workers import Workers
 from rlctl.run import directory, files
-from rlctl.run.directory import RunDirectory
+from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.policy import versions
 from rlctl.run.recipe import Recipe, resolve, validate
 from rlctl.train.display import Display, make_display
@@ -67,6 +67,7 @@ class _Start:
     task: str
     recipe: Recipe
     run: RunDirectory | None = None
+    lock: RunLock | None = None
     checkpoint: Path | None = None
     state: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -106,8 +107,9 @@ def _resumed(request: TrainRequest) -> _Start:
     run = directory.find_run(request.resume, request.root)
     recipe = run.recipe()
     recipe = validate({**recipe.model_dump(), **request.settings}, "recipe")
+    lock = run.lock()  # before looking: a process that is training removes old checkpoints
     folder, state = checkpoint.newest(run)
-    return _Start(run.status()["task"], recipe, run, folder, state)
+    return _Start(run.status()["task"], recipe, run, lock, folder, state)
 
 
 def _nothing_to_do(start: _Start) -> TrainResult:
@@ -153,7 +155,7 @@ def _train(
     if start.checkpoint is not None:
         checkpoint.restore(model, start.checkpoint, dict(start.state))
     run = start.run or directory.create(start.task, recipe.seed, request.root)
-    lock = run.lock()
+    lock = start.lock or run.lock()
     if start.state:
         cut_back(run, progress)
     _write_start(run, start, request)
@@ -168,7 +170,8 @@ def _train(
             _learn(model, loop, recipe)
         recordings = _record(loop, request.record)
     except RlctlError as error:
-        run.write_status({"status": _STATUS.get(type(error), "failed"), "error": str(error), "ended": _now()})
+        with contextlib.suppress(OSError):  # a full disk must not hide the error itself
+            run.write_status({"status": _STATUS.get(type(error), "failed"), "error": str(error), "ended": _now()})
         raise
     finally:
         loop.close()

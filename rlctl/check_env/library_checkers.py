@@ -1,0 +1,118 @@
+"""Runs Gymnasium's and Stable-Baselines3's own checkers; what they say becomes plain data, never a traceback."""
+
+from __future__ import annotations
+
+import re
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Any
+
+from rlctl.check_env.failures import describe
+from rlctl.check_env.progress import Progress
+from rlctl.check_env.wire import Message
+
+GYMNASIUM, SB3 = "Gymnasium", "Stable-Baselines3"
+
+RAISED = "the environment raised "
+"""How a complaint begins that is the environment's own exception."""
+
+_LIBRARIES = re.compile(r"[/\\](gymnasium|stable_baselines3|rlctl[/\\]check_env)[/\\](?!envs[/\\])")
+_ANSI = re.compile(r"\x1b\[[0-9;]*m")
+_LONGEST = 400  # characters
+
+Complaints = list[dict[str, str]]
+
+
+def library_checkers(make: Callable[[], Any], progress: Progress | None = None) -> Iterator[Message]:
+    """Run each checker on an instance of its own; yield a message per checker."""
+    progress = progress or Progress()
+    progress.phase("checkers")
+    yield _message(GYMNASIUM, make, _gymnasium_checker, progress)
+    # Last, because it loads torch, which takes seconds.
+    yield _message(SB3, make, _sb3_checker, progress)
+
+
+def _gymnasium_checker() -> Callable[[Any], None]:
+    from gymnasium.utils.env_checker import check_env
+
+    def check(env: Any) -> None:
+        spec = getattr(env, "spec", None)
+        wrappers = getattr(spec, "additional_wrappers", ())
+        # The check of `close` makes a second environment from the registration, wrappers included.
+        again = spec is not None and all(wrapper.kwargs is not None for wrapper in wrappers)
+        check_env(env, skip_render_check=True, skip_close_check=not again)
+
+    return check
+
+
+def _sb3_checker() -> Callable[[Any], None]:
+    from stable_baselines3.common.env_checker import check_env
+
+    return check_env
+
+
+def _message(
+    name: str, make: Callable[[], Any], load: Callable[[], Callable[[Any], None]], progress: Progress
+) -> Message:
+    problem = None
+    complaints: Complaints = []
+    try:
+        checker = load()
+    except Exception as error:
+        problem = f"importing it failed: {describe(error)}"
+    else:
+        env = make()
+        progress.enter("check")
+        complaints = complaints_of(checker, env)
+        progress.leave()
+    return {"type": "checked", "checker": name, "problem": problem, "complaints": _named(name, complaints)}, {}
+
+
+def _named(name: str, complaints: Complaints) -> list[dict[str, str]]:
+    return [{"checker": name, **each} for each in complaints]
+
+
+def complaints_of(checker: Callable[[Any], None], env: Any) -> Complaints:
+    """Run a checker on an environment and return what it said; warnings of other code are left out."""
+    complaints: Complaints = []
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            checker(env)
+        except BaseException as error:  # an environment may raise anything, SystemExit too
+            complaints.append({"kind": "error", "text": _text(error)})
+        finally:
+            _close(env, complaints)
+    said = [str(each.message) for each in told if _LIBRARIES.search(each.filename)]
+    return [{"kind": "warning", "text": _clean(text)} for text in dict.fromkeys(said)] + complaints
+
+
+def _close(env: Any, complaints: Complaints) -> None:
+    if not hasattr(env, "close"):
+        return
+    try:
+        env.close()
+    except BaseException as error:
+        complaints.append({"kind": "error", "text": _text(error)})
+
+
+def _text(error: BaseException) -> str:
+    if _from_environment(error.__traceback__):
+        return RAISED + describe(error)
+    text = _clean(str(error)) or "no message"
+    return text if isinstance(error, AssertionError) else f"{type(error).__name__}: {text}"
+
+
+def _from_environment(trace: TracebackType | None) -> bool:
+    """Say whether an exception passed through code that is neither a checker's nor a library's below it."""
+    files = [frame.filename for frame in traceback.extract_tb(trace)]
+    return any("site-packages" not in file and not _LIBRARIES.search(file) for file in files) or any(
+        re.search(r"[/\\]gymnasium[/\\]envs[/\\]", file) for file in files
+    )
+
+
+def _clean(text: str) -> str:
+    text = " ".join(_ANSI.sub("", text).removeprefix("WARN: ").split()).removeprefix("WARN: ")
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."

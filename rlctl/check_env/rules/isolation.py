@@ -1,0 +1,96 @@
+"""RL4: instances do not touch each other. Training steps dozens of them in one process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rlctl.check_env.comparison import first_difference
+from rlctl.check_env.evidence import Evidence, Failure, Trajectory
+from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.rules.determinism import compared
+from rlctl.check_env.rules.interface import where
+from rlctl.check_env.rules.known import built, one
+
+ERROR, WARNING = Severity.ERROR, Severity.WARNING
+
+CLIENT_FIX = (
+    "Give each instance its own state. With PyBullet: keep the id that p.connect returned and pass "
+    "physicsClientId=self.client to every call, p.disconnect included."
+)
+
+
+def _require_alone(evidence: Evidence) -> None:
+    """Instances can only be compared if one that is alone repeats itself."""
+    for role in ("reused", "fresh instance"):
+        first = "alone" if role == "reused" else "fresh process"
+        if compared(evidence, first, role)[1] is not None:
+            raise NotJudged("an instance that is alone does not repeat itself (RL301 to RL304)")
+
+
+def _failures(evidence: Evidence, phase: str) -> Iterator[Failure]:
+    for failure in evidence.failures:
+        if failure.part == "instances" and failure.phase == phase and failure.call != "build":
+            yield failure
+
+
+def _failed(failure: Failure, doing: str) -> Seen:
+    verb = "raised" if failure.kind == "raised" else "ended:" if failure.kind == "died" else "hangs:"
+    at = f"step {failure.step}" if failure.call == "step" else failure.call
+    error = failure.error if failure.kind == "raised" else f"the process {failure.error}"
+    return Seen(f"{doing}, {at} {verb} {error}", where(failure))
+
+
+def _differs(evidence: Evidence, lived: Trajectory, doing: str) -> Iterator[Seen]:
+    alone = one(evidence, "fresh process" if lived.seed == one(evidence, "fresh process").seed else "second alone")
+    if alone.ended == "raised":
+        raise NotJudged("the episode raised when alone, too (RL207)")
+    difference = first_difference(built(evidence), alone, lived)
+    if difference is not None:
+        severity = WARNING if difference.is_small else None
+        yield Seen(f"{doing}: {difference.text()}", difference.evidence(lived), severity)
+
+
+@rule("RL401", "instances share a world", ERROR, CLIENT_FIX)
+def interleaved(evidence: Evidence) -> Iterator[Seen]:
+    """Two instances stepped in turns behave otherwise than one alone: they share a simulation or other state, so
+    every environment of a training disturbs every other."""
+    _require_alone(evidence)
+    doing = "two instances stepped in turns"
+    for failure in _failures(evidence, "interleaved"):
+        yield _failed(failure, doing)
+        return
+    one(evidence, "interleaved")
+    for lived in evidence.role("interleaved"):
+        for seen in _differs(evidence, lived, f"{doing}, against one alone"):
+            yield seen
+            return
+
+
+@rule("RL402", "closing breaks another instance", ERROR, CLIENT_FIX)
+def closing(evidence: Evidence) -> Iterator[Seen]:
+    """Closing one instance breaks another, or changes what it does: close ends something they share."""
+    _require_alone(evidence)
+    doing = "after another instance was closed"
+    for failure in _failures(evidence, "after close"):
+        yield _failed(failure, doing)
+        return
+    if list(interleaved.check(evidence)):
+        raise NotJudged("the instances already disturb each other while both are open (RL401)")
+    yield from _differs(evidence, one(evidence, "after close"), f"{doing}, against one alone")
+
+
+@rule(
+    "RL403",
+    "no second instance",
+    ERROR,
+    "Open nothing exclusively (a port, a file, a display) in the constructor, or choose a free one per instance.",
+)
+def second_instance(evidence: Evidence) -> Iterator[Seen]:
+    """A second environment, in the same process or in another at the same time, cannot be built. Training needs
+    many."""
+    built(evidence)
+    for failure in evidence.failures:
+        if failure.call in ("load", "build") and failure.part != "probe":
+            beside = "in a second process" if failure.phase in ("build", "alone", "checkers") else "in one process"
+            yield Seen(f"a second instance {beside} cannot be built: {failure.error}", where(failure))
+            return

@@ -1,0 +1,138 @@
+"""Draws a world: robots from their URDF files, what Rerun cannot read from PyBullet's own shapes, markers, paths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.urdf import UrdfTree
+
+from rlctl.replay.scene import BodyMotion, Scene
+from rlctl.replay.shapes import draw_shapes
+from rlctl.replay.timelines import Timelines
+
+Tell = Callable[[str], None]
+WORLD_FRAME = "tf#/"
+_MARKER_COLORS = [(40, 200, 90), (70, 150, 255), (240, 120, 200), (250, 180, 40)]
+_HALO_RADIUS = 0.09  # [m]
+_PATH_COLOR = (120, 190, 255)
+_GROUND_COLOR = (70, 74, 82)
+
+
+def draw_scene(scene: Scene, timelines: Timelines, tell: Tell) -> None:
+    """Draw everything under `world/`; `tell` hears of what could not be drawn as it should be."""
+    timelines.stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for body in scene.bodies:
+        if body.ground_height is not None:
+            _draw_ground(body, scene, timelines)
+        else:
+            _draw_body(body, timelines, tell)
+        _draw_path(body, timelines)
+    for number, (name, positions) in enumerate(scene.markers.items()):
+        _draw_marker(name, positions, _MARKER_COLORS[number % len(_MARKER_COLORS)], timelines)
+
+
+def _draw_marker(name: str, positions: NDArray[np.float64], color: tuple[int, int, int], timelines: Timelines) -> None:
+    """Draw a labelled point, and a halo around it that is still seen when a hand is there."""
+    entity, steps = _entity("world", "markers", name), range(len(positions))
+    stream = timelines.stream
+    # Not static positions: static data would hide the moving ones for good.
+    point = rr.Points3D.from_fields(radii=0.03, colors=color, labels=name, show_labels=True)
+    stream.log(entity, point, static=True)
+    timelines.send(entity, steps, rr.Points3D.columns(positions=positions))
+    halo = rr.Ellipsoids3D.from_fields(
+        half_sizes=[[_HALO_RADIUS] * 3], colors=color, fill_mode=rr.components.FillMode.MajorWireframe
+    )
+    stream.log(f"{entity}/halo", halo, static=True)
+    timelines.send(f"{entity}/halo", steps, rr.Ellipsoids3D.columns(centers=positions))
+
+
+def _entity(*parts: str) -> str:
+    return rr.new_entity_path(list(parts))
+
+
+def _draw_ground(body: BodyMotion, scene: Scene, timelines: Timelines) -> None:
+    low, high = bounds(scene)
+    center, half = (low + high)[:2] / 2, max(2.0, float((high - low)[:2].max()))
+    thickness = 0.01
+    timelines.stream.log(
+        _entity("world", body.name),
+        rr.Boxes3D(
+            centers=[[*center, (body.ground_height or 0.0) - thickness]],
+            half_sizes=[[half, half, thickness / 2]],
+            colors=[_GROUND_COLOR],
+            fill_mode=rr.components.FillMode.Solid,
+        ),
+        static=True,
+    )
+
+
+def bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and highest coordinates [m] that links and markers reach, each of shape (3,)."""
+    places = [body.positions.reshape(-1, 3) for body in scene.bodies if body.ground_height is None]
+    places += list(scene.markers.values())
+    points = np.concatenate([*places, np.zeros((0, 3))])
+    return (points.min(axis=0), points.max(axis=0)) if len(points) else (-np.ones(3), np.ones(3))
+
+
+def _draw_body(body: BodyMotion, timelines: Timelines, tell: Tell) -> None:
+    try:
+        tree = UrdfTree.from_file_path(
+            body.file, frame_prefix=f"{body.name}/", static_transform_entity_path=_entity("tf", body.name, "fixed")
+        )
+    except Exception as error:  # Rerun's reader is stricter than PyBullet's, and raises what its parser raises
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        tell(f"{body.file.name}: drawn from PyBullet's shapes, Rerun cannot read it: {reason}")
+        draw_shapes(body, timelines, tell)
+        return
+    _send_meshes(tree, body, timelines.stream)
+    _send_motion(tree, body, timelines)
+
+
+def _send_meshes(tree: UrdfTree, body: BodyMotion, stream: rr.RecordingStream) -> None:
+    root, ours = _entity(tree.name), _entity("world", body.name)
+    visuals = tree.stream().drop(content=f"{root}/collision_geometries/**")
+    chunks = []
+    for chunk in visuals:
+        if chunk.entity_path == root or chunk.entity_path.startswith(f"{root}/"):
+            rest = chunk.entity_path.removeprefix(root).removeprefix("/visual_geometries")
+            chunk = chunk.with_entity_path(ours + rest)
+        chunks.append(chunk)
+    stream.send_chunks(chunks)
+
+
+def _send_motion(tree: UrdfTree, body: BodyMotion, timelines: Timelines) -> None:
+    root = {"parent_frame": WORLD_FRAME, "child_frame": f"{body.name}/{tree.root_link().name}"}
+    base = _entity("tf", body.name, "base")
+    if body.fixed:
+        pose = rr.Transform3D(
+            translation=body.positions[0, 0], quaternion=rr.Quaternion(xyzw=body.orientations[0, 0]), **root
+        )
+        timelines.stream.log(base, pose, static=True)
+    else:
+        steps = len(body.positions)
+        columns = rr.Transform3D.columns(
+            translation=body.positions[:, 0],
+            quaternion=body.orientations[:, 0],
+            **{key: [value] * steps for key, value in root.items()},
+        )
+        timelines.send(base, range(steps), columns)
+    known = {joint.name: joint for joint in tree.joints()}
+    for index, name in enumerate(body.joint_names):
+        if name in known:
+            angles = body.joint_positions[:, index].tolist()
+            columns = known[name].compute_transform_columns(angles, clamp=False)
+            timelines.send(_entity("tf", body.name, name), range(len(angles)), columns)
+
+
+def _draw_path(body: BodyMotion, timelines: Timelines) -> None:
+    """Draw the way of an arm's last link, or of a free robot's base: a segment per step."""
+    if not body.joint_names or (body.fixed and not body.chain):
+        return
+    points = body.positions[:, -1 if body.fixed else 0].astype(np.float32)
+    entity = _entity("world", "paths", body.name)
+    timelines.stream.log(entity, rr.LineStrips3D.from_fields(radii=0.004, colors=_PATH_COLOR), static=True)
+    segments = [points[step - 1 : step + 1] for step in range(1, len(points))]
+    timelines.send(entity, range(1, len(points)), rr.LineStrips3D.columns(strips=segments))

@@ -1,0 +1,152 @@
+"""Sends the numbers of an episode as curves, each with a name and a colour."""
+
+from __future__ import annotations
+
+import colorsys
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from rlctl.replay.live import Lived
+from rlctl.replay.pictures import jpeg
+from rlctl.replay.scene import Scene
+from rlctl.replay.timelines import Timelines
+
+Color = tuple[int, int, int]
+# Distinct on the viewer's dark and light background; the first eight also to colour-blind eyes.
+_PALETTE: list[Color] = [
+    (86, 180, 233), (230, 159, 0), (0, 180, 130), (222, 110, 170), (213, 94, 0), (150, 120, 220), (170, 170, 60),
+    (120, 200, 90), (200, 80, 80), (60, 120, 200),
+]  # fmt: skip
+_TOTAL_COLOR: Color = (150, 150, 150)
+_MOST_SERIES = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class Plot:
+    """A group of curves to show in one view."""
+
+    title: str
+    entity: str
+    kind: str
+    """reward, action, joints, observation or image."""
+
+
+def send_curves(lived: Lived, scene: Scene | None, timelines: Timelines) -> list[Plot]:
+    """Send rewards, actions, joints and observations; return the plots there are, in order."""
+    plots = _rewards(lived, timelines)
+    plots += _actions(lived, timelines)
+    plots += _joints(scene, timelines) if scene else []
+    return plots + _observations(lived, timelines)
+
+
+def palette(count: int) -> list[Color]:
+    """Return distinct colours."""
+    if count <= len(_PALETTE):
+        return _PALETTE[:count]
+    return [_hue(index / count) for index in range(count)]
+
+
+def _hue(hue: float) -> Color:
+    red, green, blue = colorsys.hsv_to_rgb(hue, 0.65, 0.85)
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def _send(timelines: Timelines, entity: str, first: int, values: NDArray[Any], names: Sequence[str]) -> None:
+    """Send curves: `values` of shape (rows, curves), its first row at the step `first`."""
+    rows, count = values.shape
+    if count == 0:
+        return
+    style = rr.SeriesLines(names=list(names), colors=palette(count), widths=[1.5] * count)
+    timelines.stream.log(entity, style, static=True)
+    scalars = np.ascontiguousarray(values, np.float64)
+    timelines.send(entity, range(first, first + rows), rr.Scalars.columns(scalars=scalars))
+
+
+def _single(timelines: Timelines, entity: str, values: NDArray[Any], name: str, color: Color, width: float) -> None:
+    timelines.stream.log(entity, rr.SeriesLines(names=name, colors=color, widths=width), static=True)
+    scalars = np.asarray(values, np.float64)
+    timelines.send(entity, range(1, len(scalars) + 1), rr.Scalars.columns(scalars=scalars))
+
+
+def _rewards(lived: Lived, timelines: Timelines) -> list[Plot]:
+    names = lived.episode.info.term_names
+    _single(timelines, "reward/total", lived.episode.rewards, "total", _TOTAL_COLOR, 2.5)
+    for index, (name, color) in enumerate(zip(names, palette(len(names)), strict=True)):
+        entity = rr.new_entity_path(["reward", "terms", name])
+        _single(timelines, entity, lived.weighted_terms[:, index], name, color, 1.5)
+    if lived.successes is not None:
+        _single(timelines, "success", lived.successes, "success", _PALETTE[2], 1.5)
+    return [Plot("reward, by weighted term" if names else "reward", "reward", "reward")]
+
+
+def _actions(lived: Lived, timelines: Timelines) -> list[Plot]:
+    actions = lived.episode.actions.reshape(lived.length, -1)
+    _send(timelines, "action", 1, actions, _numbered("action", actions.shape[1]))
+    meaning = lived.env.action_meaning
+    return [Plot(f"action: {meaning}" if meaning else "action", "action", "action")]
+
+
+def _joints(scene: Scene, timelines: Timelines) -> list[Plot]:
+    robots = scene.robots()
+    for body in robots:
+        names = [name if len(robots) == 1 else f"{body.name}/{name}" for name in body.joint_names]
+        positions, velocities = (rr.new_entity_path(["joints", kind, body.name]) for kind in ("position", "velocity"))
+        _send(timelines, positions, 0, body.joint_positions, names)
+        _send(timelines, velocities, 0, body.joint_velocities, names)
+    if not robots:
+        return []
+    return [
+        Plot("joint positions", "joints/position", "joints"),
+        Plot("joint velocities", "joints/velocity", "joints"),
+    ]
+
+
+def _numbered(name: str, count: int) -> list[str]:
+    return [name] if count == 1 else [f"{name}[{index}]" for index in range(count)]
+
+
+def _observations(lived: Lived, timelines: Timelines) -> list[Plot]:
+    plots = []
+    for name, values in named_observations(lived).items():
+        unit = lived.env.observation_units.get(name)
+        entity = "observation" if not name else rr.new_entity_path(["observation", name])
+        title = f"observed {name}" if name else "observation"
+        if _is_image(values):
+            _send_images(timelines, entity, values)
+            plots.append(Plot(title, entity, "image"))
+            continue
+        flat = values.reshape(len(values), -1)
+        shown = flat[:, :_MOST_SERIES]
+        _send(timelines, entity, 0, shown, _numbered(name or "observation", flat.shape[1])[: shown.shape[1]])
+        plots.append(Plot(f"{title} [{unit}]" if unit else title, entity, "observation"))
+    return plots
+
+
+def named_observations(lived: Lived) -> dict[str, NDArray[Any]]:
+    """Return the observations by name, each of shape (T + 1, ...); under "" where there are no names.
+
+    Of stacked observations it is the newest.
+    """
+    observations, sizes = lived.episode.observations, lived.env.observation_sizes
+    if isinstance(observations, dict):
+        return observations
+    if not sizes or observations.ndim != 2:
+        return {"": observations}
+    newest = observations[:, -sum(sizes.values()) :]
+    ends = np.cumsum(list(sizes.values()))
+    return {name: newest[:, end - size : end] for (name, size), end in zip(sizes.items(), ends, strict=True)}
+
+
+def _is_image(values: NDArray[Any]) -> bool:
+    return values.dtype == np.uint8 and values.ndim == 4 and values.shape[-1] in (1, 3)
+
+
+def _send_images(timelines: Timelines, entity: str, values: NDArray[Any]) -> None:
+    blobs = [jpeg(image) for image in values]
+    columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
+    timelines.send(entity, range(len(blobs)), columns)

@@ -1,0 +1,132 @@
+"""Compares two lives of one episode, bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.replay.live import Lived
+from rlctl.run.episode import Observations, RecordedEpisode
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """Where two lives of an episode part."""
+
+    step: int
+    """The first step that differs; 0 is the reset."""
+    what: str
+    recorded: str
+    now: str
+    size: float | None
+    """Absolute difference there; None where there is none to give."""
+    steps: int
+    """How many steps differ."""
+    length: int
+    """Steps of the recorded episode."""
+
+    def __str__(self) -> str:
+        by = "" if self.size is None else f" (off by {self.size:.3g})"
+        return (
+            f"step {self.step} of {self.length}: {self.what} is {self.now}, recorded {self.recorded}{by}; "
+            f"{self.steps} of {self.length + 1} steps differ"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Column:
+    """Recorded and present values: a row per step from `first` on, a name per element of a row."""
+
+    names: list[str]
+    first: int
+    recorded: NDArray[Any]
+    now: NDArray[Any]
+
+    def differing(self) -> NDArray[np.int64]:
+        """Return the steps whose bits differ."""
+        rows = min(len(self.recorded), len(self.now))
+        before, after = self.recorded[:rows], self.now[:rows]
+        if before.dtype != after.dtype or before.shape != after.shape:
+            return np.arange(rows) + self.first
+        unequal: NDArray[np.bool_] = (_bits(before) != _bits(after)).any(axis=1)
+        return np.flatnonzero(unequal) + self.first
+
+    def difference(self, step: int, steps: int, length: int) -> Difference:
+        """Describe the first element that differs at a step."""
+        before, after = self.recorded[step - self.first], self.now[step - self.first]
+        name = self.names[0].partition("[")[0]
+        if before.dtype != after.dtype:
+            return Difference(step, f"type of {name}", str(before.dtype), str(after.dtype), None, steps, length)
+        if before.shape != after.shape:
+            return Difference(step, f"size of {name}", str(before.size), str(after.size), None, steps, length)
+        element = int(np.flatnonzero((_bits(before[:, None]) != _bits(after[:, None])).any(axis=1))[0])
+        values = before[element].item(), after[element].item()
+        size = abs(float(values[1]) - float(values[0]))
+        texts = [repr(value) for value in values]
+        finite = size if np.isfinite(size) else None
+        return Difference(step, self.names[element], texts[0], texts[1], finite, steps, length)
+
+
+def _bits(values: NDArray[Any]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(values).reshape(len(values), -1).view(np.uint8)
+
+
+def find_difference(recorded: RecordedEpisode, lived: Lived) -> Difference | None:
+    """Compare observations, rewards, reward terms and the end; None if every bit is the same."""
+    length = len(recorded.rewards)
+    steps: set[int] = set()
+    first: tuple[int, _Column] | None = None
+    for column in _columns(recorded, lived):
+        found = column.differing().tolist()
+        steps.update(found)
+        # At the same step the earlier column counts: what is observed explains what is rewarded.
+        if found and (first is None or found[0] < first[0]):
+            first = found[0], column
+    if first is not None:
+        return first[1].difference(first[0], len(steps), length)
+    return _different_end(recorded, lived, length)
+
+
+def _columns(recorded: RecordedEpisode, lived: Lived) -> list[_Column]:
+    before, after = _parts(recorded.observations), _parts(lived.episode.observations)
+    columns = [
+        _Column(_element_names(name, max(part.shape[1], 1), lived), 0, before.get(name, part[:, :0]), part)
+        for name, part in after.items()
+    ]
+    info = recorded.info
+    columns.append(_Column(["reward"], 1, recorded.rewards[:, None], lived.episode.rewards[:, None]))
+    if info.term_names == lived.episode.info.term_names and info.term_names:
+        names = [f"term {name}" for name in info.term_names]
+        columns.append(_Column(names, 1, recorded.terms, lived.episode.terms))
+    return columns
+
+
+def _parts(observations: Observations) -> dict[str, NDArray[Any]]:
+    parts = observations if isinstance(observations, dict) else {"": observations}
+    return {name: values.reshape(len(values), -1) for name, values in parts.items()}
+
+
+def _element_names(name: str, count: int, lived: Lived) -> list[str]:
+    sizes = lived.env.observation_sizes
+    if not name and sum(sizes.values()) == count:
+        return [f"observation {part}[{index}]" for part, size in sizes.items() for index in range(size)]
+    label = f"observation {name}" if name else "observation"
+    return [f"{label}[{index}]" for index in range(count)]
+
+
+def _different_end(recorded: RecordedEpisode, lived: Lived, length: int) -> Difference | None:
+    before, after = recorded.info, lived.episode.info
+    if lived.length != length:
+        return Difference(lived.length, "length", str(length), str(lived.length), length - lived.length, 1, length)
+    if not lived.ended:
+        return Difference(length, "end of the episode", "here", "not here", None, 1, length)
+    for what, recorded_value, value in (
+        ("names of the reward terms", before.term_names, after.term_names),
+        ("success", before.success, after.success),
+    ):
+        if recorded_value != value:
+            return Difference(length, what, str(recorded_value), str(value), None, 1, length)
+    return None

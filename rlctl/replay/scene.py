@@ -1,0 +1,176 @@
+"""What a PyBullet world looks like, step by step: read while an episode is lived, drawn afterwards."""
+
+from __future__ import annotations
+
+import dataclasses
+import traceback
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError
+from rlctl.task.bullet import pybullet
+from rlctl.task.env import TaskEnv
+from rlctl.task.sim import Body
+
+Array = NDArray[np.float64]
+_GROUND_SIZE = 8.0  # [m]; a body without joints that is wider both ways is the ground
+_INERTIAL_POSE = slice(3, 5)  # of getDynamicsInfo: the centre of mass in the link frame
+_LINK_POSE = slice(4, 6)  # of getLinkState: the link frame in the world
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """One visual shape, as PyBullet has it: a kind, sizes [m], a pose in the frame of its link, a colour."""
+
+    link: str
+    kind: int
+    """`pybullet.GEOM_*`."""
+    size: tuple[float, ...]
+    """Box: full extents; sphere: radius; cylinder and capsule: length and radius; mesh: scale per axis."""
+    mesh: Path | None
+    position: tuple[float, ...]
+    orientation: tuple[float, ...]
+    color: tuple[float, ...]
+    """RGBA in [0, 1]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyMotion:
+    """A body over T steps. Positions [m] and quaternions (x, y, z, w) are of link frames in the world frame."""
+
+    name: str
+    file: Path
+    fixed: bool
+    ground_height: float | None
+    """Height of the upper face [m] if the body is the flat ground."""
+    joint_names: list[str]
+    joint_positions: Array
+    """[rad or m], shape (T + 1, joints)."""
+    joint_velocities: Array
+    """[rad/s or m/s], shape (T + 1, joints)."""
+    links: list[str]
+    """The base first."""
+    positions: Array
+    """Shape (T + 1, links, 3)."""
+    orientations: Array
+    """Shape (T + 1, links, 4)."""
+    shapes: list[Shape]
+    chain: bool
+    """Whether the links follow each other in one line, as those of an arm do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A world over T steps."""
+
+    bodies: list[BodyMotion]
+    markers: dict[str, Array]
+    """World positions [m], shape (T + 1, 3)."""
+
+    def robots(self) -> list[BodyMotion]:
+        """Return the bodies with joints."""
+        return [body for body in self.bodies if body.joint_names]
+
+
+class SceneObserver:
+    """Reads bodies and markers after the reset and every step; changes nothing."""
+
+    def __init__(self, env: TaskEnv) -> None:
+        self._env = env
+        self._bodies: list[_BodyReader] = []
+        self._markers: dict[str, list[Array]] = {}
+
+    def __call__(self, step: int) -> None:
+        if step == 0:  # only now: a reset may load the bodies anew
+            self._bodies = [_BodyReader(body) for body in self._env.sim.bodies.values()]
+            self._markers = {name: [] for name in self._marker_positions()}
+        for reader in self._bodies:
+            reader.read()
+        if self._markers:
+            positions = self._marker_positions()
+            for name, history in self._markers.items():
+                history.append(np.array(positions[name], np.float64))
+
+    def _marker_positions(self) -> dict[str, Array]:
+        try:
+            return self._env.task.markers()
+        except Exception as error:  # a plugin may raise anything
+            message = f"{self._env.name}: markers() raised {type(error).__name__}: {error}"
+            raise TaskError(message, details=traceback.format_exc()) from error
+
+    def scene(self) -> Scene:
+        """Return what was seen since the last reset."""
+        return Scene(
+            [reader.motion() for reader in self._bodies],
+            {name: np.stack(history) for name, history in self._markers.items()},
+        )
+
+
+class _BodyReader:
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        self.client = body.sim.client
+        base, _ = pybullet.getBodyInfo(body.id, physicsClientId=self.client)
+        self.links = [base.decode(), *body.link_names]
+        inertial = pybullet.getDynamicsInfo(body.id, -1, physicsClientId=self.client)[_INERTIAL_POSE]
+        # PyBullet's base pose is that of the centre of mass.
+        self._base_in_inertial = pybullet.invertTransform(*inertial)
+        self._joint_positions: list[Array] = []
+        self._joint_velocities: list[Array] = []
+        self._poses: list[list[tuple[tuple[float, ...], tuple[float, ...]]]] = []
+
+    def read(self) -> None:
+        body = self.body
+        self._joint_positions.append(body.joint_positions.copy())
+        self._joint_velocities.append(body.joint_velocities.copy())
+        inertial = pybullet.getBasePositionAndOrientation(body.id, physicsClientId=self.client)
+        poses = [pybullet.multiplyTransforms(*inertial, *self._base_in_inertial)]
+        if len(self.links) > 1:
+            states = pybullet.getLinkStates(
+                body.id, list(range(len(self.links) - 1)), computeForwardKinematics=1, physicsClientId=self.client
+            )
+            poses += [state[_LINK_POSE] for state in states]
+        self._poses.append(poses)
+
+    def motion(self) -> BodyMotion:
+        body = self.body
+        return BodyMotion(
+            name=body.name,
+            file=body.file,
+            fixed=body.fixed,
+            ground_height=self._ground_height(),
+            joint_names=body.joint_names,
+            joint_positions=np.stack(self._joint_positions),
+            joint_velocities=np.stack(self._joint_velocities),
+            links=self.links,
+            positions=np.array([[pose[0] for pose in poses] for poses in self._poses], np.float64),
+            orientations=np.array([[pose[1] for pose in poses] for poses in self._poses], np.float64),
+            shapes=self._shapes(),
+            chain=self._is_chain(),
+        )
+
+    def _ground_height(self) -> float | None:
+        if len(self.links) > 1:
+            return None
+        low, high = pybullet.getAABB(self.body.id, -1, physicsClientId=self.client)
+        if min(high[0] - low[0], high[1] - low[1]) < _GROUND_SIZE:
+            return None
+        endless = high[2] - low[2] > 1e6  # an infinite plane has an infinite box
+        return float(self._poses[0][0][0][2] if endless else high[2])
+
+    def _is_chain(self) -> bool:
+        parents = [
+            pybullet.getJointInfo(self.body.id, index, physicsClientId=self.client)[16]
+            for index in range(len(self.links) - 1)
+        ]
+        return len(parents) > 1 and parents == list(range(-1, len(parents) - 1))
+
+    def _shapes(self) -> list[Shape]:
+        shapes = []
+        for data in pybullet.getVisualShapeData(self.body.id, physicsClientId=self.client):
+            _, link, kind, size, mesh, position, orientation, color = data[:8]
+            file = Path(mesh.decode()) if mesh else None
+            shapes.append(Shape(self.links[link + 1], kind, tuple(size), file, position, orientation, color))
+        return shapes

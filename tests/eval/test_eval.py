@@ -1,0 +1,150 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from rlctl.errors import AnswerIsNo, UsageError
+from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.eval.report import as_json
+from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
+from rlctl.rollout.workers import EpisodeResult
+from rlctl.train.request import TrainRequest, run_training
+from tests.train.conftest import ENVS, SMALL_PPO
+
+
+@pytest.fixture(scope="module")
+def reach_run(tmp_path_factory):
+    """A barely trained policy for reach: evaluation does not care how good it is."""
+    root = tmp_path_factory.mktemp("runs")
+    settings = {**SMALL_PPO, "eval": {"episodes": 2, "every_steps": 256}}
+    return run_training(TrainRequest("reach", settings=settings, root=root)).run
+
+
+@pytest.fixture(scope="module")
+def evaluation(reach_run):
+    return run_evaluation(EvalRequest(str(reach_run.path), episodes=6), Gates())
+
+
+def result(success, total=1.0, terms=None):
+    return EpisodeResult(0, 0, total, 10, success, terms or {}, None)
+
+
+def test_wilson_interval_by_hand():
+    results = [result(True)] * 8 + [result(False)] * 2
+    assert success_rate(results) == 0.8
+    # p = 0.8, n = 10, z = 1.959964: centre (p + z^2 / 2n) / (1 + z^2 / n) = (0.8 + 0.192073) / 1.384146 = 0.716741
+    # half width z / (1 + z^2 / n) * sqrt(p q / n + z^2 / 4 n^2) = 1.416010 * sqrt(0.016 + 0.00960365) = 0.226577
+    assert success_interval(results) == pytest.approx((0.490162, 0.943318), abs=1e-5)
+
+
+def test_no_success_is_not_zero_success():
+    assert success_rate([result(None)]) is None
+    assert success_interval([result(None)]) is None
+
+
+def test_spread_by_hand():
+    # Middle half of 0 1 2 3 4 5 6 100: 2 3 4 5, mean 3.5.
+    spread = Spread.of([100, 0, 1, 2, 3, 4, 5, 6])
+    assert spread.iqm == 3.5
+    assert spread.mean == 121 / 8
+    assert (spread.min, spread.max) == (0, 100)
+    assert Spread.of([1.0, 3.0]).std == pytest.approx(2**0.5)
+    assert Spread.of([1.0]).std == 0.0
+
+
+def test_mean_terms_add_up():
+    results = [result(True, 3.0, {"a": 1.0, "b": 2.0}), result(True, 5.0, {"a": 5.0, "b": 0.0})]
+    assert mean_terms(results) == {"a": 3.0, "b": 1.0}
+
+
+def test_an_episode_does_not_depend_on_what_runs_beside_it(reach_run, evaluation):
+    alone = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, n_envs=1), Gates())
+    assert [episode.result.total_reward for episode in alone.episodes] == [
+        episode.result.total_reward for episode in evaluation.episodes
+    ]
+    assert len({episode.seed for episode in evaluation.episodes}) == 6
+
+
+def test_terms_add_up_to_the_return(evaluation):
+    for episode in evaluation.episodes:
+        assert sum(episode.result.terms.values()) == pytest.approx(episode.result.total_reward)
+    assert evaluation.final_distance is not None
+    assert evaluation.final_distance.min > 0
+
+
+def test_json_has_what_ci_needs(evaluation):
+    content = as_json(evaluation)
+    assert {"success_rate", "success_interval", "return", "episodes", "task", "policy", "versions"} <= content.keys()
+    assert content["return"].keys() == {"mean", "iqm", "std", "min", "max"}
+    assert content["episodes"][2].keys() >= {"index", "seed", "success", "return", "length", "terms"}
+    assert content["return"]["mean"] == pytest.approx(np.mean([each["return"] for each in content["episodes"]]))
+    json.dumps(content, allow_nan=False)
+
+
+def test_tolerance_is_a_parameter(reach_run):
+    wide = EvalRequest(str(reach_run.path), episodes=4, task_parameters={"tolerance": 10.0})
+    assert run_evaluation(wide, Gates()).success_rate == 1.0
+
+
+def test_stochastic_repeats_with_its_seed(reach_run):
+    request = EvalRequest(str(reach_run.path), episodes=2, deterministic=False)
+    first, second = (run_evaluation(request, Gates()).returns.mean for _ in range(2))
+    assert first == second
+    assert first != run_evaluation(EvalRequest(str(reach_run.path), episodes=2), Gates()).returns.mean
+
+
+@pytest.mark.parametrize(
+    ("gates", "told"),
+    [
+        (Gates(min_success=1.1), r"success rate 0\.\d+ is below 1\.1"),
+        (Gates(min_success_lower=1.1), r"lower bound 0\.\d+ of the success rate is below 1\.1"),
+        (Gates(min_return=1e9), "mean return .* is below 1e"),
+        (Gates(min_success=1.1, min_return=1e9), "success rate .*; mean return"),
+    ],
+)
+def test_gates(evaluation, gates, told):
+    with pytest.raises(AnswerIsNo, match=told):
+        gates.check(evaluation)
+
+
+def test_a_gate_on_success_needs_success(tmp_path):
+    run = run_training(TrainRequest(f"{ENVS}:NoSuccess", settings=SMALL_PPO, root=tmp_path)).run
+    with pytest.raises(UsageError, match="--min-success: this task reports no success"):
+        run_evaluation(EvalRequest(str(run.path), episodes=2), Gates(min_success=0.5))
+    assert run_evaluation(EvalRequest(str(run.path), episodes=2), Gates(min_return=-1e9)).success_rate is None
+
+
+def rlctl(*arguments, cwd):
+    return subprocess.run([sys.executable, "-m", "rlctl", *arguments], capture_output=True, text=True, cwd=cwd)
+
+
+def test_command_line_gate_and_pure_json(reach_run, tmp_path):
+    done = rlctl(*("eval", str(reach_run.path), "--episodes", "3", "--min-success", "1", "--json", "-"), cwd=tmp_path)
+    assert done.returncode == 1
+    assert json.loads(done.stdout)["policy"]["training_steps"] == 256
+    assert done.stderr.strip().splitlines()[-1].startswith("error: gate missed: success rate 0")
+
+
+def test_policy_for_another_task_is_refused(reach_run, tmp_path):
+    done = rlctl("eval", str(reach_run.best_policy), "--task", "Pendulum-v1", "--episodes", "1", cwd=tmp_path)
+    assert done.returncode == 5
+    assert "this policy is not for this task: its observation space is Box(" in done.stderr
+    assert ", the environment's is Box([-1. -1. -8.], [1. 1. 8.], (3,), float32)" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_no_run_yet(tmp_path):
+    done = rlctl("eval", cwd=tmp_path)
+    assert done.returncode == 5
+    assert done.stderr == f"error: no run yet under {tmp_path / 'runs'}; train one: rlctl train reach\n"
+
+
+def test_a_run_without_a_best_policy(reach_run, tmp_path):
+    run = tmp_path / "runs" / "reach" / "2026-01-01_00-00-00_s0"
+    run.mkdir(parents=True)
+    (run / "run.json").write_text('{"task": "reach"}')
+    done = rlctl("eval", "reach", cwd=tmp_path)
+    assert done.returncode == 5
+    assert "no best policy yet; train longer, or use --checkpoint last" in done.stderr

@@ -1,0 +1,109 @@
+"""Small environments for training tests: loaded by path, in workers too."""
+
+import os
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+
+class Line(gymnasium.Env):
+    """A point on a line is pushed to the origin; ten steps an episode, success within 0.5."""
+
+    def __init__(self):
+        self.observation_space = spaces.Box(-10.0, 10.0, (1,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        self.x = float(self.np_random.uniform(-0.4, 0.4))
+        return self._observation(), {}
+
+    def _observation(self):
+        return np.array([self.x], np.float32)
+
+    def step(self, action):
+        self.steps += 1
+        self.x = float(np.clip(self.x + 0.01 * float(action[0]), -10, 10))
+        return self._observation(), -abs(self.x), False, self.steps >= 10, {"is_success": abs(self.x) < 0.5}
+
+
+class Discrete(Line):
+    """The same with two actions."""
+
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Discrete(2)
+
+    def step(self, action):
+        return super().step([2.0 * action - 1.0])
+
+
+class DictObservation(Line):
+    """The same, observed as a dictionary."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Dict(
+            {"x": spaces.Box(-10.0, 10.0, (1,), np.float32), "flag": spaces.Discrete(3)}
+        )
+
+    def _observation(self):
+        return {"x": np.array([self.x], np.float32), "flag": 1}
+
+
+class Image(Line):
+    """The same, seen by a small camera."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+    def _observation(self):
+        image = np.zeros((36, 36, 3), np.uint8)
+        image[:, int(18 + self.x)] = 255
+        return image
+
+
+class Faulty(Line):
+    """Goes wrong, in a way of its parameter, at the seventh step of its third episode."""
+
+    def __init__(self, fault: str = "raise", episode: int = 3):
+        super().__init__()
+        self.fault, self.episode, self.episodes = fault, episode, 0
+
+    def reset(self, *, seed=None, options=None):
+        self.episodes += 1
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        if self.episodes == self.episode and self.steps == 7:
+            if self.fault == "raise":
+                raise RuntimeError("the gripper fell off")
+            if self.fault == "nan reward":
+                reward = float("nan")
+            if self.fault == "nan observation":
+                observation = np.array([np.nan], np.float32)
+            if self.fault == "shape":
+                observation = np.zeros(2, np.float32)
+            if self.fault == "die":
+                os._exit(9)
+        return observation, reward, terminated, truncated, info
+
+
+class Exploding(Line):
+    """Rewards that no network survives."""
+
+    def step(self, action):
+        observation, _, terminated, truncated, info = super().step(action)
+        return observation, 1e30 * float(action[0]), terminated, truncated, info
+
+
+class NoSuccess(Line):
+    """The same, without saying what success is."""
+
+    def step(self, action):
+        return (*super().step(action)[:4], {})

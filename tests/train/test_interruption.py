@@ -1,0 +1,134 @@
+"""Signals and full disks, on the real command."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.train.conftest import ENVS
+
+COMMAND = [sys.executable, "-m", "rlctl", "train"]
+SMALL = [
+    *("--n-envs", "4", "--set", "algo_kwargs.n_steps=16", "--set", "algo_kwargs.batch_size=32"),
+    *("--set", "eval.episodes=4", "--set", "eval.every_steps=1_000_000"),
+]
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if condition():
+            return
+        time.sleep(0.05)
+    pytest.fail("waited in vain")
+
+
+def start(folder: Path, *arguments: str, **options) -> subprocess.Popen:
+    return subprocess.Popen(
+        [*COMMAND, f"{ENVS}:Line", "-n", "1e8", *SMALL, *arguments],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_saves_a_checkpoint_and_leaves_no_child(tmp_path, number, code):
+    process = start(tmp_path)
+    wait_for(lambda: list(tmp_path.glob("runs/*/*/metrics.csv")))
+    children = psutil.Process(process.pid).children(recursive=True)
+    assert children
+    process.send_signal(number)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert stdout == ""
+    last = stderr.strip().splitlines()[-1]
+    assert last.startswith("error: interrupted at step ")
+    assert "checkpoint saved. Go on with: rlctl train --resume runs/" in last
+    assert "Traceback" not in stderr
+    wait_for(lambda: not any(child.is_running() for child in children), 5)
+    (run,) = tmp_path.glob("runs/Line/*")
+    assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
+    steps = int(next((run / "checkpoints").iterdir()).name)
+    done = subprocess.run(
+        [*COMMAND, "--resume", str(run), "-n", str(steps + 64), "--json", "-"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert json.loads(done.stdout)["steps"] == steps + 64
+
+
+def test_a_killed_run_leaves_no_worker_and_does_not_block_the_next(tmp_path):
+    process = start(tmp_path, "--set", "eval.every_steps=64")
+    wait_for(lambda: list(tmp_path.glob("runs/*/*/checkpoints/0*")))
+    children = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.communicate(timeout=60)
+    wait_for(lambda: not any(child.is_running() for child in children), 10)
+    (run,) = tmp_path.glob("runs/Line/*")
+    steps = max(int(each.name) for each in (run / "checkpoints").iterdir() if each.name.isdigit())
+    done = subprocess.run(
+        [*COMMAND, "--resume", "latest", "-n", str(steps + 64)], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_two_processes_cannot_write_one_run(tmp_path):
+    process = start(tmp_path, "--set", "eval.every_steps=64")
+    wait_for(lambda: list(tmp_path.glob("runs/*/*/checkpoints/0*")))
+    second = subprocess.run([*COMMAND, "--resume", "latest"], cwd=tmp_path, capture_output=True, text=True)
+    process.terminate()
+    process.communicate(timeout=60)
+    assert second.returncode == 2
+    assert f"another process is writing this run (pid {process.pid} on " in second.stderr
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 8 MB."""
+    if os.geteuid() != 0:
+        pytest.skip("mounting a small file system needs root")
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)], capture_output=True, text=True
+    )
+    if mount.returncode != 0:
+        pytest.skip(f"no small file system here: {mount.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_a_full_disk_costs_warnings_and_an_exit_code(small_disk):
+    filler = small_disk / "filler"
+    process = start(small_disk, "--set", "eval.every_steps=20_000", "-n", "40_000")
+    wait_for(lambda: list(small_disk.glob("runs/*/*/metrics.csv")))
+    with filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space left"):
+        while True:
+            file.write(b"\0" * 4096)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 5, stderr
+    assert "warning: not saved: " in stderr
+    assert "No space left on device" in stderr
+    assert "the training is done, but could not be saved" in stderr.strip().splitlines()[-1]
+    assert not list(small_disk.glob("runs/*/*/checkpoints/[0-9]*"))
+    assert "Traceback" not in stderr
+
+
+def test_stdout_closed_early_is_silent(tmp_path):
+    process = start(tmp_path, "-n", "256")
+    process.stdout.close()
+    stderr = process.stderr.read()
+    assert process.wait(timeout=60) == 141
+    assert "Traceback" not in stderr
+    assert "error" not in stderr

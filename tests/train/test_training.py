@@ -1,0 +1,235 @@
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from rlctl.errors import DivergedError, RecipeError, TaskError, UsageError
+from rlctl.run import recipe as recipes
+from rlctl.run.episode import load_episode
+from rlctl.run.policy import load_policy
+from tests.train.conftest import ENVS, SMALL
+
+
+def rows(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_run_folder_holds_everything(train, small_ppo):
+    result = train("Line", small_ppo)
+    run = result.run
+    status = run.status()
+    assert status["status"] == "finished"
+    assert status["steps"] == result.steps == 256
+    assert run.recipe().algo_kwargs["n_steps"] == 16
+    assert run.best_policy.is_file()
+    assert run.last_policy.is_file()
+    assert [int(folder.name) for folder in run.checkpoints()] == [128, 256]
+    assert list(run.tensorboard.iterdir())
+    metrics = rows(run.metrics_file)
+    assert [int(row["steps"]) for row in metrics] == [64, 128, 192, 256]
+    assert all(float(row["approx_kl"]) >= 0 for row in metrics)
+    evals = rows(run.evals_file)
+    assert [int(row["steps"]) for row in evals] == [128, 256]
+    # |x| stays below 0.4 + 10 * 0.01 = 0.5, so every episode succeeds.
+    assert {float(row["success"]) for row in evals} == {1.0}
+
+
+def test_best_policy_is_that_of_the_best_evaluation(train, small_ppo):
+    result = train("Line", small_ppo)
+    best = max(rows(result.run.evals_file), key=lambda row: float(row["return"]))
+    assert load_policy(result.run.best_policy).info.training_steps == int(best["steps"]) == result.best_step
+
+
+def test_kept_episodes_are_the_first_and_the_worst(train, small_ppo):
+    result = train("Line", small_ppo)
+    files = sorted(result.run.episodes.glob("*.npz"))
+    assert 2 <= len(files) <= 4
+    episode = load_episode(files[0])
+    assert episode.actions.shape == (10, 1)
+    assert episode.observations.shape == (11, 1)
+    assert episode.info.total_reward == pytest.approx(episode.rewards.sum())
+
+
+@pytest.mark.parametrize(
+    ("algo", "env"),
+    [
+        ("ppo", "Line"),
+        ("ppo", "Discrete"),
+        ("ppo", "DictObservation"),
+        ("ppo", "Image"),
+        ("a2c", "Line"),
+        ("sac", "Line"),
+        ("td3", "Line"),
+        ("ddpg", "Line"),
+        ("dqn", "Discrete"),
+        ("tqc", "Line"),
+        ("crossq", "Line"),
+        ("recurrent_ppo", "Line"),
+    ],
+)
+def test_every_algorithm_trains_resumes_and_loads(train, resume, algo, env):
+    kwargs = {"n_steps": 16} if algo in recipes.ON_POLICY else {"learning_starts": 32, "batch_size": 16}
+    if algo == "ppo":
+        kwargs["batch_size"] = 32
+    result = train(env, {**SMALL, "algo": algo, "algo_kwargs": kwargs})
+    assert result.steps == 256
+    longer = resume(result, total_timesteps=384)
+    assert longer.steps == 384
+    steps = [int(row["steps"]) for row in rows(result.run.evals_file)]
+    assert steps == sorted(set(steps))
+    policy = load_policy(result.run.last_policy)
+    assert policy.info.algo == algo
+    assert policy.info.training_steps == 384
+    assert policy.action_space.contains(policy.predict(policy.observation_space.sample()))
+
+
+def test_resume_goes_on_with_weights_optimiser_normalisation_and_counters(train, resume, small_ppo):
+    from safetensors.numpy import load_file
+
+    first = train("Line", small_ppo)
+    before = load_file(first.run.checkpoints()[-1] / "state.safetensors")
+    count = float(before["normalize//count"])
+    # VecNormalize starts at 1e-4 and counts every observation once, resets included: 256 + 4.
+    assert count == pytest.approx(260, abs=0.01)
+    resume(first, total_timesteps=320)
+    state = json.loads((first.run.checkpoints()[-1] / "state.json").read_text())
+    after = load_file(first.run.checkpoints()[-1] / "state.safetensors")
+    assert state["counters"]["num_timesteps"] == 320
+    assert state["counters"]["_n_updates"] == 2 * 5  # epochs x rollouts
+    # 64 more, and 4 for the fresh episodes that a resume begins.
+    assert float(after["normalize//count"]) == pytest.approx(count + 68, abs=0.01)
+    adam_steps = {float(value) for key, value in after.items() if key.endswith("/step")}
+    assert adam_steps == {2.0 * 2 * 5}  # minibatches x epochs x rollouts
+    assert state["progress"]["episodes_started"] == [9] * 4  # 64 steps: 6 ended, 7 begun; then 1 + 1 more
+
+
+def test_resuming_a_finished_run_does_nothing(train, resume, small_ppo):
+    first = train("Line", small_ppo)
+    again = resume(first)
+    assert again.steps == 256
+    assert "nothing to do" in again.note
+
+
+def test_resume_takes_no_other_recipe(train, resume, small_ppo):
+    first = train("Line", small_ppo)
+    with pytest.raises(UsageError, match="algo cannot be changed, only -n"):
+        resume(first, algo="sac")
+
+
+def test_resume_falls_back_to_the_checkpoint_before_a_damaged_one(train, resume, small_ppo):
+    first = train("Line", small_ppo)
+    newest = first.run.checkpoints()[-1] / "state.safetensors"
+    content = bytearray(newest.read_bytes())
+    content[-1] ^= 1
+    newest.write_bytes(bytes(content))
+    resume(first)
+    assert [int(row["steps"]) for row in rows(first.run.metrics_file)] == [64, 128, 192, 256]
+    assert [int(row["steps"]) for row in rows(first.run.evals_file)] == [128, 256]
+
+
+def test_stop_success_takes_two_evaluations_in_a_row(train, small_ppo):
+    result = train("Line", {**small_ppo, "total_timesteps": 10_000, "stop_success": 0.98})
+    assert result.steps == 256
+    assert [int(row["steps"]) for row in rows(result.run.evals_file)] == [128, 256]
+
+
+def test_same_seed_gives_the_same_weights(train, small_ppo):
+    policies = [load_policy(train("Line", {**small_ppo, "seed": seed}).run.last_policy) for seed in (3, 3, 4)]
+    weights = [policy.network.state_dict() for policy in policies]
+    assert all((weights[0][key] == weights[1][key]).all() for key in weights[0])
+    assert any((weights[0][key] != weights[2][key]).any() for key in weights[0])
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("raise", "RuntimeError: the gripper fell off"),
+        ("nan reward", "ValueError: reward is nan"),
+        ("nan observation", "ValueError: observation is not finite: element 0 is nan"),
+        ("shape", r"ValueError: observation has shape \(2,\), the space has \(1,\)"),
+    ],
+)
+def test_a_fault_of_the_environment_is_named_with_episode_and_step(train, small_ppo, fault, told):
+    settings = {**small_ppo, "total_timesteps": 1000, "task": {"fault": fault, "episode": 8}}
+    with pytest.raises(TaskError, match=told) as caught:
+        train("Faulty", settings)
+    assert "episode seed " in str(caught.value)
+    assert "step 7" in str(caught.value)
+
+
+def test_a_fault_leaves_the_last_boundary_to_resume_from(train, small_ppo, tmp_path):
+    with pytest.raises(TaskError):
+        train("Faulty", {**small_ppo, "total_timesteps": 1000, "task": {"episode": 8}})
+    (status,) = (tmp_path / "runs").glob("*/*/run.json")
+    assert json.loads(status.read_text())["status"] == "failed"
+    # The eighth episode's seventh step is step 77 of an environment, in the fifth rollout of 16.
+    assert (status.parent / "checkpoints" / "000000256").is_dir()
+
+
+def test_a_worker_that_dies_ends_the_run(train, small_ppo):
+    with pytest.raises(TaskError, match=r"worker \d died while stepping \(exit code 9\)"):
+        train("Faulty", {**small_ppo, "total_timesteps": 1000, "task": {"fault": "die"}})
+
+
+def test_divergence_is_told(train, small_ppo):
+    settings = {**small_ppo, "total_timesteps": 2000, "normalize": {"observation": False, "reward": False}}
+    settings["algo_kwargs"] = {**settings["algo_kwargs"], "learning_rate": 1.0, "max_grad_norm": 1e30}
+    with pytest.raises(DivergedError, match="training diverged: .* not finite at step 64"):
+        train("Exploding", settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (
+            {"algo_kwargs": {"n_step": 16}},
+            "algo_kwargs.n_step: ppo has no parameter 'n_step'. Did you mean 'n_steps'?",
+        ),
+        ({"algo": "sac", "algo_kwargs": {"n_epochs": 3}}, "algo_kwargs.n_epochs: sac has no parameter 'n_epochs'."),
+        (
+            {"policy_kwargs": {"net_arc": [8]}},
+            "policy_kwargs.net_arc: ActorCriticPolicy has no parameter 'net_arc'. Did you mean 'net_arch'?",
+        ),
+        (
+            {"policy_kwargs": {"activation_fn": "rellu"}},
+            "policy_kwargs.activation_fn: no activation 'rellu'. Did you mean 'relu'?",
+        ),
+        ({"algo_kwargs": {"learning_rate": "lin_fast"}}, "'lin_fast' is not lin_ and a number, such as lin_3e-4"),
+        ({"algo": "dqn"}, "dqn cannot be used here: "),
+        ({"task": {"colour": 1}}, "task.colour: "),
+        ({"reward_weights": {"speed": 1.0}}, "is a plain Gymnasium environment; only tasks have them"),
+    ],
+)
+def test_recipe_errors_name_the_key(train, small_ppo, settings, told):
+    if settings.get("algo", "ppo") != "ppo":
+        small_ppo.pop("algo_kwargs")
+    with pytest.raises(RecipeError) as caught:
+        train("Line", recipes.merge(small_ppo, settings))
+    assert told in str(caught.value)
+
+
+def test_task_and_resume_exclude_each_other():
+    from rlctl.train.request import TrainRequest, run_training
+
+    for request in (TrainRequest(None), TrainRequest("reach", resume="latest")):
+        with pytest.raises(UsageError, match="give a task to train, or --resume RUN"):
+            run_training(request)
+
+
+def test_defaults_for_an_environment_without_a_recipe():
+    resolved = recipes.resolve(f"{ENVS}:Line", None, {})
+    assert resolved.algo == "ppo"
+    assert resolved.n_envs == 8
+    assert 2048 <= resolved.n_envs * resolved.algo_kwargs["n_steps"] <= 16384
+
+
+def test_live_policy_and_saved_policy_act_the_same(train, small_ppo):
+    result = train("Line", small_ppo)
+    policy = load_policy(result.run.last_policy)
+    episode = load_episode(sorted(result.run.episodes.glob("*.npz"))[-1])
+    if episode.info.policy != "training step 256":
+        pytest.fail(f"the newest episode is of {episode.info.policy}")
+    actions = np.stack([policy.predict(observation) for observation in episode.observations[:-1]])
+    np.testing.assert_array_equal(actions, episode.actions)
