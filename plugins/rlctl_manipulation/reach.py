@@ -8,7 +8,7 @@ from rlctl.task import Box, Sim, Task, rewards
 
 HOME = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])  # [rad], elbow bent
 MAX_SPEED = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
-GOAL_LOW, GOAL_HIGH = (0.35, -0.35, 0.15), (0.65, 0.35, 0.65)  # [m], world frame, in front of the arm
+GOAL_LOW, GOAL_HIGH = (0.45, -0.3, 0.2), (0.7, 0.3, 0.6)  # [m], world frame, in front of the arm
 HAND = "lbr_iiwa_link_7"
 
 
@@ -22,7 +22,7 @@ class Reach(Task):
     control_dt, substeps, episode_s = 4 / 240, 4, 2.0  # [s], -, [s]
     action_space = Box(-1.0, 1.0, (7,), np.float32)
     action_meaning = "joint steps; 1 is the joint's top speed for one control step"
-    observation_units = {"joint_positions": "rad", "joint_velocities": "rad/s", "hand": "m", "goal": "m"}
+    observation_units = {"joint_positions": "rad", "joint_velocities": "rad/s", "hand": "m", "hand_to_goal": "m"}
     reward_weights = {"distance": -1.0, "reached": 1.0, "action": -0.01, "smoothness": -0.01}
 
     def build(self, sim: Sim) -> None:
@@ -39,7 +39,7 @@ class Reach(Task):
     def act(self, action: np.ndarray) -> None:
         target = self.arm.joint_positions + self.joint_step * action
         target = np.clip(target, self.arm.joint_low, self.arm.joint_high)
-        self.arm.drive_to(target, max_speed=self.max_speed, max_force=self.max_torque, gain=0.25)
+        self.arm.drive_to(target, max_speed=self.max_speed, max_force=self.max_torque, gain=1.0)
         self.action_change, self.last_action = action - self.last_action, action
 
     def observe(self) -> dict[str, np.ndarray]:
@@ -47,7 +47,7 @@ class Reach(Task):
             "joint_positions": self.arm.joint_positions,
             "joint_velocities": self.arm.joint_velocities,
             "hand": self.arm.link_position(HAND),
-            "goal": self.goal,
+            "hand_to_goal": self.goal - self.arm.link_position(HAND),
         }
 
     def rewards(self, action: np.ndarray) -> dict[str, float]:

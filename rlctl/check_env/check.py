@@ -96,4 +96,9 @@ def _status(task: str) -> Iterator[Callable[[Where], None]]:
         yield lambda where: None
         return
     with console.status(f"checking {task}") as status:
-        yield lambda where: status.update(f"checking {task}: {where.phase}, episode {where.episode}, step {where.step}")
+
+        def say(where: Where) -> None:
+            number = f" {where.episode + 1}" if where.phase == "episodes" else ""
+            status.update(f"checking {task}: {where.phase}{number}")
+
+        yield say

@@ -34,7 +34,7 @@ IDLE_TIMEOUT_S = 300.0
 """How long a child may do nothing with the environment: loading torch on a busy machine, at the worst."""
 _POLL_S = 0.1
 _KEPT_LINES = 8
-_NOT_ITS_OWN = ("pybullet build time", "argv[0]=")
+_NOT_ITS_OWN = ("pybullet build time", "argv[")
 """Lines that PyBullet prints when it is imported and when it connects."""
 
 
@@ -164,7 +164,7 @@ def watch(
                 for other in [each for each in active.values() if each.part == "checkers"]:
                     other.close()
                     del active[other.connection]
-        on_poll(children[0].where)
+        on_poll(next(iter(active.values()), children[0]).where)
 
 
 def _failure(child: Child, kind: str, error: str) -> Message:

@@ -84,8 +84,11 @@ def _from_complaints(rule: Rule, complaints: list[Complaint]) -> list[Finding]:
 
 def _finding(rule: Rule, complaints: list[Complaint]) -> Finding:
     severity = rule.severity
-    if rule in libraries.OF_CHECKER.values() and complaints[0].kind == "error":
+    refused = any(each.kind == "error" for each in complaints)
+    if rule in libraries.OF_CHECKER.values() and refused:
         severity = Severity.ERROR
+    elif severity is Severity.ERROR and not refused:
+        severity = Severity.WARNING  # the library only warns, and the rule itself saw nothing
     said_by = list(dict.fromkeys(each.checker for each in complaints))
     evidence: dict[str, Any] = {"said_by": " and ".join(said_by)}
     return Finding(rule.id, severity, rule.name, complaints[0].text, evidence, rule.fix)

@@ -38,6 +38,7 @@ def _gymnasium_checker() -> Callable[[Any], None]:
     from gymnasium.utils.env_checker import check_env
 
     def check(env: Any) -> None:
+        env = _without_gymnasiums_wrappers(env)
         spec = getattr(env, "spec", None)
         wrappers = getattr(spec, "additional_wrappers", ())
         # The check of `close` makes a second environment from the registration, wrappers included.
@@ -50,7 +51,16 @@ def _gymnasium_checker() -> Callable[[Any], None]:
 def _sb3_checker() -> Callable[[Any], None]:
     from stable_baselines3.common.env_checker import check_env
 
-    return check_env
+    return lambda env: check_env(_without_gymnasiums_wrappers(env))
+
+
+def _without_gymnasiums_wrappers(env: Any) -> Any:
+    """Take off what `gymnasium.make` puts on: the checkers look for methods that these hide. Others stay on."""
+    from gymnasium import wrappers
+
+    while type(env) in (wrappers.TimeLimit, wrappers.OrderEnforcing, wrappers.PassiveEnvChecker):
+        env = env.env
+    return env
 
 
 def _message(

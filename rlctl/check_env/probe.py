@@ -14,11 +14,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rlctl.check_env.evidence import FIRST_SEED, SECOND_SEED
-from rlctl.check_env.failures import EnvironmentRaised, failure
+from rlctl.check_env.failures import EnvironmentRaised, describe, failure
 from rlctl.check_env.leaves import leaf_to_wire, leaves_of
 from rlctl.check_env.progress import Progress
 from rlctl.check_env.recording import Budget, Instance, Plan, Recording
 from rlctl.check_env.wire import Message
+from rlctl.errors import TaskError
 
 Make = Callable[[], Any]
 
@@ -29,6 +30,8 @@ EPISODES = [
 """How the actions of each episode are chosen; the first three come first, in case time runs out."""
 COMPARED_STEPS = 300
 """How far comparisons look. The first of them is also the probe's first whole episode."""
+DIRTY_STEPS = 37
+"""How far the other episode goes, at most, that is left unfinished before a repetition."""
 ENDLESS_STEPS = 10_000
 """After so many steps an episode without an end is cut."""
 LATER_ENDLESS_STEPS = 1_000
@@ -56,18 +59,25 @@ def probe(make: Make, progress: Progress | None = None) -> Iterator[Message]:
 def _comparisons(instance: Instance) -> Iterator[Message]:
     """The first episode lived again: at once, after an unfinished other one, and with another seed."""
     budget = Budget(time.monotonic() + COMPARISONS_S)
-    short = {"max_steps": COMPARED_STEPS, "max_s": COMPARISONS_S / 4}
+    steps = COMPARED_STEPS
     for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
         if role == "dirty":
             instance.progress.phase("dirty")
-            Recording(instance, Plan(role, 0, SECOND_SEED, "extreme", max_steps=37, max_s=1.0), budget).run()
+            unfinished = min(DIRTY_STEPS, max(1, steps // 2))
+            other = Plan(role, 0, SECOND_SEED, "extreme", max_steps=unfinished, max_s=1.0)
+            Recording(instance, other, budget).run()
         instance.progress.phase(role)
         if budget.seconds_left < 0:
             yield _skip(role, f"the first comparisons took {COMPARISONS_S:g} s")
             continue
         seed = SECOND_SEED if role == "seeds" else FIRST_SEED
-        recording = Recording(instance, Plan(role, number, seed, action_seed=FIRST_SEED, **short), budget)  # type: ignore[arg-type]
+        plan = Plan(role, number, seed, "random", FIRST_SEED, COMPARED_STEPS, COMPARISONS_S / 4)
+        recording = Recording(instance, plan, budget)
         yield from recording.run()
+        steps = min(steps, recording.steps)
+    for number, role in enumerate(("unseeded", "unseeded again")):
+        plan = Plan(role, number, FIRST_SEED, max_steps=0, then_unseeded=True)
+        yield from Recording(instance, plan, budget).run()
 
 
 def _episodes(instance: Instance) -> Iterator[Message]:
@@ -137,11 +147,12 @@ def _instances(make: Make, progress: Progress) -> Iterator[Message]:
     last.reset()
     if last.running:
         last.step()
+    progress.phase("close")
     yield from _closed(neighbour)
+    progress.phase("after close")
     while last.running:
         last.step()
     yield from last.messages()
-    progress.phase("close")
     yield from _closed(survivor)
 
 
@@ -158,14 +169,17 @@ def _interleaved(*recordings: Recording) -> Iterator[Message]:
 
 def _build(make: Make, progress: Progress) -> Instance:
     try:
-        env = make()
+        return _instance(make(), progress)
     except BaseException as error:
         raise EnvironmentRaised("build") from error
-    return _instance(env, progress)
 
 
 def _instance(env: Any, progress: Progress) -> Instance:
-    return Instance(env, leaves_of(getattr(env, "observation_space", None)), _accepts_seed(env), progress)
+    try:
+        observation_space = getattr(env, "observation_space", None)
+    except Exception as error:
+        raise TaskError(f"observation_space raises {describe(error)}") from error
+    return Instance(env, leaves_of(observation_space), _accepts_seed(env), progress)
 
 
 def _closed(instance: Instance) -> Iterator[Message]:

@@ -40,6 +40,8 @@ class Plan:
     """The seed of the actions; by default the episode's."""
     max_steps: int = 10_000
     max_s: float = 10.0
+    then_unseeded: bool = False
+    """Reset with the seed, and then once more without one."""
 
 
 class Instance:
@@ -102,6 +104,8 @@ class Recording:
         started = time.perf_counter()
         try:
             result = self.instance.call("reset", self.instance.env.reset, **keywords)
+            if self.plan.then_unseeded:
+                result = self.instance.call("reset", self.instance.env.reset)
         except EnvironmentRaised as error:
             self._fail(error)
             return
@@ -216,6 +220,11 @@ class Recording:
         steps.append(self._step)
         values.append(array)
         self.budget.bytes_left -= array.nbytes + 100
+
+    @property
+    def steps(self) -> int:
+        """How many steps were taken."""
+        return len(self._rewards)
 
     @property
     def was_cut(self) -> bool:

@@ -11,23 +11,25 @@ from rlctl.check_env.check import Report
 from rlctl.check_env.finding import Finding, Severity
 
 if TYPE_CHECKING:
-    from rich.text import Text
+    from rich.console import Console
 
 STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: "cyan"}
 LONG = ("traceback", "last_output")
 """Evidence that is text of several lines; JSON has it whole."""
+SHOWN_LINES = 3
+"""How much of what a dying process printed is shown; a traceback's place is in the message."""
 
 
 def show(report: Report, json: str | None) -> None:
     """Print a report, or write it as JSON to a file or, for `-`, to stdout."""
     for rule, trace in report.verdict.crashed.items():
-        print(f"rule {rule} crashed, a bug in rlctl:\n{trace}", file=sys.stderr)
+        print(f"{rule} crashed, a bug in rlctl:\n{trace}", file=sys.stderr)
     if json is not None:
         output.write_result_json(json, as_json(report))
         return
     out = output.out()
     for finding in report.verdict.findings:
-        out.print(_block(finding))
+        _print(out, finding)
     for line in _summary(report):
         out.print(line, markup=False)
 
@@ -71,22 +73,24 @@ def _json_value(value: Any) -> Any:
     return value
 
 
-def _block(finding: Finding) -> Text:
+def _print(out: Console, finding: Finding) -> None:
+    from rich.padding import Padding
     from rich.text import Text
 
-    text = Text()
-    text.append(f"{finding.severity} {finding.rule}", STYLES[finding.severity])
-    text.append(f"  {finding.name}\n", "bold")
-    text.append(f"  {finding.message}\n")
-    for key in LONG:
-        if key in finding.evidence:
-            lines = str(finding.evidence[key]).rstrip().splitlines()[-3:]
-            text.append("".join(f"    {line}\n" for line in lines), "dim")
+    head = Text(f"{finding.severity} {finding.rule}", STYLES[finding.severity])
+    out.print(head.append(f"  {finding.name}", "bold"))
+    body = Text(f"{finding.message}\n")
+    for line in str(finding.evidence.get("last_output", "")).splitlines()[-SHOWN_LINES:]:
+        body.append(f"  {line}\n", "dim")
     if numbers := _numbers(finding):
-        text.append(f"  {numbers}\n", "dim")
-    text.append("  fix: ", "green")
-    text.append(f"{finding.fix}\n")
-    return text
+        body.append(f"{numbers}\n", "dim")
+    body.append("fix: ", "green").append(finding.fix)
+    if out.is_terminal:
+        out.print(Padding(body, (0, 0, 1, 2)))
+        return
+    # Lines are not wrapped where nobody looks at them: one line each is easier to search.
+    out.print(Text("\n").join(Text("  ").append_text(line) for line in body.split("\n")))
+    out.print()
 
 
 def _numbers(finding: Finding) -> str:

@@ -53,7 +53,7 @@ class Recipe(_Section):
     """How to train a task. `algo_kwargs` and `policy_kwargs` are SB3's own names."""
 
     task: dict[str, Any] = {}
-    reward_weights: dict[str, float] = {}
+    reward_weights: dict[str, pydantic.FiniteFloat] = {}
     randomize: bool = False
     events: dict[str, dict[str, Any]] = {}
     algo: Algorithm = "ppo"
@@ -94,8 +94,12 @@ class _Range:
     integer: bool = False
     text: tuple[str, ...] = ()
     open_low: bool = False
+    with_unit: bool = False
+    """Also as SB3's pair of a number and a unit, such as [1, episode]."""
 
     def check(self, name: str, value: Any) -> None:
+        if self.with_unit and isinstance(value, list) and value:
+            value = value[0]
         if isinstance(value, str) and value.startswith(self.text or ("\0",)):
             return
         kind = "a whole number" if self.integer else "a number"
@@ -128,6 +132,7 @@ _RANGES = {
     "target_kl": _Range(0, open_low=True),
     "buffer_size": _COUNT,
     "learning_starts": _Range(0, integer=True),
+    "train_freq": _Range(1, integer=True, with_unit=True),
     "gradient_steps": _Range(-1, integer=True),
     "tau": _PART,
     "target_update_interval": _COUNT,

@@ -169,6 +169,7 @@ class TorchPolicy(Policy):
         super().__init__(info)
         self.network = network
         self.normalizer = normalizer
+        self._uses_sde = bool(info.policy_kwargs.get("use_sde"))
         network.set_training_mode(False)
 
     @classmethod
@@ -199,6 +200,8 @@ class TorchPolicy(Policy):
     def forward(
         self, observations: Observations, state: State | None, deterministic: bool
     ) -> tuple[NDArray[Any], State | None]:
+        if not deterministic and self._uses_sde:
+            self.network.reset_noise(ROWS)  # type: ignore[operator]
         actions, after = self.network.predict(
             self.normalizer(observations),
             state=state,

@@ -49,6 +49,7 @@ RULES: tuple[Rule, ...] = (
     determinism.fresh_process,
     determinism.seeds_differ,
     determinism.same_info,
+    determinism.later_episodes,
     isolation.interleaved,
     isolation.closing,
     isolation.second_instance,

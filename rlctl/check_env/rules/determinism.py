@@ -22,7 +22,7 @@ RNG_FIX = (
     "the environment."
 )
 FEWEST_SEEDS = 4
-OTHER_START = r"reset\(seed=123\)` (is non-deterministic|observations are not equal|then)"
+OTHER_START = r"reset\(seed=123\)` (is non-deterministic|observations are not equal)"
 OTHER_STEP = r"step (observations|rewards|termination) are not|np_random` is not properly"
 
 
@@ -107,9 +107,9 @@ def after_another(evidence: Evidence) -> Iterator[Seen]:
 def fresh_instance(evidence: Evidence) -> Iterator[Seen]:
     """A second instance in the same process lives the same seed and actions differently: instances share something
     (a class attribute, a module's global, a simulator that close leaves open)."""
-    _require_repeatable(evidence)
     trajectory, difference = compared(evidence, "fresh process", "fresh instance")
     if difference is not None:
+        _require_repeatable(evidence)
         yield _seen(evidence, trajectory, difference, "lived by a second instance in one process")
 
 
@@ -123,9 +123,9 @@ def fresh_instance(evidence: Evidence) -> Iterator[Seen]:
 def fresh_process(evidence: Evidence) -> Iterator[Seen]:
     """A new process with another PYTHONHASHSEED lives the same seed and actions differently. What was learned or
     measured today cannot be repeated tomorrow."""
-    _require_repeatable(evidence)
     trajectory, difference = compared(evidence, "alone", "fresh process")
     if difference is not None:
+        _require_repeatable(evidence)
         yield _seen(evidence, trajectory, difference, "lived by a new process")
 
 
@@ -171,3 +171,20 @@ def seeds_differ(evidence: Evidence) -> Iterator[Seen]:
 def same_info(evidence: Evidence) -> Iterator[Seen]:
     """The same step gives another info. Nothing learns from info, but what is logged from it cannot be compared."""
     return iter(())
+
+
+@rule(
+    "RL308",
+    "later episodes are not seeded",
+    WARNING,
+    "Where reset gets no seed, go on with the generator that an earlier seed made: super().reset(seed=seed), then draw "
+    "from self.np_random, and give parts of the environment that same generator.",
+    complaints=(r"then `env\.reset\(\)`",),
+)
+def later_episodes(evidence: Evidence) -> Iterator[Seen]:
+    """A seeded reset repeats, but a reset without a seed after it does not: it draws from somewhere else. rlctl seeds
+    every episode; what seeds only the first, as most training scripts do, cannot be repeated."""
+    trajectory, difference = compared(evidence, "unseeded", "unseeded again")
+    if difference is not None:
+        _require_repeatable(evidence)
+        yield _seen(evidence, trajectory, difference, "reset with a seed and then without one, twice")

@@ -95,7 +95,7 @@ def takes_options(evidence: Evidence) -> Iterator[Seen]:
     "terminated or truncated is no bool",
     ERROR,
     "bool(...) around both: a comparison of numpy numbers gives numpy.bool.",
-    complaints=(r"signal (to|must) be a boolean", r"Expects `done` signal"),
+    complaints=(r"signal (to|must) be a boolean", r"Expects `done` signal", r"truth value of an array"),
 )
 def flag_types(evidence: Evidence) -> Iterator[Seen]:
     """A flag is not Python's bool. Gymnasium accepts numpy.bool, Stable-Baselines3's checker refuses it, and

@@ -8,7 +8,7 @@ from rlctl.check_env.comparison import first_difference
 from rlctl.check_env.evidence import Evidence, Failure, Trajectory
 from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
 from rlctl.check_env.rules.determinism import compared
-from rlctl.check_env.rules.interface import where
+from rlctl.check_env.rules.interface import calls_alone, where
 from rlctl.check_env.rules.known import built, one
 
 ERROR, WARNING = Severity.ERROR, Severity.WARNING
@@ -20,16 +20,16 @@ CLIENT_FIX = (
 
 
 def _require_alone(evidence: Evidence) -> None:
-    """Instances can only be compared if one that is alone repeats itself."""
-    for role in ("reused", "fresh instance"):
-        first = "alone" if role == "reused" else "fresh process"
-        if compared(evidence, first, role)[1] is not None:
-            raise NotJudged("an instance that is alone does not repeat itself (RL301 to RL304)")
+    """Instances can only be compared if two that live the same, one after the other, do the same."""
+    if compared(evidence, "fresh process", "fresh instance")[1] is not None:
+        raise NotJudged("two instances differ already when they are alone (RL301 to RL304)")
 
 
 def _failures(evidence: Evidence, phase: str) -> Iterator[Failure]:
+    alone = {(failure.call, failure.error) for failure in calls_alone(evidence, "raised")}
     for failure in evidence.failures:
-        if failure.part == "instances" and failure.phase == phase and failure.call != "build":
+        is_known = (failure.call, failure.error) in alone
+        if failure.part == "instances" and failure.phase == phase and failure.call != "build" and not is_known:
             yield failure
 
 

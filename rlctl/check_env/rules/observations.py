@@ -53,7 +53,13 @@ def _when(step: int) -> str:
     "observation shape",
     ERROR,
     "Return arrays of the shape that observation_space declares, at reset and at every step.",
-    complaints=(*OUTSIDE, r"was expecting a numpy array", r"observation keys", r"Expected: \(.*actual shape"),
+    complaints=(
+        *OUTSIDE,
+        r"(was expecting|must be) a numpy array",
+        r"Casting input x",
+        r"observation keys",
+        r"Expected: \(.*actual shape",
+    ),
 )
 def shape(evidence: Evidence) -> Iterator[Seen]:
     """An observation has another structure than its space says. Learners copy observations into arrays made from

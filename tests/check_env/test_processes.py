@@ -1,0 +1,161 @@
+"""What only shows with real child processes: crashes, hangs, hash order, exit codes, and the two outputs."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rlctl.check_env import judge as judging
+from rlctl.check_env.check import check
+from rlctl.check_env.evidence import Evidence
+from rlctl.check_env.finding import Severity, rule
+from rlctl.check_env.rules import RULES
+from rlctl.errors import RecipeError, UsageError
+
+FOLDER = Path(__file__).parent
+BROKEN = "tests/check_env/broken_envs.py"
+ROOT = FOLDER.parent.parent
+
+
+def rlctl(*arguments):
+    command = [sys.executable, "-m", "rlctl", "check-env", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.fixture
+def in_root(monkeypatch):
+    monkeypatch.chdir(ROOT)
+
+
+@pytest.mark.parametrize(
+    ("task", "expected", "message", "fix"),
+    [
+        ("tests/check_env/broken_import.py:Anything", "RL001", "ZeroDivisionError: at import", "Import the module"),
+        (f"{BROKEN}:RaisingConstructor", "RL002", "FileNotFoundError: robot.urdf", "Repair the constructor"),
+        (f"{BROKEN}:NeedsArgument", "RL002", "missing 1 required", "(--set task.gain=...)"),
+        (f"{BROKEN}:NoEnvironment", "RL003", "NoEnvironment is no Gymnasium environment", "Inherit from gymnasium.Env"),
+        (f"{BROKEN}:ExitsWhenBuilt", "RL004", "the process ended with exit code 7 in the constructor", "input"),
+    ],
+)
+def test_without_an_instance_there_is_a_finding_and_exit_code_3(task, expected, message, fix, in_root):
+    report = check(task, {}, env_timeout_s=10)
+    (finding,) = report.verdict.findings
+    assert finding.rule == expected
+    assert message in finding.message
+    assert fix in finding.fix
+    assert report.exit_code == 3
+    assert report.verdict.not_judged["RL301"] == "no instance could be built"
+
+
+def test_segfault_is_a_finding(in_root):
+    report = check(f"{BROKEN}:Segfaults", {}, env_timeout_s=10)
+    (finding,) = report.verdict.findings
+    assert (finding.rule, finding.message) == ("RL208", "the process was killed by SIGSEGV in step 7")
+    assert finding.evidence["seed"] == 1000
+    assert report.exit_code == 1
+    assert {"RL301", "RL401", "RL501"} <= report.verdict.not_judged.keys()
+
+
+def test_hang_is_a_finding_after_the_timeout(in_root):
+    started = time.monotonic()
+    report = check(f"{BROKEN}:Hangs", {}, env_timeout_s=0.7)
+    assert time.monotonic() - started < 20
+    (finding,) = report.verdict.findings
+    assert (finding.rule, finding.message) == ("RL209", "step 7 did not come back in 0.7 s")
+    assert "RL291" in report.verdict.not_judged
+    assert report.exit_code == 1
+
+
+def test_printing_is_worth_knowing_and_does_not_reach_the_result(in_root):
+    run = rlctl(f"{BROKEN}:Prints", "--json", "-")
+    content = json.loads(run.stdout)
+    (finding,) = content["findings"]
+    assert (finding["rule"], finding["severity"]) == ("RL211", "warning")
+    assert "the first: 'moving [" in finding["message"]
+    assert run.returncode == 0
+
+
+def test_hash_order_shows_in_a_new_process(in_root):
+    report = check(f"{BROKEN}:HashOrder", {}, env_timeout_s=10)
+    assert [finding.rule for finding in report.verdict.findings] == ["RL305"]
+
+
+def test_unknown_names_are_usage_errors(in_root):
+    with pytest.raises(UsageError, match=r"no task 'reech'. Did you mean 'reach'\?"):
+        check("reech", {}, env_timeout_s=10)
+    with pytest.raises(RecipeError, match=r"no parameter 'sise'. Did you mean 'size'\?"):
+        check(f"{BROKEN}:Clean", {"sise": 1.0}, env_timeout_s=10)
+    with pytest.raises(UsageError, match="NUMBER is a int, not a class"):
+        check(f"{BROKEN}:NUMBER", {}, env_timeout_s=10)
+
+
+def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
+    code = (
+        "import sys; from rlctl.check_env.check import check; import rlctl.check_env.report; "
+        "check('tests/check_env/broken_import.py:Anything', {}, env_timeout_s=10); "
+        "print([name for name in ('torch', 'stable_baselines3', 'pybullet', 'broken_import') if name in sys.modules])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert run.stdout == "[]\n"
+
+
+def test_a_rule_that_crashes_is_no_pass():
+    @rule("RL999", "crashing", Severity.INFO, "-")
+    def crashing(evidence):
+        """Crashes."""
+        return iter([1 / 0])
+
+    verdict = judging.judge(Evidence("any"), [judging.RULES[0], crashing])
+    assert verdict.not_judged["RL999"] == "no instance could be built"
+    loading = [rule("RL099", "crashing", Severity.INFO, "-")(crashing.check)]
+    verdict = judging.judge(Evidence("any"), loading)
+    assert "ZeroDivisionError" in verdict.crashed["RL099"]
+    assert verdict.judged == []
+
+
+def test_command_of_a_clean_environment(tmp_path):
+    run = rlctl("CartPole-v1")
+    assert (run.returncode, run.stderr) == (0, "")
+    lines = run.stdout.splitlines()
+    assert lines[0].startswith("CartPole-v1: no findings; 42 rules judged in ")
+    assert len(lines) == 2
+    assert "steps/s" in lines[1]
+    assert "\x1b" not in run.stdout
+
+
+def test_command_of_a_broken_environment(tmp_path):
+    file = tmp_path / "report.json"
+    run = rlctl(f"{BROKEN}:OutOfRange", "--set", "task.size=4.0", "--json", str(file))
+    assert (run.returncode, run.stdout) == (1, "")
+    content = json.loads(file.read_text())
+    (finding,) = content["findings"]
+    assert finding.keys() == {"rule", "name", "severity", "message", "evidence", "fix"}
+    assert (finding["rule"], finding["severity"]) == ("RL103", "error")
+    assert finding["evidence"]["expected"] == [-4.0, 4.0]
+    assert content["steps_per_second"] > 0
+    assert content["spaces"]["action"].startswith("Box(-1.0, 1.0, (2,)")
+    assert content["not_judged"] == []
+    assert len(content["judged"]) == len(RULES)
+
+
+def test_command_shows_the_worst_first_with_numbers_and_fix():
+    run = rlctl(f"{BROKEN}:NumpyBool")
+    assert run.returncode == 1
+    assert run.stdout.splitlines()[:4] == [
+        "error RL204  terminated or truncated is no bool",
+        "  terminated is a numpy.bool at step 1",
+        "  seed 1000, episode 0, actions random, step 1, type numpy.bool, expected bool",
+        "  fix: bool(...) around both: a comparison of numpy numbers gives numpy.bool.",
+    ]
+
+
+def test_command_of_mistakes_in_the_command():
+    run = rlctl("CartPole-v99")
+    assert run.returncode == 2
+    assert run.stdout == ""
+    run = rlctl(f"{BROKEN}:NeedsArgument", "--json", "-")
+    assert run.returncode == 3
+    assert json.loads(run.stdout)["findings"][0]["rule"] == "RL002"
