@@ -10,7 +10,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from rlctl import __version__
-from rlctl.errors import RlctlError
+from rlctl.errors import RlctlError, UsageError
 
 app = typer.Typer(
     name="rlctl",
@@ -19,9 +19,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={
         "help_option_names": ["-h", "--help"],
-        "token_normalize_func": lambda token: {"--num-envs": "--n-envs"}.get(
-            token.replace("_", "-"), token.replace("_", "-")
-        ),
+        # Typer hands over names without their dashes in front.
+        "token_normalize_func": lambda name: {"num-envs": "n-envs"}.get(name.replace("_", "-"), name.replace("_", "-")),
     },
 )
 
@@ -212,12 +211,11 @@ def export(
     json: Json = None,
 ) -> None:
     """Turn a policy into a self-contained ONNX file, and verify that it acts the same."""
-    from rlctl.errors import UsageError
+    if not onnx:
+        raise UsageError("say what to export to: rlctl export --onnx")
     from rlctl.export.export import export_onnx
     from rlctl.export.report import show
 
-    if not onnx:
-        raise UsageError("say what to export to: rlctl export --onnx")
     show(export_onnx(run, checkpoint=checkpoint, output=output), json)
 
 

@@ -196,6 +196,7 @@ def is_task(constructor: Any) -> bool:
 
 def recipe_file(task: str) -> Path | None:
     """Return the recipe that comes with a task: `<name>.yaml` beside its module, `<file>.yaml` beside its file."""
+    _put_current_folder_on_path()
     if entry := find(task):
         return entry.recipe_file
     if _GYMNASIUM_ID.match(task) or ":" not in task:
@@ -277,8 +278,9 @@ def _import_file(task: str, file: Path) -> Any:
     folder = str(file.parent)
     if folder not in sys.path:
         sys.path.insert(0, folder)
-    taken = file.stem in sys.modules or file.stem in sys.stdlib_module_names
-    name = f"rlctl_task_{file.stem}" if taken else file.stem
+    name = file.stem
+    while name in sys.modules or name in sys.stdlib_module_names:
+        name = f"rlctl_task_{name}"
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
         raise UsageError(f"task {task!r}: {file} is not a Python file")
@@ -302,7 +304,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
         except gymnasium.error.UnregisteredEnv:
             close = did_you_mean(task.rpartition(":")[2], gymnasium.registry)
             raise UsageError(f"Gymnasium has no environment {task!r}.{close}") from None
-        except ModuleNotFoundError as error:
+        except (ModuleNotFoundError, gymnasium.error.DeprecatedEnv) as error:
             raise UsageError(f"Gymnasium: {task}: {error}") from None
 
     constructor.gymnasium_id = task  # type: ignore[attr-defined]

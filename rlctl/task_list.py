@@ -28,6 +28,8 @@ def list_tasks(*, check: bool = False) -> list[ListedTask]:
             algo = _algorithm(entry)
         except RecipeError as error:
             problem = problem or str(error)
+        except (OSError, UnicodeDecodeError) as error:
+            problem = problem or f"{entry.recipe_file}: {error}"
         if check and problem is None:
             problem = registry.check_import(entry)
         listed.append(ListedTask(entry, algo, problem))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from rerun.chunk import Chunk
 from rerun.urdf import UrdfTree
 
 from rlctl.replay.scene import BodyMotion, Scene
@@ -17,7 +18,7 @@ Tell = Callable[[str], None]
 WORLD_FRAME = "tf#/"
 _MARKER_COLORS = [(40, 200, 90), (70, 150, 255), (240, 120, 200), (250, 180, 40)]
 _HALO_RADIUS = 0.09  # [m]
-_PATH_COLOR = (120, 190, 255)
+_PATH_COLOR = (255, 80, 180)
 _GROUND_COLOR = (70, 74, 82)
 
 
@@ -43,7 +44,10 @@ def _draw_marker(name: str, positions: NDArray[np.float64], color: tuple[int, in
     stream.log(entity, point, static=True)
     timelines.send(entity, steps, rr.Points3D.columns(positions=positions))
     halo = rr.Ellipsoids3D.from_fields(
-        half_sizes=[[_HALO_RADIUS] * 3], colors=color, fill_mode=rr.components.FillMode.MajorWireframe
+        half_sizes=[[_HALO_RADIUS] * 3],
+        colors=color,
+        line_radii=0.003,
+        fill_mode=rr.components.FillMode.MajorWireframe,
     )
     stream.log(f"{entity}/halo", halo, static=True)
     timelines.send(f"{entity}/halo", steps, rr.Ellipsoids3D.columns(centers=positions))
@@ -101,22 +105,35 @@ def _send_meshes(tree: UrdfTree, body: BodyMotion, stream: rr.RecordingStream) -
             chunk = chunk.with_entity_path(ours + rest)
         chunks.append(chunk)
     stream.send_chunks(chunks)
+    for chunk in chunks:
+        _fill(chunk, stream)
+
+
+def _fill(chunk: Chunk, stream: rr.RecordingStream) -> None:
+    """Draw the boxes, cylinders and spheres of a URDF file with faces, not with edges alone."""
+    kinds = {name.partition(":")[0] for name in chunk.to_record_batch().schema.names}
+    for archetype in (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D, rr.Capsules3D):
+        if archetype.__name__ in kinds:
+            filled = archetype.from_fields(fill_mode=rr.components.FillMode.Solid)
+            stream.log(chunk.entity_path, filled, static=True)
 
 
 def _send_motion(tree: UrdfTree, body: BodyMotion, timelines: Timelines) -> None:
-    root = {"parent_frame": WORLD_FRAME, "child_frame": f"{body.name}/{tree.root_link().name}"}
-    base = _entity("tf", body.name, "base")
+    frame = f"{body.name}/{tree.root_link().name}"
+    positions, orientations, base = body.positions[:, 0], body.orientations[:, 0], _entity("tf", body.name, "base")
     if body.fixed:
+        quaternion = rr.Quaternion(xyzw=orientations[0])
         pose = rr.Transform3D(
-            translation=body.positions[0, 0], quaternion=rr.Quaternion(xyzw=body.orientations[0, 0]), **root
+            translation=positions[0], quaternion=quaternion, parent_frame=WORLD_FRAME, child_frame=frame
         )
         timelines.stream.log(base, pose, static=True)
     else:
-        steps = len(body.positions)
+        steps = len(positions)
         columns = rr.Transform3D.columns(
-            translation=body.positions[:, 0],
-            quaternion=body.orientations[:, 0],
-            **{key: [value] * steps for key, value in root.items()},
+            translation=positions,
+            quaternion=orientations,
+            parent_frame=[WORLD_FRAME] * steps,
+            child_frame=[frame] * steps,
         )
         timelines.send(base, range(steps), columns)
     known = {joint.name: joint for joint in tree.joints()}

@@ -24,16 +24,14 @@ class Difference:
     size: float | None
     """Absolute difference there; None where there is none to give."""
     steps: int
-    """How many steps differ."""
+    """How many steps differ; 0 if it is only the end that does."""
     length: int
     """Steps of the recorded episode."""
 
     def __str__(self) -> str:
         by = "" if self.size is None else f" (off by {self.size:.3g})"
-        return (
-            f"step {self.step} of {self.length}: {self.what} is {self.now}, recorded {self.recorded}{by}; "
-            f"{self.steps} of {self.length + 1} steps differ"
-        )
+        many = f"; {self.steps} of {self.length + 1} steps differ" if self.steps else ""
+        return f"step {self.step} of {self.length}: {self.what} is {self.now}, recorded {self.recorded}{by}{many}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,13 +118,14 @@ def _element_names(name: str, count: int, lived: Lived) -> list[str]:
 def _different_end(recorded: RecordedEpisode, lived: Lived, length: int) -> Difference | None:
     before, after = recorded.info, lived.episode.info
     if lived.length != length:
-        return Difference(lived.length, "length", str(length), str(lived.length), length - lived.length, 1, length)
+        missing = abs(length - lived.length)
+        return Difference(min(length, lived.length), "length", str(length), str(lived.length), missing, 0, length)
     if not lived.ended:
-        return Difference(length, "end of the episode", "here", "not here", None, 1, length)
+        return Difference(length, "end of the episode", "here", "later", None, 0, length)
     for what, recorded_value, value in (
         ("names of the reward terms", before.term_names, after.term_names),
         ("success", before.success, after.success),
     ):
         if recorded_value != value:
-            return Difference(length, what, str(recorded_value), str(value), None, 1, length)
+            return Difference(length, what, str(recorded_value), str(value), None, 0, length)
     return None

@@ -22,7 +22,7 @@ def blueprint(
     """Return the layout: the world on the left, its numbers on the right."""
     left: list[rrb.Container | rrb.View] = []
     if scene is not None:
-        left.append(_world(scene, timeline))
+        left.append(_world(scene))
     if pictures:
         left.append(rrb.Spatial2DView(name="camera", origin="/camera"))
     left += [rrb.Spatial2DView(name=plot.title, origin=f"/{plot.entity}") for plot in plots if plot.kind == "image"]
@@ -34,7 +34,7 @@ def blueprint(
     right = _curves(plots)
     if left:
         content: rrb.Container = rrb.Horizontal(
-            rrb.Vertical(*left, below, row_shares=[4] * len(left) + [1]), right, column_shares=[3, 2]
+            rrb.Vertical(rrb.Vertical(*left), below, row_shares=[4, 1]), right, column_shares=[3, 2]
         )
     else:
         content = rrb.Vertical(right, below, row_shares=[4, 1])
@@ -58,19 +58,20 @@ def _plot(plot: Plot) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(name=plot.title, origin=f"/{plot.entity}", plot_legend=legend)
 
 
-def _world(scene: Scene, timeline: str) -> rrb.Spatial3DView:
+def _world(scene: Scene) -> rrb.Spatial3DView:
     low, high = bounds(scene)
     center = (low + high) / 2
-    distance = max(1.0, 1.3 * float(np.linalg.norm(high - low)))
+    distance = max(1.0, 1.15 * float(np.linalg.norm(high - low)))
     eye = center + distance * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
-    paths = rrb.VisibleTimeRanges(
-        timeline=timeline, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
-    )
+    start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    so_far = [rrb.VisibleTimeRange(name, start=start, end=end) for name in ("step", "sim_time")]
     return rrb.Spatial3DView(
         name="world",
         origin="/",
         contents=["/world/**", "/tf/**"],
-        overrides={rr.new_entity_path(["world", "paths", body.name]): paths for body in scene.robots()},
+        overrides={
+            rr.new_entity_path(["world", "paths", body.name]): rrb.VisibleTimeRanges(so_far) for body in scene.robots()
+        },
         eye_controls=rrb.EyeControls3D(position=eye, look_target=center, eye_up=(0, 0, 1)),
         spatial_information=rrb.SpatialInformation(target_frame=WORLD_FRAME),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, plane=rr.components.Plane3D.XY),

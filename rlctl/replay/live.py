@@ -81,6 +81,12 @@ def live(
     return diary.lived(spec, policy)
 
 
+def frame_time(env: Env) -> float | None:
+    """Return the time between two steps [s], where an environment says it."""
+    fps = env.metadata.get("render_fps")
+    return describe(env).control_dt or (1.0 / fps if fps else None)
+
+
 def as_taken(action: Any, space: spaces.Space[Any]) -> Any:
     """Return an action as an environment of this space takes it: an int, or an array of the space's dtype."""
     if isinstance(space, spaces.Discrete):
@@ -123,7 +129,7 @@ class _Diary:
         self._info = describe(env)
         self._space = env.observation_space
         self._action_space = env.action_space
-        self._fps = env.metadata.get("render_fps")
+        self._dt = frame_time(env)
         self._seed = seed
         self._terms = list(self._info.reward_weights)
         self._observations: list[Any] = []
@@ -216,7 +222,7 @@ class _Diary:
             successes=np.array(known, np.bool_) if steps and len(known) == steps else None,
             ended=self.over,
             happenings=self._happenings,
-            dt=self._info.control_dt or (1.0 / self._fps if self._fps else None),
+            dt=self._dt,
         )
 
 

@@ -17,19 +17,19 @@ _QUALITY = 80
 
 
 class Camera:
-    """Asks an environment for a picture every few steps; one that cannot is asked once."""
+    """Asks an environment for pictures, of long episodes only every few steps; one that cannot is asked once."""
 
-    def __init__(self, env: Env, max_steps: int | None, tell: Callable[[str], None]) -> None:
+    def __init__(self, env: Env, tell: Callable[[str], None]) -> None:
         self.pictures: list[tuple[int, bytes]] = []
         """Step and JPEG file."""
         self._env = env
-        self._every = max(1, -(-(max_steps or 5 * _MOST_PICTURES) // _MOST_PICTURES))
+        self._every = 1
         self._tell = tell
         self._works = env.render_mode == "rgb_array"
 
     def __call__(self, step: int) -> None:
         if step == 0:
-            self.pictures = []
+            self.pictures, self._every = [], 1
         if not self._works or step % self._every:
             return
         try:
@@ -38,6 +38,8 @@ class Camera:
         except Exception as error:  # missing pygame, no OpenGL, no picture: the recording goes on without
             self._works = False
             self._tell(f"no camera pictures: {type(error).__name__}: {error}")
+        if len(self.pictures) > _MOST_PICTURES:  # how long an episode will be is not known before
+            self.pictures, self._every = self.pictures[::2], 2 * self._every
 
 
 def jpeg(picture: NDArray[Any]) -> bytes:

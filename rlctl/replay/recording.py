@@ -1,13 +1,14 @@
-"""Recordings of episodes that were lived before: lived again, compared, and written as `.rrd`."""
+"""Recorded episodes: lived again, compared with what was recorded, and written as `.rrd`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from rlctl import output
-from rlctl.replay.difference import Difference, find_difference
-from rlctl.replay.live import Env, Lived, recorded_actions
-from rlctl.replay.watching import Tell, Watched, watch, watched_env
+from rlctl.replay.difference import find_difference
+from rlctl.replay.live import Lived, live, present_versions, recorded_actions
+from rlctl.replay.report import Verification
+from rlctl.replay.watching import Tell, watch, watched_env
 from rlctl.run.episode import RecordedEpisode
 
 
@@ -16,32 +17,31 @@ def tell(message: str) -> None:
     output.err().print(message, markup=False)
 
 
-def record_episode(episode: RecordedEpisode, path: Path, *, title: str, tell: Tell = tell) -> Difference | None:
+def record_episode(episode: RecordedEpisode, path: Path, *, title: str, tell: Tell = tell) -> Lived:
     """Live a recorded episode again in an environment of its own and write what it looks like to `path`, an `.rrd`.
 
-    Returns where it went another way than recorded, and tells it; the file is written all the same.
+    `tell` hears if it went another way than recorded; the file is written all the same. Returns the new life.
     """
     from rlctl.replay.rrd import write_rrd
 
-    with watched_env(episode.info.env_spec(), tell) as env:
-        watched = watch_again(env, episode, tell=tell)
-    difference = find_difference(episode, watched.lived)
-    if difference is not None:
-        tell(f"warning: {title}: lived again it differs from what was recorded, {difference}")
-    write_rrd(path, watched, title=title, tell=tell)
-    return difference
-
-
-def watch_again(env: Env, episode: RecordedEpisode, *, tell: Tell = tell) -> Watched:
-    """Live the seed and the actions of an episode again."""
-    info = episode.info
-    choose = recorded_actions(episode, env)
-    return watch(env, info.env_spec(), info.seed, choose, policy=info.policy, tell=tell)
-
-
-def write_watched(path: Path, watched: Watched, *, title: str) -> Lived:
-    """Write a recording of an episode that was just lived, and return the episode."""
-    from rlctl.replay.rrd import write_rrd
-
+    info, spec = episode.info, episode.info.env_spec()
+    with watched_env(spec, tell) as env:
+        choose = recorded_actions(episode, env)
+        watched = watch(env, spec, info.seed, choose, policy=info.policy, tell=tell)
+    if difference := find_difference(episode, watched.lived):
+        tell(f"warning: {title}: lived again it is not what was recorded; {difference}")
     write_rrd(path, watched, title=title, tell=tell)
     return watched.lived
+
+
+def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Lived, Verification]:
+    """Live a recorded episode again in a fresh environment and compare every bit; `path` names it."""
+    info, spec = episode.info, episode.info.env_spec()
+    env = spec.make()
+    try:
+        lived = live(env, spec, info.seed, recorded_actions(episode, env, path), policy=info.policy)
+    finally:
+        env.close()
+    now = present_versions(info.task)
+    other = {name: (version, now.get(name)) for name, version in info.versions.items() if now.get(name) != version}
+    return lived, Verification(path, find_difference(episode, lived), other)

@@ -6,6 +6,7 @@ import hashlib
 import json
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -81,7 +82,7 @@ def _send(stream: rr.RecordingStream, watched: Watched, title: str, tell: Tell) 
 
 def _properties(lived: Lived) -> rr.AnyValues:
     info = lived.episode.info
-    values = {
+    values: dict[str, Any] = {
         "task": info.task,
         "task_parameters": json.dumps(info.task_parameters),
         "seed": info.seed,

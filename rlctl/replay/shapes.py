@@ -21,9 +21,7 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, tell: Callable[[str], No
         if not shapes:
             continue
         entity = rr.new_entity_path(["world", body.name, name])
-        columns = rr.Transform3D.columns(
-            translation=body.positions[:, link], quaternion=body.orientations[:, link]
-        )
+        columns = rr.Transform3D.columns(translation=body.positions[:, link], quaternion=body.orientations[:, link])
         timelines.send(entity, range(len(body.positions)), columns)
         for number, shape in enumerate(shapes):
             archetype = _archetype(shape)
@@ -39,9 +37,7 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, tell: Callable[[str], No
 
 def _pose(shape: Shape) -> rr.Transform3D:
     scale = shape.size if shape.kind == pybullet.GEOM_MESH else None
-    return rr.Transform3D(
-        translation=shape.position, quaternion=rr.Quaternion(xyzw=shape.orientation), scale=scale
-    )
+    return rr.Transform3D(translation=shape.position, quaternion=rr.Quaternion(xyzw=shape.orientation), scale=scale)
 
 
 def _archetype(shape: Shape) -> rr.AsComponents | None:
@@ -59,5 +55,5 @@ def _archetype(shape: Shape) -> rr.AsComponents | None:
         half = [[0.0, 0.0, -length / 2]]
         return rr.Capsules3D(lengths=length, radii=radius, translations=half, colors=[color], fill_mode=solid)
     if shape.mesh and shape.mesh.is_file() and shape.mesh.suffix.lower() in _MESHES:
-        return rr.Asset3D(path=shape.mesh)
+        return rr.Asset3D(path=shape.mesh, albedo_factor=color)
     return None

@@ -5,16 +5,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 from rlctl import registry
 from rlctl.errors import RlctlError
 from rlctl.registry import EnvSpec
 from rlctl.replay.live import Choose, Env, Lived, live
 from rlctl.replay.pictures import Camera
-
-if TYPE_CHECKING:
-    from rlctl.replay.scene import Scene
+from rlctl.replay.scene import Scene, SceneObserver
+from rlctl.task.env import TaskEnv
 
 Tell = Callable[[str], None]
 
@@ -52,12 +50,11 @@ def _build(spec: EnvSpec, tell: Tell) -> Env:
 
 def watch(env: Env, spec: EnvSpec, seed: int, choose: Choose, *, policy: str, tell: Tell) -> Watched:
     """Live an episode and keep what can be drawn of it."""
-    if registry.is_task(registry.load(spec.task)):
-        from rlctl.replay.scene import SceneObserver
-
-        observer = SceneObserver(env.unwrapped)
+    inner = env.unwrapped
+    if isinstance(inner, TaskEnv):
+        observer = SceneObserver(inner)
         lived = live(env, spec, seed, choose, policy=policy, observers=[observer])
         return Watched(lived, scene=observer.scene())
-    camera = Camera(env, env.spec.max_episode_steps if env.spec else None, tell)
+    camera = Camera(env, tell)
     lived = live(env, spec, seed, choose, policy=policy, observers=[camera])
     return Watched(lived, pictures=camera.pictures)

@@ -191,6 +191,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
                 raise self._observation_differs(parts)
             if not all(math.isfinite(value.sum()) for value in dictionary.values()):
                 raise self._not_finite(parts)
+            for name, (lowest, highest) in self.task.observation_bounds.items():
+                dictionary[name] = self._bounded(dictionary[name], lowest, highest, parts)
             return dictionary
         try:
             observation = np.concatenate(list(parts.values()), axis=None, dtype=np.float32)
@@ -202,12 +204,15 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise self._not_finite(parts)
         if self.task.observation_bounds:
             low, high = self.observation_space.low, self.observation_space.high  # type: ignore[attr-defined]
-            # Float rounding only: a value well outside its declared range is an error of the task.
-            clipped: NDArray[np.float32] = np.minimum(np.maximum(observation, low), high)
-            if np.abs(clipped - observation).max() > 1e-4:
-                raise self._out_of_bounds(parts)
-            observation = clipped
+            observation = self._bounded(observation, low, high, parts)
         return observation
+
+    def _bounded(self, values: NDArray[np.float32], low: Any, high: Any, parts: Mapping[str, Any]) -> Any:
+        # Float rounding only: a value well outside its declared range is an error of the task.
+        clipped = np.minimum(np.maximum(values, low), high)
+        if np.abs(clipped - values).max() > 1e-4:
+            raise self._out_of_bounds(parts)
+        return clipped
 
     def _observation_differs(self, parts: Mapping[str, Any]) -> TaskError:
         now = {name: np.shape(value) for name, value in parts.items()}

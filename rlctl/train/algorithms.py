@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from rlctl.errors import RecipeError, did_you_mean
+from rlctl.errors import RecipeError, UsageError, did_you_mean
 from rlctl.run.recipe import Normalize, Recipe
 from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
 
@@ -35,6 +36,7 @@ _DETERMINISTIC_EXPLORERS = frozenset({"td3", "ddpg"})
 
 def build_model(recipe: Recipe, env: VecEnv, device: str) -> BaseAlgorithm:
     """Build the model of a recipe on vector environments; raises `RecipeError` for what does not fit."""
+    _check_device(device)
     cls = ALGORITHMS[recipe.algo]
     kwargs = _algorithm_kwargs(recipe, cls, env.action_space)
     env = normalized(env, recipe.normalize, kwargs.get("gamma", 0.99))
@@ -52,10 +54,18 @@ def build_model(recipe: Recipe, env: VecEnv, device: str) -> BaseAlgorithm:
         )
     except (AssertionError, ValueError, TypeError) as error:
         raise RecipeError(f"{recipe.algo} cannot be used here: {' '.join(str(error).split())}") from error
-    except RuntimeError as error:
-        if "device" in str(error).lower() or "cuda" in str(error).lower():
-            raise RecipeError(f"--device {device}: {str(error).splitlines()[0]}") from None
-        raise
+
+
+def _check_device(device: str) -> None:
+    # SB3 takes the CPU without a word where there is no GPU.
+    if device == "auto":
+        return
+    try:
+        wanted = torch.device(device)
+    except RuntimeError:
+        raise UsageError(f"--device {device!r}: no such device; give cpu, cuda, cuda:1, or auto") from None
+    if wanted.type == "cuda" and (wanted.index or 0) >= torch.cuda.device_count():
+        raise UsageError(f"--device {device}: torch sees {torch.cuda.device_count()} CUDA devices here; use cpu or auto")
 
 
 def _algorithm_kwargs(recipe: Recipe, cls: type[BaseAlgorithm], action_space: spaces.Space[Any]) -> dict[str, Any]:

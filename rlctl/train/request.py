@@ -140,7 +140,7 @@ def _train(
     from rlctl.train import checkpoint
     from rlctl.train.algorithms import build_model
     from rlctl.train.loop import Progress, TrainingLoop, cut_back
-    from rlctl.train.tensorboard import make_logger
+    from rlctl.train.tensorboard import make_logger, writer_errors
     from rlctl.train.vec_env import WorkerVecEnv
 
     pin_threads()
@@ -166,7 +166,7 @@ def _train(
 
     loop = TrainingLoop(run, recipe, env, make_eval_workers, progress, display, spec)
     try:
-        with _signals(loop, display):
+        with _signals(loop, display), writer_errors(display.message):
             _learn(model, loop, recipe)
         recordings = _record(loop, request.record)
     except RlctlError as error:

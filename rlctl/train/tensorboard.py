@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,24 @@ class _TensorBoard(KVWriter):
         if self._format is not None:
             self._format.close()
             self._format = None
+
+
+@contextlib.contextmanager
+def writer_errors(warn: Callable[[str], None]) -> Iterator[None]:
+    """Tell `warn` when TensorBoard's own thread cannot write, instead of its traceback."""
+    before = threading.excepthook
+
+    def hook(arguments: threading.ExceptHookArgs) -> None:
+        if isinstance(arguments.exc_value, OSError):
+            warn(f"warning: not saved: TensorBoard log: {arguments.exc_value.strerror}")
+        else:
+            before(arguments)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 def make_logger(folder: Path, warn: Callable[[str], None]) -> Logger:

@@ -29,6 +29,11 @@ def wait_for(condition, seconds=60):
     pytest.fail("waited in vain")
 
 
+def fill(file):
+    while True:
+        file.write(b"\0" * 4096)
+
+
 def start(folder: Path, *arguments: str, **options) -> subprocess.Popen:
     return subprocess.Popen(
         [*COMMAND, f"{ENVS}:Line", "-n", "1e8", *SMALL, *arguments],
@@ -111,11 +116,10 @@ def small_disk(tmp_path):
 
 def test_a_full_disk_costs_warnings_and_an_exit_code(small_disk):
     filler = small_disk / "filler"
-    process = start(small_disk, "--set", "eval.every_steps=20_000", "-n", "40_000")
+    process = start(small_disk, "--set", "eval.every_steps=8_000", "-n", "16_000")
     wait_for(lambda: list(small_disk.glob("runs/*/*/metrics.csv")))
     with filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space left"):
-        while True:
-            file.write(b"\0" * 4096)
+        fill(file)
     _, stderr = process.communicate(timeout=120)
     assert process.returncode == 5, stderr
     assert "warning: not saved: " in stderr

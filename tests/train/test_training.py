@@ -176,7 +176,7 @@ def test_a_worker_that_dies_ends_the_run(train, small_ppo):
 def test_divergence_is_told(train, small_ppo):
     settings = {**small_ppo, "total_timesteps": 2000, "normalize": {"observation": False, "reward": False}}
     settings["algo_kwargs"] = {**settings["algo_kwargs"], "learning_rate": 1.0, "max_grad_norm": 1e30}
-    with pytest.raises(DivergedError, match="training diverged: .* not finite at step 64"):
+    with pytest.raises(DivergedError, match=r"training diverged: .* not finite at step 64"):
         train("Exploding", settings)
 
 
@@ -233,3 +233,11 @@ def test_live_policy_and_saved_policy_act_the_same(train, small_ppo):
         pytest.fail(f"the newest episode is of {episode.info.policy}")
     actions = np.stack([policy.predict(observation) for observation in episode.observations[:-1]])
     np.testing.assert_array_equal(actions, episode.actions)
+
+
+@pytest.mark.parametrize(
+    ("device", "told"), [("gpu", "--device 'gpu': no such device"), ("cuda:99", "--device cuda:99: ")]
+)
+def test_a_device_that_is_not_there(train, small_ppo, device, told):
+    with pytest.raises(UsageError, match=told):
+        train("Line", small_ppo, device=device)

@@ -1,0 +1,124 @@
+"""What a replay prints."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from pathlib import Path
+from typing import Any
+
+from rlctl import output
+from rlctl.errors import AnswerIsNo
+from rlctl.replay.difference import Difference
+from rlctl.run.policy import versions
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayedEpisode:
+    """One episode that was lived."""
+
+    seed: int
+    length: int
+    total_reward: float
+    success: bool | None
+    recording: Path | None = None
+    """The `.rrd` file."""
+    episode: Path | None = None
+    """The `.npz` file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Verification:
+    """What came of living a recorded episode again."""
+
+    episode: Path
+    difference: Difference | None
+    other_versions: dict[str, tuple[str, str | None]]
+    """Name to recorded and present version, of those that differ."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayResult:
+    """Episodes that were lived, and what came of verifying one."""
+
+    task: str
+    policy: str
+    episodes: list[ReplayedEpisode]
+    verification: Verification | None = None
+
+    def check(self) -> None:
+        """Raise `AnswerIsNo` if a recorded episode was not the same again."""
+        if self.verification is not None and self.verification.difference is not None:
+            raise AnswerIsNo(f"{self.verification.episode}: not identical, {self.verification.difference}")
+
+
+def show(result: ReplayResult, json: str | None) -> None:
+    """Print the episodes and the command that opens them, or write them as JSON."""
+    if json is not None:
+        output.write_result_json(json, as_json(result))
+    if json == "-":
+        return
+    if result.verification is not None:
+        _show_verification(result, result.verification)
+        return
+    out = output.out()
+    out.print(f"{result.task}: {result.policy}" if result.policy else result.task, markup=False)
+    for episode in result.episodes:
+        out.print(_line(episode), markup=False)
+    if command := open_command(result):
+        out.print(f"open with: {command}", markup=False)
+
+
+def _line(episode: ReplayedEpisode) -> str:
+    parts = [f"seed {episode.seed}", f"{episode.length} steps", f"return {episode.total_reward:.4g}"]
+    if episode.success is not None:
+        parts.append("success" if episode.success else "no success")
+    where = f"{episode.recording}: " if episode.recording else ""
+    return where + ", ".join(parts)
+
+
+def _show_verification(result: ReplayResult, verification: Verification) -> None:
+    out, (episode,) = output.out(), result.episodes
+    verdict = "identical, bit for bit" if verification.difference is None else "not identical"
+    out.print(f"{verification.episode}: {result.task}, {_line(episode)}: {verdict}", markup=False)
+    for name, (recorded, now) in verification.other_versions.items():
+        out.print(f"recorded with {name} {recorded}, here is {now or 'none'}", markup=False)
+
+
+def open_command(result: ReplayResult) -> str | None:
+    """Return the command that opens the recordings; None if there are none."""
+    files = [str(episode.recording) for episode in result.episodes if episode.recording]
+    return shlex.join(["rerun", *files]) if files else None
+
+
+def as_json(result: ReplayResult) -> dict[str, Any]:
+    """Return the result as plain data."""
+    content: dict[str, Any] = {
+        "task": result.task,
+        "policy": result.policy,
+        "episodes": [
+            {
+                "file": str(episode.recording) if episode.recording else None,
+                "episode": str(episode.episode) if episode.episode else None,
+                "seed": episode.seed,
+                "length": episode.length,
+                "return": episode.total_reward,
+                "success": episode.success,
+            }
+            for episode in result.episodes
+        ],
+        "open": open_command(result),
+        "versions": versions(),
+    }
+    if (verification := result.verification) is not None:
+        difference = verification.difference
+        content["verification"] = {
+            "episode": str(verification.episode),
+            "identical": difference is None,
+            "difference": dataclasses.asdict(difference) if difference else None,
+            "other_versions": {
+                name: {"recorded": recorded, "now": now}
+                for name, (recorded, now) in verification.other_versions.items()
+            },
+        }
+    return content

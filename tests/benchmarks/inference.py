@@ -1,0 +1,63 @@
+"""How long a policy takes to choose one action."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rlctl
+from tests.benchmarks.row import Row, side_by_side
+from tests.benchmarks.shipped import rlctl_command, short_run
+
+CALLS = 300  # in a round
+
+
+def onnx_runtime(repeat: int) -> Row:
+    """Count calls for one observation; SB3's is `policy.predict` after the normalisation it was trained with."""
+    run = short_run()
+    onnx_file = run / "exports" / "policy.onnx"
+    rlctl_command("export", str(run), "--onnx")
+    sb3: Any = _torch_policy(run)
+    exported: Any = rlctl.load_policy(onnx_file)
+    env = rlctl.make("reach")
+    observation, _ = env.reset(seed=0)
+    env.close()
+    batch = {"obs": observation[None]}
+
+    def theirs() -> float:
+        return _seconds(lambda: sb3.network.predict(sb3.normalizer(observation), deterministic=True))
+
+    bare = side_by_side(lambda: _seconds(lambda: exported.session.run(["action"], batch)), theirs, 3 * repeat)
+    pair = side_by_side(lambda: _seconds(lambda: exported.predict(observation)), theirs, 3 * repeat)
+    faster = 1 / pair.ratio
+    return Row(
+        "ONNX Runtime, one observation",
+        f"{pair.ours * 1e6:.1f} us",
+        f"{pair.theirs * 1e6:.0f} us",
+        f"{faster:.1f}x",
+        ">= 8x",
+        faster >= 8,
+        f"rlctl.load_policy(onnx).predict; onnxruntime's own session.run alone: {1 / bare.ratio:.1f}x",
+    )
+
+
+def _torch_policy(run: Path) -> Any:
+    from rlctl.run.torch_policy import pin_threads
+
+    # The best case for so small a network.
+    pin_threads()
+    return rlctl.load_policy(run / "policies" / "best.safetensors")
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    """Return the median of many calls."""
+    times = []
+    for _ in range(CALLS):
+        began = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - began)
+    return float(np.median(times))

@@ -1,0 +1,68 @@
+"""Fixtures for all tests: the command line as a user runs it, installed plugins, and processes left behind."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import psutil
+import pytest
+
+
+@pytest.fixture
+def rlctl(tmp_path):
+    """Run the command line in a process of its own, in `tmp_path`; `path` goes before the installed packages."""
+
+    def run(*arguments, path=None, env=None, **options) -> subprocess.CompletedProcess:
+        environment = {**os.environ, "NO_COLOR": "1", **(env or {})}
+        if path is not None:
+            environment["PYTHONPATH"] = str(path)
+        return subprocess.run(
+            [sys.executable, "-m", "rlctl", *map(str, arguments)],
+            **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 60, "env": environment, **options},
+        )
+
+    return run
+
+
+@pytest.fixture
+def write_module(tmp_path):
+    """Write a Python file into `tmp_path` and return its path."""
+
+    def write(name: str, source: str) -> Path:
+        file = tmp_path / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(textwrap.dedent(source))
+        return file
+
+    return write
+
+
+@pytest.fixture
+def install(tmp_path):
+    """Install a distribution without pip: a folder for `sys.path` with the metadata that pip would write."""
+
+    def installed(name: str, tasks: dict[str, str], files: dict[str, str] | None = None, version="1.2") -> Path:
+        folder = tmp_path / "site"
+        metadata = folder / f"{name.replace('-', '_')}-{version}.dist-info"
+        metadata.mkdir(parents=True)
+        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        points = "".join(f"{task} = {target}\n" for task, target in tasks.items())
+        (metadata / "entry_points.txt").write_text(f"[rlctl.tasks]\n{points}")
+        for file, source in (files or {}).items():
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            (folder / file).write_text(textwrap.dedent(source))
+        return folder
+
+    return installed
+
+
+@pytest.fixture
+def no_child_left():
+    """Fail if the test leaves a process behind."""
+    before = set(psutil.Process().children(recursive=True))
+    yield
+    left = [child for child in psutil.Process().children(recursive=True) if child not in before]
+    _, alive = psutil.wait_procs(left, timeout=3)
+    assert alive == []

@@ -1,0 +1,90 @@
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlctl.registry import EnvSpec
+from rlctl.replay.watching import Watched, watch, watched_env
+from rlctl.run.episode import save_episode
+from rlctl.task.bullet import pybullet
+
+ENVS = Path(__file__).with_name("envs.py")
+HAND = 6  # link index
+
+
+@pytest.fixture(autouse=True)
+def strict(monkeypatch):
+    """Rerun raises for what it would otherwise leave out of a recording."""
+    import rerun
+
+    monkeypatch.setenv("RERUN_STRICT", "1")
+    rerun.set_strict_mode(True)
+
+
+def reach(seed: int = 5) -> Watched:
+    """Live an episode of reach that goes straight to the goal, by inverse kinematics."""
+    spec = EnvSpec("reach")
+    with watched_env(spec, print) as env:
+        task, sim = env.unwrapped.task, env.unwrapped.sim
+
+        def choose(observation, step):
+            arm = sim.body("arm")
+            wanted = pybullet.calculateInverseKinematics(
+                arm.id, HAND, task.goal.tolist(), maxNumIterations=100, physicsClientId=sim.client
+            )
+            return np.clip((np.array(wanted) - arm.joint_positions) / task.joint_step, -1, 1).astype(np.float32)
+
+        return watch(env, spec, seed, choose, policy="inverse kinematics", tell=print)
+
+
+def lived(name: str, *, seed: int = 3, **parameters) -> tuple[Watched, list[str]]:
+    """Live an episode of an environment of envs.py with random actions; returns also what was told."""
+    spec, told = EnvSpec(f"{ENVS}:{name}", parameters), []
+    with watched_env(spec, told.append) as env:
+        env.action_space.seed(0)
+        watched = watch(env, spec, seed, lambda o, k: env.action_space.sample(), policy="chance", tell=told.append)
+    return watched, told
+
+
+@pytest.fixture(scope="session")
+def reached() -> Watched:
+    return reach()
+
+
+@pytest.fixture(scope="session")
+def episode_file(reached, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("episodes") / "000007.npz"
+    save_episode(path, reached.lived.episode)
+    return path
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory):
+    """A run of reach that was trained for a moment, with one recording."""
+    from rlctl.train.request import TrainRequest, run_training
+
+    settings = {
+        "n_envs": 4,
+        "total_timesteps": 64,
+        "algo_kwargs": {"n_steps": 16, "batch_size": 32, "n_epochs": 1},
+        "eval": {"episodes": 2},
+    }
+    return run_training(TrainRequest("reach", settings=settings, root=tmp_path_factory.mktemp("runs"), record=1))
+
+
+@pytest.fixture
+def replay(rlctl):
+    """Run `rlctl replay` in an empty folder, without a display."""
+
+    def call(*arguments, display: str = ""):
+        environment = {"RERUN_STRICT": "1", "DISPLAY": display, "WAYLAND_DISPLAY": ""}
+        return rlctl("replay", *arguments, env=environment)
+
+    return call
+
+
+def as_json(done: subprocess.CompletedProcess) -> dict:
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)

@@ -1,0 +1,105 @@
+"""Tasks and plain environments to replay."""
+
+from dataclasses import dataclass
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from rlctl.task import Box, Event, Sim, Task, events
+
+
+@dataclass
+class Tumble(Task):
+    """A cube falls beside a car that Rerun's URDF reader refuses; the goal moves, and the cube's mass is drawn."""
+
+    car: str = "racecar/racecar.urdf"
+
+    control_dt, substeps, episode_s = 1 / 60, 4, 0.5
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+    reward_weights = {"height": -2.0, "metric": 0.0}
+    events = {
+        "mass": Event("reset", events.scale_mass, body="cube", factor=(0.5, 2.0), enabled=True),
+        "grip": Event("interval", events.set_friction, every_s=0.25, body="cube", friction=(0.1, 1.0), enabled=True),
+    }
+
+    def build(self, sim: Sim) -> None:
+        sim.load("ground", "plane.urdf", fixed=True)
+        self.cube = sim.load("cube", "cube_small.urdf", position=(0.5, 0.2, 0.4))
+        sim.load("car", self.car, position=(-0.5, 0.0, 0.1))
+
+    def reset(self, rng: np.random.Generator) -> None:
+        self.time = 0.0
+        self.cube.set_base((0.5, rng.uniform(-0.2, 0.2), 0.4), (0.0, 0.0, 0.6, 0.8))
+
+    def act(self, action: np.ndarray) -> None:
+        self.time += self.control_dt
+
+    def observe(self) -> dict[str, np.ndarray]:
+        return {"position": self.cube.base_position, "time": np.array([self.time])}
+
+    def rewards(self, action: np.ndarray) -> dict[str, float]:
+        return {"height": float(self.cube.base_position[2]), "metric": 1.0}
+
+    def is_success(self) -> bool:
+        return 0.1 < self.cube.base_position[2] < 0.3
+
+    def markers(self) -> dict[str, np.ndarray]:
+        return {"goal": np.array([self.time, 0.0, 0.2])}
+
+
+class Pixels(gymnasium.Env):
+    """Discrete actions, a dictionary to observe, and a picture that is drawn."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(self, render_mode: str | None = None, fault: str = "", steps: int = 10):
+        self.render_mode = render_mode
+        self.fault = fault
+        self.length = steps
+        self.action_space = spaces.Discrete(3)
+        self.observation_space = spaces.Dict(
+            {
+                "count": spaces.Discrete(1000),
+                "point": spaces.Box(-1.0, 1.0, (2,), np.float32),
+                "eye": spaces.Box(0, 255, (12, 16, 3), np.uint8),
+            }
+        )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps, self.point = 0, self.np_random.uniform(-1, 1, 2)
+        return self._observation(), {}
+
+    def _observation(self):
+        eye = np.full((12, 16, 3), 20 * self.steps % 256, np.uint8)
+        return {"count": self.steps, "point": self.point.astype(np.float32), "eye": eye}
+
+    def step(self, action):
+        self.steps += 1
+        if self.fault == "talk":
+            print("a plugin talks")
+        if self.fault == "step" and self.steps == 4:
+            raise RuntimeError("lost a wheel")
+        return self._observation(), float(action), False, self.steps >= self.length, {}
+
+    def render(self):
+        if self.fault == "render":
+            raise OSError("no OpenGL")
+        return np.full((40, 60, 3), 20 * self.steps % 256, np.uint8)
+
+
+class Blind(Pixels):
+    """Cannot draw at all; its constructor knows no render_mode."""
+
+    def __init__(self):
+        super().__init__()
+
+
+class Chance(Pixels):
+    """Not reproducible: after five steps its point comes from nowhere."""
+
+    def step(self, action):
+        if self.steps >= 5:
+            self.point = np.random.default_rng().uniform(-1, 1, 2)
+        return super().step(action)

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from rlctl.errors import TaskError
+from rlctl.registry import EnvSpec
+from rlctl.replay.rrd import write_rrd
+from rlctl.replay.watching import watch, watched_env
+from tests.replay.conftest import ENVS, lived
+from tests.replay.reading import column, entities, jpegs
+
+
+def write(watched, tmp_path):
+    path, told = tmp_path / "plain.rrd", []
+    write_rrd(path, watched, title="plain", tell=told.append)
+    assert told == []
+    return path
+
+
+def test_actions_rewards_observations_and_pictures(tmp_path):
+    watched, told = lived("Pixels")
+    assert told == []
+    path = write(watched, tmp_path)
+    steps, actions = column(path, "/action")
+    assert steps.tolist() == list(range(1, 11))
+    np.testing.assert_array_equal(actions.ravel(), watched.lived.episode.actions)
+    _, rewards = column(path, "/reward/total")
+    np.testing.assert_array_equal(rewards, actions)  # its reward is the action
+    _, counts = column(path, "/observation/count")
+    assert counts.ravel().tolist() == list(range(11))
+    pictures = jpegs(path, "/camera")
+    assert sorted(pictures) == list(range(11))
+    assert pictures[0][:2] == b"\xff\xd8"
+    assert sorted(jpegs(path, "/observation/eye")) == list(range(11))
+
+
+def test_long_episodes_have_fewer_pictures():
+    watched, _ = lived("Pixels", steps=450)
+    # More than 100: every second, and again, and again: every eighth step of 450.
+    assert [step for step, _ in watched.pictures] == list(range(0, 451, 8))
+
+
+def test_time_follows_from_the_frame_rate(tmp_path):
+    watched, _ = lived("Pixels")
+    assert watched.lived.dt == 1 / 20
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "reason"),
+    [
+        ("Pixels", {"fault": "render"}, "no camera pictures: OSError: no OpenGL"),
+        ("Blind", {}, "no camera pictures: "),
+    ],
+)
+def test_missing_pictures_are_told_and_nothing_else_is_missing(name, parameters, reason, tmp_path):
+    watched, told = lived(name, **parameters)
+    assert len(told) == 1
+    assert told[0].startswith(reason)
+    found = entities(write(watched, tmp_path))
+    assert "/camera" not in found
+    assert {"/action", "/reward/total", "/observation/point"} <= found
+
+
+@pytest.mark.parametrize("task", ["Pendulum-v1", "CartPole-v1"])
+def test_gymnasium_environments(task, tmp_path):
+    spec = EnvSpec(task)
+    with watched_env(spec, print) as env:
+        env.action_space.seed(0)
+        watched = watch(env, spec, 1, lambda o, k: env.action_space.sample(), policy="", tell=print)
+    _, observations = column(write(watched, tmp_path), "/observation")
+    np.testing.assert_array_equal(observations, watched.lived.episode.observations)
+
+
+def test_error_of_the_environment_names_seed_and_step():
+    with pytest.raises(TaskError) as raised:
+        lived("Pixels", seed=11, fault="step")
+    assert str(raised.value) == (
+        f"task '{ENVS}:Pixels': RuntimeError: lost a wheel\n"
+        f"in the episode with seed 11, step 4; to see it alone: rlctl check-env {ENVS}:Pixels"
+    )
+    assert "lost a wheel" in raised.value.details

@@ -1,0 +1,138 @@
+"""Environments that go wrong: the message names task, environment, seed and step, and nothing is left running."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import psutil
+import pytest
+
+from rlctl.errors import TaskError
+from tests.rollout.conftest import ENVS
+
+pytestmark = pytest.mark.usefixtures("no_child_left")
+
+
+def run_into_the_fault(workers):
+    """Environment 2 lives the faulty seed."""
+    workers.reset({env: env + 5 for env in range(4)})
+    workers.arrays.action[:] = 0.0
+    for _ in range(4):
+        workers.step()
+
+
+PLACE = f"in environment 2, episode seed 7, step 3; to see it alone: rlctl check-env {ENVS}:Walk"
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("raise", "RuntimeError: the gripper fell off"),
+        ("nan observation", "ValueError: observation is not finite: element 0 is nan"),
+        ("inf reward", "ValueError: reward is inf"),
+        ("shape", "ValueError: observation has shape (5,), the space has (2,)"),
+        ("exit", "SystemExit: done here"),
+        ("segfault", "worker 1 died while stepping (SIGSEGV)"),
+        ("_exit", "worker 1 died while stepping (exit code 4)"),
+    ],
+)
+def test_a_step_that_fails(spec, start, fault, told):
+    workers = start(spec("Walk", fault=fault), 4, n_workers=2)
+    with pytest.raises(TaskError) as caught:
+        run_into_the_fault(workers)
+    assert str(caught.value) == f"task '{ENVS}:Walk': {told}\n{PLACE}"
+    assert caught.value.exit_code == 3
+
+
+def test_the_environments_own_traceback_comes_along(spec, start):
+    workers = start(spec("Walk", fault="raise"), 4, n_workers=1)
+    with pytest.raises(TaskError) as caught:
+        run_into_the_fault(workers)
+    assert 'raise RuntimeError("the gripper fell off")' in caught.value.details
+    assert "in fail" in caught.value.details
+
+
+def test_a_hang_is_ended(spec, start):
+    workers = start(spec("Walk", fault="hang"), 4, n_workers=2, timeout_s=1.0)
+    began = time.monotonic()
+    with pytest.raises(TaskError) as caught:
+        run_into_the_fault(workers)
+    assert time.monotonic() - began < 10
+    assert str(caught.value) == (
+        f"task '{ENVS}:Walk': no answer for 1 s while stepping; if that may take so long, raise --env-timeout\n{PLACE}"
+    )
+
+
+def test_a_worker_that_is_killed_while_idle(spec, start):
+    workers = start(spec("Walk"), 4, n_workers=2)
+    workers.reset({env: env for env in range(4)})
+    victim = workers._processes[1]
+    victim.kill()
+    victim.wait()
+    workers.arrays.action[:] = 0.0
+    with pytest.raises(TaskError) as caught:
+        workers.step()
+    assert str(caught.value).startswith(f"task '{ENVS}:Walk': worker 1 died while ")
+    assert str(caught.value).endswith("(SIGKILL)\nit ran the environments 2 to 3")
+
+
+def test_an_environment_that_cannot_be_built(spec, start):
+    workers = start(spec("FailsToStart"), 4)
+    with pytest.raises(TaskError, match=r"^task '.*:FailsToStart': RuntimeError: no licence for this robot \(envs.py:"):
+        workers.reset({0: 1})
+
+
+def test_a_reset_that_fails_is_step_zero(spec, start):
+    workers = start(spec("FailsToReset"), 4)
+    with pytest.raises(TaskError) as caught:
+        workers.reset({env: 40 + env for env in range(4)})
+    assert str(caught.value).startswith(f"task '{ENVS}:FailsToReset': RuntimeError: cannot find home\n")
+    assert "episode seed 4" in str(caught.value)
+    assert ", step 0; " in str(caught.value)
+
+
+PARENT = textwrap.dedent(
+    """
+    import sys
+    from rlctl.registry import EnvSpec
+    from rlctl.rollout.workers import Workers
+    workers = Workers(EnvSpec(sys.argv[1], {"fault": "hang"}), 4, n_workers=2)
+    workers.reset({env: env + int(sys.argv[2]) for env in range(4)})
+    workers.arrays.action[:] = 0.0
+    for _ in range(2):
+        workers.step()
+    print("stepping", flush=True)
+    while True:
+        workers.step()
+    """
+)
+
+
+@pytest.mark.parametrize("first_seed", [5, 100], ids=["stuck in a step", "at work"])
+def test_workers_end_with_a_killed_parent(first_seed):
+    command = [sys.executable, "-c", PARENT, f"{ENVS}:Walk", str(first_seed)]
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert parent.stdout.readline() == b"stepping\n"
+    time.sleep(0.2)
+    workers = psutil.Process(parent.pid).children()
+    assert len(workers) == 2
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    parent.stdout.close()
+    _, alive = psutil.wait_procs(workers, timeout=5)
+    for each in alive:
+        each.kill()
+    assert alive == []
+
+
+def test_ctrl_c_is_for_the_main_process(spec, start):
+    workers = start(spec("Walk"), 2, n_workers=2)
+    workers.reset({0: 0, 1: 1})
+    for process in workers._processes:
+        os.kill(process.pid, signal.SIGINT)
+    workers.arrays.action[:] = 0.0
+    for _ in range(3):
+        workers.step()

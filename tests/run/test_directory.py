@@ -1,0 +1,179 @@
+"""The run folder: finding runs and policies, and keeping a second writer out."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.run import directory
+from rlctl.run.directory import RunDirectory, find_policy, find_run
+
+
+@pytest.fixture
+def root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def make_run(root):
+    def make(task: str, name: str, policy: str | None = "best") -> RunDirectory:
+        run = RunDirectory(root / task / name)
+        run.path.mkdir(parents=True)
+        run.write_status({"task": task})
+        if policy:
+            (run.path / "policies").mkdir()
+            (run.path / "policies" / f"{policy}.safetensors").write_bytes(b"")
+        return run
+
+    return make
+
+
+def error(kind, call, *arguments):
+    with pytest.raises(kind) as caught:
+        call(*arguments)
+    return str(caught.value)
+
+
+def test_a_new_run(root):
+    run = directory.create("path/to/my_env.py:MyEnv", 3, root)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_s3", run.path.name)
+    assert run.path.parent == root / "MyEnv"
+    assert os.readlink(root / "latest") == f"MyEnv/{run.path.name}"
+    others = [directory.create("path/to/my_env.py:MyEnv", 3, root) for _ in range(3)]
+    assert len({run.path, *(other.path for other in others)}) == 4
+    assert (root / "latest").resolve() == others[-1].path
+    assert sorted(os.listdir(root)) == ["MyEnv", "latest"]
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "runs").write_text("a file")
+    assert error(ArtifactError, directory.create, "reach", 0, tmp_path / "runs").endswith(
+        "runs/reach: cannot make a run folder: Not a directory"
+    )
+
+
+def test_the_newest_run(root, make_run):
+    make_run("reach", "2026-01-01_10-00-00_s0")
+    newest = make_run("ant", "2026-01-03_10-00-00_s0")
+    reach = make_run("reach", "2026-01-02_10-00-00_s9")
+    (root / "reach" / "notes").mkdir()
+    assert find_run(None, root).path == find_run("latest", root).path == newest.path
+    assert find_run("reach", root).path == reach.path
+    assert find_run(str(newest.path), root).path == newest.path
+    assert find_run("some/where/ant.py:ant", root).path == newest.path
+
+
+def test_of_two_in_one_second_the_later(root, make_run):
+    first = make_run("reach", "2026-01-01_10-00-00_s0")
+    second = make_run("reach", "2026-01-01_10-00-00_s0_1")
+    os.utime(first.status_file, (1, 1))
+    assert find_run("reach", root).path == second.path
+
+
+def test_no_run_yet(root):
+    expected = f"no run yet under {root}; train one: rlctl train reach"
+    assert error(ArtifactError, find_run, None, root) == expected
+    assert error(ArtifactError, find_run, "reach", root) == (
+        f"no run of 'reach' yet under {root}; train one: rlctl train reach"
+    )
+    assert ArtifactError("").exit_code == 5
+
+
+def test_a_word_that_stands_for_no_run(root, make_run, tmp_path):
+    make_run("reach", "2026-01-01_10-00-00_s0")
+    assert error(ArtifactError, find_run, "raech", root) == (
+        "no run 'raech': not a folder, and no task with a run. Did you mean 'reach'?"
+    )
+    (tmp_path / "stuff").mkdir()
+    assert error(ArtifactError, find_run, "stuff", root) == "stuff: not a run of rlctl: it has no run.json"
+
+
+def test_which_policy(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    path, owner = find_policy("reach", root=root)
+    assert path == run.best_policy
+    assert owner.path == run.path
+    assert find_policy(str(run.best_policy), root=root)[1].path == run.path
+    assert error(ArtifactError, find_policy, "reach", "last", root) == f"{run.path}: no last policy yet; it saved none"
+    assert error(UsageError, find_policy, "reach", "worst", root) == (
+        "--checkpoint 'worst': give best, last, or the step of a checkpoint"
+    )
+    assert error(ArtifactError, find_policy, "reach", "500", root) == (
+        f"{run.path}: no checkpoint at step 500; there are: none"
+    )
+    folder = run.checkpoint(1200)
+    folder.mkdir(parents=True)
+    (folder / "policy.safetensors").write_bytes(b"")
+    assert folder.name == "000001200"
+    assert find_policy("reach", "1200", root)[0] == folder / "policy.safetensors"
+    assert error(ArtifactError, find_policy, "reach", "500", root).endswith("there are: 1200")
+
+
+def test_no_best_policy_yet(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0", policy="last")
+    assert error(ArtifactError, find_policy, "reach", "best", root) == (
+        f"{run.path}: no best policy yet; train longer, or use --checkpoint last"
+    )
+    assert find_policy("reach", "last", root)[0] == run.last_policy
+
+
+def test_a_policy_file_itself(root, tmp_path):
+    file = tmp_path / "mine.safetensors"
+    assert error(ArtifactError, find_policy, str(file)) == f"{file}: no such file"
+    file.write_bytes(b"")
+    assert find_policy(str(file)) == (file, None)
+
+
+def test_half_written_checkpoints_do_not_count(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    for name in ("000000200", ".000000300.77.part", "000000100"):
+        (run.path / "checkpoints" / name).mkdir(parents=True)
+    assert [folder.name for folder in run.checkpoints()] == ["000000100", "000000200"]
+
+
+def test_episodes_are_numbered_on(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    assert run.next_episode_number() == 0
+    run.episodes.mkdir()
+    for name in ("000002.npz", "000010.npz", "best.npz", "000011.rrd"):
+        (run.episodes / name).write_bytes(b"")
+    assert run.next_episode_number() == 11
+    assert run.episode_file(11) == run.episodes / "000011.npz"
+
+
+def test_status(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    run.write_status({"status": "running", "steps": 0})
+    run.write_status({"steps": 10})
+    assert run.status() == {"task": "reach", "status": "running", "steps": 10}
+    run.status_file.write_text("[]")
+    assert error(ArtifactError, run.status) == f"{run.status_file}: not a run of rlctl: it names no task"
+    run.status_file.write_text("{")
+    assert error(ArtifactError, run.status).startswith(f"{run.status_file}: damaged: ")
+
+
+def test_a_second_writer_is_refused(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    lock = run.lock()
+    told = error(UsageError, run.lock)
+    assert told == f"{run.path}: another process is writing this run (pid {os.getpid()} on {os.uname().nodename})"
+    lock.release()
+    run.lock().release()
+
+
+def test_a_lock_ends_with_its_process(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    code = (
+        "import sys, time; from pathlib import Path; from rlctl.run.directory import RunDirectory\n"
+        f"lock = RunDirectory(Path({json.dumps(str(run.path))})).lock(); print('locked', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b"locked\n"
+        assert f"(pid {writer.pid} on " in error(UsageError, run.lock)
+        writer.kill()
+    run.lock().release()

@@ -1,0 +1,95 @@
+"""Recorded episodes: written, read, and refused when they cannot be what they should."""
+
+import json
+
+import numpy as np
+import pytest
+
+from rlctl.errors import ArtifactError
+from rlctl.registry import EnvSpec
+from rlctl.run import files
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
+
+INFO = EpisodeInfo(
+    task="reach",
+    task_parameters={"tolerance": 0.02},
+    events={"mass": {"factor": [0.9, 1.1]}},
+    randomize=True,
+    frame_stack=2,
+    seed=2**31 - 1,
+    success=False,
+    total_reward=-1.0 / 3.0,
+    term_names=["distance"],
+)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "episodes" / "000000.npz"
+
+
+def episode(observations):
+    rng = np.random.default_rng(0)
+    return RecordedEpisode(
+        INFO, rng.normal(size=(3, 2)).astype(np.float32), observations, rng.normal(size=3), rng.normal(size=(3, 1))
+    )
+
+
+@pytest.mark.parametrize(
+    "observations",
+    [
+        np.arange(8, dtype=np.float32).reshape(4, 2),
+        {"camera": np.ones((4, 2, 2, 3), np.uint8), "arm/joints": np.zeros((4, 7), np.float32)},
+    ],
+    ids=["flat", "dict"],
+)
+def test_round_trip(path, observations):
+    written = episode(observations)
+    save_episode(path, written)
+    read = load_episode(path)
+    assert read.info == INFO
+    for name in ("actions", "rewards", "terms"):
+        assert getattr(read, name).tobytes() == getattr(written, name).tobytes()
+        assert getattr(read, name).dtype == getattr(written, name).dtype
+    if isinstance(observations, dict):
+        assert read.observations.keys() == observations.keys()
+        assert all((read.observations[key] == value).all() for key, value in observations.items())
+    else:
+        np.testing.assert_array_equal(read.observations, observations)
+
+
+def test_it_knows_what_it_was_lived_in():
+    assert INFO.env_spec() == EnvSpec(
+        "reach", {"tolerance": 0.02}, randomize=True, events={"mass": {"factor": [0.9, 1.1]}}, frame_stack=2
+    )
+
+
+def rewrite(path, info):
+    save_episode(path, episode(np.zeros((4, 2))))
+    arrays = files.read_npz(path)
+    files.write_npz(path, {**arrays, "info": np.array(info)})
+
+
+def test_a_newer_format(path):
+    rewrite(path, json.dumps({"format": 99, "who": "knows"}))
+    with pytest.raises(ArtifactError, match=r"000000.npz: episode format 99 is newer than this rlctl can read \(1\)$"):
+        load_episode(path)
+
+
+@pytest.mark.parametrize("info", ["{", "[]", "{}", json.dumps({"task": "reach", "seed": "x", "total_reward": 0})])
+def test_a_damaged_description(path, info):
+    rewrite(path, info)
+    with pytest.raises(ArtifactError, match=r"000000.npz: its description is damaged: "):
+        load_episode(path)
+
+
+def test_what_is_no_episode(path):
+    files.write_npz(path, {"weights": np.zeros(3)})
+    with pytest.raises(ArtifactError, match=r"000000.npz: not an episode of rlctl: it has no info, actions, "):
+        load_episode(path)
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(ArtifactError, match=r"000000.npz: damaged, or not an .npz file"):
+        load_episode(path)
+    path.unlink()
+    with pytest.raises(ArtifactError, match=r"000000.npz: no such file$"):
+        load_episode(path)

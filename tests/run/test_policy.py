@@ -1,0 +1,214 @@
+"""Policy files, and policies that act: a row's action depends on that row alone."""
+
+import json
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import rlctl
+from rlctl.errors import ArtifactError
+from rlctl.run.env_info import EnvInfo, space_to_json
+from rlctl.run.policy import ROWS, BatchActor, PolicyInfo, read_policy, save_policy
+from rlctl.run.torch_policy import build_network, pin_threads
+
+BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
+DICT = spaces.Dict({"a": spaces.Box(-np.inf, np.inf, (3,), np.float32), "b": spaces.Discrete(4)})
+ACTIONS = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread():
+    import torch
+
+    before = torch.get_num_threads()
+    pin_threads()
+    torch.manual_seed(0)
+    yield
+    torch.set_num_threads(before)
+
+
+def describe(algo="ppo", policy="MlpPolicy", observation=BOX, action=ACTIONS, **options):
+    env = EnvInfo(observation_space=space_to_json(observation), action_space=space_to_json(action))
+    return PolicyInfo(algo=algo, policy=policy, env=env, task="my_env.py:MyEnv", training_steps=7, **options)
+
+
+def tensors_of(info):
+    tensors = {f"policy/{key}": value.numpy() for key, value in build_network(info).state_dict().items()}
+    for key in info.normalized_keys:
+        tensors[f"normalize/{key}/mean"] = np.linspace(-1, 1, 5)
+        tensors[f"normalize/{key}/var"] = np.linspace(0.5, 2, 5)
+    return tensors
+
+
+@pytest.fixture
+def saved(tmp_path):
+    def save(**options):
+        info = describe(**options)
+        path = tmp_path / "policy.safetensors"
+        save_policy(path, info, tensors_of(info))
+        return path
+
+    return save
+
+
+@pytest.fixture
+def path(saved):
+    return saved(policy_kwargs={"net_arch": [16]}, normalized_keys=[""], clip_observation=10.0)
+
+
+def test_round_trip(tmp_path):
+    info = describe(policy_kwargs={"net_arch": [8]})
+    tensors = tensors_of(info)
+    tensors["policy/transposed"] = np.arange(6.0).reshape(2, 3).T
+    path = tmp_path / "policies" / "best.safetensors"
+    save_policy(path, info, tensors)
+    read, arrays = read_policy(path)
+    assert read == info
+    assert arrays.keys() == tensors.keys()
+    for name, value in tensors.items():
+        np.testing.assert_array_equal(arrays[name], value)
+        assert arrays[name].dtype == value.dtype
+
+
+def test_normalisation_by_hand(path):
+    _, tensors = read_policy(path)
+    policy = rlctl.load_policy(path)
+    observation = np.array([3.0, -2.0, 0.0, 1.0, 90.0], np.float32)
+    mean, var = tensors["normalize//mean"], tensors["normalize//var"]
+    expected = np.clip((observation - mean) / np.sqrt(var + 1e-8), -10.0, 10.0)
+    assert expected[4] == 10.0
+    np.testing.assert_array_equal(policy.normalizer(observation[None])[0], expected.astype(np.float32))
+
+
+def rewrite(path, metadata):
+    from safetensors.numpy import load_file, save
+
+    path.write_bytes(save(load_file(path), metadata=metadata))
+
+
+@pytest.mark.parametrize("size", [0, 4, 100, -1])
+def test_a_truncated_file(path, size):
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(ArtifactError, match=r"policy.safetensors: damaged, or not a .safetensors file: ") as caught:
+        rlctl.load_policy(path)
+    assert caught.value.exit_code == 5
+
+
+def test_a_file_of_somebody_else(path):
+    rewrite(path, {"format": "pt"})
+    with pytest.raises(ArtifactError) as caught:
+        rlctl.load_policy(path)
+    assert str(caught.value) == f"{path}: not an rlctl policy: its metadata has no 'rlctl' entry"
+
+
+def test_a_newer_format(path):
+    rewrite(path, {"rlctl": json.dumps({"format": 2, "new": "things"})})
+    with pytest.raises(ArtifactError) as caught:
+        rlctl.load_policy(path)
+    assert str(caught.value) == (
+        f"{path}: policy format 2 is newer than this rlctl {rlctl.__version__} can read (1); upgrade rlctl"
+    )
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"format": 1, "algo": 3}'])
+def test_damaged_metadata(path, text):
+    rewrite(path, {"rlctl": text})
+    with pytest.raises(ArtifactError, match=r"policy.safetensors: its rlctl metadata is damaged: "):
+        rlctl.load_policy(path)
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(ArtifactError, match=r"none.safetensors: no such file$"):
+        rlctl.load_policy(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"policy_kwargs": {"net_arch": [32]}}, "its tensors do not fit its description: Error"),
+        ({"policy_kwargs": {"net_arch": "wide"}}, "its tensors do not fit its description: "),
+        ({"policy_kwargs": {"activation_fn": "sinus"}}, "its tensors do not fit its description: policy_kwargs."),
+        ({"normalized_keys": ["x"]}, "its tensors do not fit its description: 'normalize/x/mean'"),
+        ({"algo": "alphago"}, "policy for an unknown algorithm 'alphago'"),
+        ({"policy": "TransformerPolicy"}, "policy of an unknown kind 'TransformerPolicy' for ppo"),
+    ],
+)
+def test_a_description_that_does_not_fit(path, changes, told):
+    info, _ = read_policy(path)
+    rewrite(path, {"rlctl": info.model_copy(update=changes).model_dump_json()})
+    with pytest.raises(ArtifactError) as caught:
+        rlctl.load_policy(path)
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"policy_kwargs": {"net_arch": [64, 64]}},
+        {"algo": "sac"},
+        {"algo": "dqn", "action": spaces.Discrete(3)},
+        {"algo": "recurrent_ppo", "policy": "MlpLstmPolicy", "policy_kwargs": {"lstm_hidden_size": 32}},
+        {"policy": "MultiInputPolicy", "observation": DICT},
+    ],
+    ids=["ppo", "sac", "dqn", "recurrent", "dict"],
+)
+def test_an_action_does_not_depend_on_its_neighbours(saved, options):
+    """Bit for bit: alone, beside others, at another place, or beyond the first block of rows."""
+    policy = rlctl.load_policy(saved(**options))
+    rng = np.random.default_rng(0)
+    count, steps = ROWS + 9, 3
+    if isinstance(policy.observation_space, spaces.Dict):
+        seen = [
+            {"a": rng.normal(size=(count, 3)).astype(np.float32), "b": rng.integers(0, 4, count)} for _ in range(steps)
+        ]
+    else:
+        seen = [rng.normal(size=(count, 5)).astype(np.float32) for _ in range(steps)]
+
+    def picked(step, rows):
+        whole = seen[step]
+        return {key: value[rows] for key, value in whole.items()} if isinstance(whole, dict) else whole[rows]
+
+    def act(order):
+        actor = BatchActor(policy, count)
+        return [actor.act(picked(step, order), order, np.full(len(order), step == 0)) for step in range(steps)]
+
+    together = act(np.arange(count))
+    backwards = act(np.arange(count)[::-1])
+    for env in (0, 5, ROWS - 1, ROWS, count - 1):
+        alone = act(np.array([env]))
+        for step in range(steps):
+            assert alone[step][0].tobytes() == together[step][env].tobytes()
+            assert backwards[step][count - 1 - env].tobytes() == together[step][env].tobytes()
+
+
+def test_a_recurrent_policy_remembers_until_reset(saved):
+    path = saved(algo="recurrent_ppo", policy="MlpLstmPolicy", policy_kwargs={"lstm_hidden_size": 16})
+    policy = rlctl.load_policy(path)
+    observation = np.ones(5, np.float32)
+    first, second = policy.predict(observation), policy.predict(observation)
+    assert not np.array_equal(first, second)
+    policy.reset()
+    np.testing.assert_array_equal(policy.predict(observation), first)
+    np.testing.assert_array_equal(policy.predict(observation), second)
+
+
+def test_predict_is_numpy_in_numpy_out(path):
+    policy = rlctl.load_policy(path)
+    action = policy.predict(np.zeros(5))
+    assert action.shape == (2,)
+    assert action.dtype == np.float32
+    np.testing.assert_array_equal(policy.predict([0.0] * 5), action)
+    assert not np.array_equal(policy.predict(np.zeros(5), deterministic=False), action)
+    assert policy.info.training_steps == 7
+
+
+def test_predict_with_a_wrong_shape(path, saved):
+    policy = rlctl.load_policy(path)
+    with pytest.raises(ValueError, match=r"^observation of shape \(4,\), the policy wants \(5,\)$"):
+        policy.predict(np.zeros(4))
+    with pytest.raises(ValueError, match=r"^observation of shape \(1, 5\), the policy wants \(5,\)$"):
+        policy.predict(np.zeros((1, 5)))
+    by_name = rlctl.load_policy(saved(policy="MultiInputPolicy", observation=DICT))
+    with pytest.raises(ValueError, match=r"^observation of shape {'a': \(3,\)}, the policy wants {'a': \(3,\), 'b': "):
+        by_name.predict({"a": np.zeros(3)})

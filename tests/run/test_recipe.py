@@ -1,0 +1,170 @@
+"""Recipes: where a value comes from, and what is said of one that cannot be."""
+
+import math
+
+import pytest
+
+from rlctl.errors import ArtifactError, RecipeError
+from rlctl.run import recipe
+from rlctl.run.recipe import Recipe, parse_settings, resolve, task_settings, validate
+
+
+@pytest.fixture
+def packaged(tmp_path):
+    """A task by path with a recipe beside it; only the recipe is read."""
+    (tmp_path / "my_env.py").write_text("class MyEnv: ...")
+    (tmp_path / "my_env.yaml").write_text(
+        "algo: ppo\n"
+        "algo_kwargs: {learning_rate: 1e-3, n_steps: 100, gamma: 0.9}\n"
+        "policy_kwargs: {net_arch: [32]}\n"
+        "task: {size: 3, shape: round}\n"
+        "n_envs: 64\n"
+        "total_timesteps: 200_000\n"
+    )
+    return f"{tmp_path / 'my_env.py'}:MyEnv"
+
+
+@pytest.fixture
+def config(tmp_path):
+    def write(text):
+        file = tmp_path / "config.yaml"
+        file.write_text(text)
+        return file
+
+    return write
+
+
+def test_set_goes_over_config_goes_over_packaged(packaged, config):
+    file = config("algo_kwargs: {gamma: 0.95, n_steps: 50}\ntask: {size: 4}\n")
+    settings = parse_settings(["algo_kwargs.gamma=0.99", "task.colour=red"])
+    result = resolve(packaged, file, settings)
+    assert result.algo_kwargs["learning_rate"] == 1e-3  # packaged
+    assert result.algo_kwargs["n_steps"] == 50  # config
+    assert result.algo_kwargs["gamma"] == 0.99  # --set
+    assert result.task == {"size": 4, "shape": "round", "colour": "red"}
+    assert result.n_envs == 64
+
+
+def test_another_algorithm_takes_nothing_of_the_packaged_ones(packaged):
+    result = resolve(packaged, None, {"algo": "sac", "algo_kwargs": {"gamma": 0.98}})
+    assert result.algo_kwargs == {"gamma": 0.98, "gradient_steps": -1, "train_freq": 1, "buffer_size": 300_000}
+    assert result.policy_kwargs == {}
+    assert result.n_envs == 8
+    assert result.task == {"size": 3, "shape": "round"}  # of the task, not of the algorithm
+    assert not result.normalize.observation
+
+
+def test_the_same_algorithm_named_again_keeps_them(packaged):
+    assert resolve(packaged, None, {"algo": "ppo"}).algo_kwargs["n_steps"] == 100
+
+
+def test_defaults_for_an_environment_without_a_recipe():
+    result = resolve("Pendulum-v1", None, {})
+    assert (result.algo, result.n_envs) == ("ppo", 8)
+    assert 2048 <= result.algo_kwargs["n_steps"] * result.n_envs <= 16_384
+    assert result.normalize == recipe.Normalize()
+    assert result.eval.every_steps == result.total_timesteps // 10
+
+
+def test_every_packaged_recipe_is_valid():
+    from rlctl import registry
+
+    for entry in registry.installed():
+        if entry.distribution == "rlctl":
+            assert entry.recipe_file is not None, entry.name
+            assert isinstance(resolve(entry.name, None, {}), Recipe)
+
+
+def test_a_resolved_recipe_is_a_config(packaged, config):
+    first = resolve(packaged, None, parse_settings(["task.name=1e6", "stop_success=0.98", "algo_kwargs.ent_coef=1e-5"]))
+    again = resolve("other.py:Env", config(first.to_yaml()), {})
+    assert again == first
+    assert again.task["name"] == 1e6
+    text = validate({"task": {"name": "1e6"}}, "x")
+    assert resolve("other.py:Env", config(text.to_yaml()), {}).task == {"name": "1e6"}
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"alog": "ppo"}, "no key 'alog'. Did you mean 'algo'? Keys here: task, reward_weights, "),
+        ({"eval": {"episode": 3}}, "no key 'eval.episode'. Did you mean 'episodes'? Keys here: every_steps, episodes."),
+        ({"checkpoint": {"kep": 3}}, "no key 'checkpoint.kep'. Did you mean 'keep'? Keys here: keep."),
+        ({"n_envs": "many"}, "n_envs: should be a valid integer, unable to parse string as an integer, got 'many'"),
+        ({"n_envs": 0}, "n_envs: should be greater than or equal to 1, got 0"),
+        ({"task": 3}, "task: should be a valid dictionary, got 3"),
+        ({"total_timesteps": 1.5}, "total_timesteps: should be a valid integer, got a number with a fractional part, "),
+        ({"stop_success": 2}, "stop_success: should be less than or equal to 1, got 2"),
+        ({"seed": -1}, "seed: should be greater than or equal to 0, got -1"),
+        ({"reward_weights": {"a": math.nan}}, "reward_weights.a: should be a finite number, got nan"),
+        ({"algo": "pppo"}, "algo: should be 'ppo', 'a2c', 'sac', 'td3', 'ddpg', 'dqn', 'tqc', 'crossq' or "),
+        ({"algo_kwargs": {"learning_rate": 3}}, "algo_kwargs.learning_rate: 3 is not in (0, 1]"),
+        ({"algo_kwargs": {"learning_rate": math.nan}}, "algo_kwargs.learning_rate: nan is not in (0, 1]"),
+        ({"algo_kwargs": {"gamma": 99}}, "algo_kwargs.gamma: 99 is not in (0, 1]"),
+        ({"algo_kwargs": {"gamma": "0.99"}}, "algo_kwargs.gamma: expected a number, got '0.99'"),
+        ({"algo_kwargs": {"n_epochs": 0}}, "algo_kwargs.n_epochs: 0 is not in [1, inf]"),
+        ({"algo_kwargs": {"n_steps": 1.5}}, "algo_kwargs.n_steps: expected a whole number, got 1.5"),
+        ({"algo_kwargs": {"gamma": True}}, "algo_kwargs.gamma: expected a number, got True"),
+        ({"algo_kwargs": {"train_freq": 0}}, "algo_kwargs.train_freq: 0 is not in [1, inf]"),
+    ],
+)
+def test_what_cannot_be(values, message):
+    with pytest.raises(RecipeError) as caught:
+        validate(values, "recipe.yaml")
+    assert str(caught.value).startswith(f"recipe.yaml: {message}")
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"learning_rate": "lin_3e-4"},
+        {"ent_coef": "auto_0.1"},
+        {"n_steps": 1e3},
+        {"train_freq": [1, "episode"]},
+        {"gradient_steps": -1},
+        {"something_of_sb3": "checked against its signature later"},
+    ],
+)
+def test_what_can_be(kwargs):
+    assert validate({"algo_kwargs": kwargs}, "recipe").algo_kwargs == kwargs
+
+
+def test_numbers_of_the_command_line():
+    values = recipe.from_command_line(["n_envs=4", "seed=1"], seed=7, total_timesteps="1e6", algo=None)
+    assert values == {"n_envs": 4, "seed": 7, "total_timesteps": 1e6}
+    assert validate(values, "recipe").total_timesteps == 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["task.size"], "--set 'task.size': write key=value, for example --set task.tolerance=0.02"),
+        (["=3"], "--set '=3': write key=value, for example --set task.tolerance=0.02"),
+        (["task.a=1", "task.a.b=2"], "--set 'task.a.b=2': 'a' has been given a value already"),
+        (["task.a=[1"], "--set task.a:1: expected ',' or ']', but got '<stream end>'"),
+    ],
+)
+def test_settings_that_cannot_be_read(settings, message):
+    with pytest.raises(RecipeError) as caught:
+        parse_settings(settings)
+    assert str(caught.value) == message
+
+
+def test_settings_of_verbs_that_take_the_task_only():
+    assert task_settings(["task.tolerance=0.02", "task.name=[a, b]"]) == {"tolerance": 0.02, "name": ["a", "b"]}
+    with pytest.raises(RecipeError, match=r"^--set taks: only task\.\* can be set here\. Did you mean 'task'\?$"):
+        task_settings(["taks.tolerance=1"])
+    with pytest.raises(RecipeError, match=r"^--set task: write task\.key=value$"):
+        task_settings(["task=1"])
+
+
+def test_a_file_that_is_none(tmp_path, config):
+    with pytest.raises(ArtifactError, match=r"^no recipe file .*/missing.yaml$"):
+        resolve("a.py:A", tmp_path / "missing.yaml", {})
+    with pytest.raises(RecipeError, match=r"config.yaml: a recipe is a mapping of keys to values, this is a list$"):
+        resolve("a.py:A", config("- algo"), {})
+    assert resolve("a.py:A", config("# nothing\n"), {}).algo == "ppo"
+    (tmp_path / "config.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ArtifactError, match=r"config.yaml: cannot be read: "):
+        resolve("a.py:A", tmp_path / "config.yaml", {})

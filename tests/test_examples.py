@@ -1,0 +1,69 @@
+"""The examples work as their texts say."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def rlctl(*arguments: str, cwd: Path, path: Path | None = None) -> str:
+    """Run `rlctl` in `cwd`, with `path` as one more place that packages are installed in; return its stdout."""
+    return run("-m", "rlctl", *arguments, cwd=cwd, path=path)
+
+
+def run(*arguments: str, cwd: Path, path: Path | None = None) -> str:
+    env = {**os.environ, "PYTHONPATH": str(path)} if path else None
+    done = subprocess.run([sys.executable, *arguments], cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_bare_env_trains_by_path(tmp_path: Path) -> None:
+    small = ["--set", "algo_kwargs.n_steps=25", "--set", "algo_kwargs.batch_size=100", "--set", "eval.episodes=4"]
+    task = f"{EXAMPLES}/bare_env/pointmass.py:PointMass"
+    rlctl("train", task, "-n", "400", "--n-envs", "4", *small, cwd=tmp_path)
+    run_folder = tmp_path / "runs" / "latest"
+    # The recipe beside the file was found: its learning rate is not the default.
+    recipe = yaml.safe_load((run_folder / "recipe.yaml").read_text())
+    assert recipe["algo_kwargs"]["learning_rate"] == 1e-3
+    # is_success of a plain environment makes the success column.
+    with (run_folder / "evals.csv").open(newline="") as lines:
+        assert float(next(csv.DictReader(lines))["success"]) >= 0.0
+
+
+def test_ci_workflow_uses_options_that_exist() -> None:
+    workflow = yaml.safe_load((EXAMPLES / "ci" / "rlctl.yml").read_text())
+    commands = [step["run"].split() for step in workflow["jobs"]["learn"]["steps"] if "rlctl " in step.get("run", "")]
+    verbs = [command for command in commands if command[0] == "rlctl"]
+    assert {verb[1] for verb in verbs} == {"check-env", "train", "eval", "export", "replay"}
+    for verb in verbs:
+        page = run("-m", "rlctl", verb[1], "--help", cwd=EXAMPLES)
+        assert [word for word in verb if word.startswith("--") and word not in page] == []
+
+
+@pytest.mark.slow
+def test_my_task_as_a_wheel(tmp_path: Path) -> None:
+    project = EXAMPLES / "my_task"
+    run("-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path / "dist"), str(project), cwd=tmp_path)
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    site = tmp_path / "site"
+    run("-m", "pip", "install", "--quiet", "--no-deps", "--target", str(site), str(wheel), cwd=tmp_path)
+
+    listed = json.loads(rlctl("tasks", "--json", "-", cwd=tmp_path, path=site))
+    assert "my-task" in json.dumps(listed)
+
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    rlctl("train", "my-task", "-n", "4000", "--set", "eval.episodes=8", cwd=empty, path=site)
+    assert (empty / "runs" / "latest" / "policies" / "best.safetensors").is_file()
+
+    run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(project / "tests"), cwd=empty, path=site)
