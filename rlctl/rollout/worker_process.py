@@ -7,6 +7,7 @@ with the episodes that ended. Observations, actions, rewards and flags travel in
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import math
 import os
@@ -24,6 +25,7 @@ from rlctl import registry
 from rlctl.errors import RlctlError
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
 from rlctl.run.env_info import describe
+from rlctl.task.env import TaskEnv
 
 
 class _Episode:
@@ -76,6 +78,8 @@ class _Worker:
         space = envs[0].observation_space
         self.fields = observation_fields(space)
         self.space = space
+        # A task's environment has looked at its observation itself.
+        self.checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
         self.action_space = envs[0].action_space
         self.discrete = isinstance(self.action_space, spaces.Discrete)
         self.total = total
@@ -86,6 +90,9 @@ class _Worker:
         self.arrays = SharedArrays(self.descriptor, self.total, self.space, self.action_space, len(self.term_names))
 
     def store(self, place: dict[str, Any], episode: _Episode, observation: Any) -> None:
+        if self.checked:
+            place[SINGLE][episode.index] = observation
+            return
         parts = observation if isinstance(observation, dict) else {SINGLE: observation}
         if parts.keys() != place.keys():
             raise ValueError(f"observation has the keys {sorted(parts)}, the space has {sorted(place)}")
@@ -96,7 +103,12 @@ class _Worker:
             if value.shape != shape:
                 what = f"observation {key!r}" if key else "observation"
                 raise ValueError(f"{what} has shape {value.shape}, the space has {shape}")
-            if value.dtype.kind == "f" and not math.isfinite(value.sum()) and not np.isfinite(value).all():
+            # A sum is finite unless an element is not, or it overflows: the slow check then tells.
+            if (
+                value.dtype.kind == "f"
+                and not math.isfinite(np.add.reduce(value, None))
+                and not np.isfinite(value).all()
+            ):
                 bad = int(np.flatnonzero(~np.isfinite(value))[0])
                 raise ValueError(f"observation is not finite: element {bad} is {value.ravel()[bad]}")
             row[episode.index] = value
@@ -214,6 +226,7 @@ def _serve(job: dict[str, Any]) -> None:
     except BaseException as error:
         answer(error=_error(error))
         return
+    gc.freeze()  # what is there now stays; collections need not look at it again
     answer(info=worker.info.model_dump())
     while True:
         try:

@@ -3,8 +3,9 @@
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from rlctl.task import events, rewards
+from rlctl.task.body import Body
 from rlctl.task.events import Event
-from rlctl.task.sim import Body, Sim
+from rlctl.task.sim import Sim
 from rlctl.task.task import Task
 
 __all__ = [

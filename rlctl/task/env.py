@@ -200,7 +200,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise self._observation_differs(parts) from None
         if observation.shape != self.observation_space.shape:
             raise self._observation_differs(parts)
-        if not math.isfinite(observation.sum()):
+        if not math.isfinite(np.add.reduce(observation)):
             raise self._not_finite(parts)
         if self.task.observation_bounds:
             low, high = self.observation_space.low, self.observation_space.high  # type: ignore[attr-defined]

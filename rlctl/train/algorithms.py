@@ -65,7 +65,9 @@ def _check_device(device: str) -> None:
     except RuntimeError:
         raise UsageError(f"--device {device!r}: no such device; give cpu, cuda, cuda:1, or auto") from None
     if wanted.type == "cuda" and (wanted.index or 0) >= torch.cuda.device_count():
-        raise UsageError(f"--device {device}: torch sees {torch.cuda.device_count()} CUDA devices here; use cpu or auto")
+        raise UsageError(
+            f"--device {device}: torch sees {torch.cuda.device_count()} CUDA devices here; use cpu or auto"
+        )
 
 
 def _algorithm_kwargs(recipe: Recipe, cls: type[BaseAlgorithm], action_space: spaces.Space[Any]) -> dict[str, Any]:
@@ -106,7 +108,8 @@ def _linear(name: str, text: str) -> Callable[[float], float]:
         start = float(text.removeprefix("lin_"))
     except ValueError:
         raise RecipeError(f"algo_kwargs.{name}: {text!r} is not lin_ and a number, such as lin_3e-4") from None
-    return lambda remaining: remaining * start
+    # The last rollout may go past the end, and a negative rate would unlearn.
+    return lambda remaining: max(remaining, 0.0) * start
 
 
 def _policy_kwargs(recipe: Recipe, policy_class: Any) -> dict[str, Any]:
