@@ -326,7 +326,8 @@ def run(arguments: list[str]) -> int:
 def _flush() -> None:
     from rlctl import output
 
-    sys.stdout.flush()
+    if sys.stdout is not None:
+        sys.stdout.flush()
     if output.results.cache_info().currsize:
         output.results().flush()
 

@@ -13,7 +13,7 @@ for _entry in registry.installed():
     if _entry.problem is None:
         gymnasium.register(
             id=f"rlctl/{_entry.name}-v0",
-            entry_point="rlctl.registry:make",
+            entry_point="rlctl.env_spec:make",
             kwargs={"task": _entry.name},
             disable_env_checker=True,
         )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 if TYPE_CHECKING:
     from rich.console import Console
 
-_PIPED_WIDTH = 120
+_PIPED_WIDTH = 1000  # nothing folds: a line stays a line for grep
 
 
 @functools.cache
@@ -22,8 +22,11 @@ def results() -> TextIO:
     From then on file descriptor 1 points to stderr, so that what PyBullet, a plugin or a worker prints cannot
     mix with a result.
     """
-    sys.stdout.flush()
-    stream = os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace")
+    try:
+        sys.stdout.flush()
+        stream = os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace")
+    except (OSError, AttributeError):  # started without a stdout
+        raise BrokenPipeError from None
     os.dup2(2, 1)
     return stream
 

@@ -15,14 +15,14 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from rlctl.errors import RecipeError, TaskError, UsageError, did_you_mean
+from rlctl.errors import TaskError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    import gymnasium
+    pass
 
 GROUP = "rlctl.tasks"
 OURS = "rlctl"
@@ -109,65 +109,6 @@ def check_import(entry: TaskEntry, timeout_s: float = 60.0) -> str | None:
     if not told:
         return f"import ended the process with exit code {child.returncode}"
     return told[-1] or None
-
-
-@dataclasses.dataclass(frozen=True)
-class EnvSpec:
-    """Everything an environment is made from; plain data, so it travels to a worker as JSON."""
-
-    task: str
-    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    randomize: bool = False
-    events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    frame_stack: int = 1
-
-    def make(self, render_mode: Literal["human", "rgb_array"] | None = None) -> gymnasium.Env[Any, Any]:
-        """Build the environment; raises `UsageError` for what the user typed, `TaskError` for what it does."""
-        constructor = load(self.task)
-        if is_task(constructor):
-            env = self._make_task_env(constructor, render_mode)
-        else:
-            for key in ("reward_weights", "events"):
-                if getattr(self, key):
-                    raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
-            env = self._make_plain_env(constructor, render_mode)
-        if self.frame_stack > 1:
-            env = _stack_frames(env, self.frame_stack)
-        return env
-
-    def _make_task_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
-        from rlctl.task.env import TaskEnv
-        from rlctl.task.events import EventSettings
-
-        parameters = _task_parameters(constructor, self.parameters)
-        env: gymnasium.Env[Any, Any] = _guarded(
-            self.task,
-            lambda: TaskEnv(
-                constructor(**parameters),
-                render_mode=render_mode,
-                reward_weights=self.reward_weights,
-                events=EventSettings(self.randomize, self.events),
-            ),
-        )
-        return env
-
-    def _make_plain_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
-        parameters = dict(self.parameters)
-        _check_keywords(self.task, constructor, parameters)
-        if render_mode is not None:
-            parameters["render_mode"] = render_mode
-        env: gymnasium.Env[Any, Any] = _guarded(self.task, lambda: constructor(**parameters))
-        if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
-            raise TaskError(f"{self.task}: {type(env).__name__} is no Gymnasium environment (reset, step, spaces)")
-        return env
-
-
-def make(
-    task: str, *, render_mode: Literal["human", "rgb_array"] | None = None, **parameters: Any
-) -> gymnasium.Env[Any, Any]:
-    """Return the Gymnasium environment of a task; keywords are the task's parameters."""
-    return EnvSpec(task, parameters).make(render_mode)
 
 
 def load(task: str) -> Callable[..., Any]:
@@ -265,7 +206,7 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
 def _import_module(task: str, name: str) -> Any:
     if _module_file(name) is None and name not in sys.modules:
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
-    return _guarded(task, lambda: importlib.import_module(name), doing="import failed: ")
+    return guarded(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 
 def _import_file(task: str, file: Path) -> Any:
@@ -277,7 +218,7 @@ def _import_file(task: str, file: Path) -> Any:
             return known
     folder = str(file.parent)
     if folder not in sys.path:
-        sys.path.insert(0, folder)
+        sys.path.append(folder)  # last: a neighbour called torch.py must not be taken for torch
     name = file.stem
     while name in sys.modules or name in sys.stdlib_module_names:
         name = f"rlctl_task_{name}"
@@ -288,7 +229,7 @@ def _import_file(task: str, file: Path) -> Any:
     sys.modules[name] = module
     loader = spec.loader
     try:
-        _guarded(task, lambda: loader.exec_module(module), doing="import failed: ")
+        guarded(task, lambda: loader.exec_module(module), doing="import failed: ")
     except BaseException:
         sys.modules.pop(name, None)
         raise
@@ -311,7 +252,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
     return constructor
 
 
-def _guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:
+def guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:
     """Run a plugin's code; whatever it raises, `SystemExit` included, becomes a `TaskError`."""
     from rlctl.errors import RlctlError
 
@@ -328,70 +269,3 @@ def _guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:
         raise TaskError(
             f"task {task!r}: {doing}{type(error).__name__}: {error}{where}", details=traceback.format_exc()
         ) from error
-
-
-def _check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
-    if hasattr(constructor, "gymnasium_id"):
-        import gymnasium
-        from gymnasium.envs.registration import load_env_creator
-
-        spec = gymnasium.registry.get(constructor.gymnasium_id)
-        if not parameters or spec is None or spec.entry_point is None:
-            return
-        parameters = {key: value for key, value in parameters.items() if key != "max_episode_steps"}  # of Gymnasium
-        entry_point = spec.entry_point
-        constructor = entry_point if callable(entry_point) else load_env_creator(entry_point)
-    signature = inspect.signature(constructor)
-    if any(p.kind is p.VAR_KEYWORD for p in signature.parameters.values()):
-        return
-    for key in parameters:
-        if key not in signature.parameters:
-            raise _no_parameter(task, key, list(signature.parameters))
-
-
-def _no_parameter(task: str, key: str, known: list[str]) -> RecipeError:
-    return RecipeError(
-        f"task.{key}: {task} has no parameter {key!r}.{did_you_mean(key, known)} It has: {', '.join(known) or 'none'}."
-    )
-
-
-def _task_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Check the parameters of a `Task` against its fields: names and types."""
-    import typing
-
-    import pydantic
-
-    fields = task.parameters()
-    hints = _guarded(task.__name__, lambda: typing.get_type_hints(task)) if given else {}
-    checked = {}
-    for key, value in given.items():
-        if key not in fields:
-            raise _no_parameter(task.__name__, key, list(fields))
-        try:
-            checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
-        except pydantic.ValidationError as error:
-            told = error.errors()[0]["msg"].removeprefix("Input ")
-            raise RecipeError(f"task.{key}: {told}, got {value!r}") from None
-    return checked
-
-
-def _stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any, Any]:
-    """Observe the last `frames` observations, oldest first, along the last axis."""
-    import numpy as np
-    from gymnasium import spaces
-    from gymnasium.wrappers import FrameStackObservation, TransformObservation
-
-    space = env.observation_space
-    if not isinstance(space, spaces.Box) or len(space.shape) not in (1, 3):
-        raise RecipeError(f"frame_stack: only flat and image observations can be stacked, this task has {space}")
-    # Gymnasium stacks along a new first axis; networks want vectors and images of the same rank.
-    stacked = spaces.Box(
-        np.concatenate([space.low] * frames, axis=-1),
-        np.concatenate([space.high] * frames, axis=-1),
-        dtype=space.dtype.type,
-    )
-    wrapped = FrameStackObservation(env, frames)
-    flat: gymnasium.Env[Any, Any] = TransformObservation(
-        wrapped, lambda stack: np.concatenate(list(stack), axis=-1), stacked
-    )
-    return flat

@@ -104,10 +104,10 @@ def test_check_shows_what_raises_in_a_line_each(rlctl, importable):
 def test_a_broken_plugin_harms_only_itself(rlctl, importable, tmp_path):
     (importable / "some_robots" / "raises.yaml").unlink()
     code = (
-        "from rlctl import registry\n"
+        "from rlctl import env_spec, registry\n"
         "from rlctl.errors import RlctlError\n"
         "for name in ('raises', 'leaves', 'absent', 'good', 'reach'):\n"
-        "    try: print(name, type(registry.make(name).unwrapped).__name__)\n"
+        "    try: print(name, type(env_spec.make(name).unwrapped).__name__)\n"
         "    except RlctlError as error: print(name, type(error).__name__, str(error).splitlines()[0])\n"
     )
     result = subprocess.run(

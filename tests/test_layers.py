@@ -135,4 +135,4 @@ def test_what_must_start_at_once(code):
 def test_environments_come_without_learning_libraries():
     assert not loaded_after("import rlctl; rlctl.make('reach').close()") & TORCH
     assert not loaded_after("from rlctl.rollout import collect, workers, worker_process") & TORCH
-    assert not loaded_after("from rlctl.registry import EnvSpec; EnvSpec('Pendulum-v1').make()") & TORCH
+    assert not loaded_after("from rlctl.env_spec import EnvSpec; EnvSpec('Pendulum-v1').make()") & TORCH

@@ -9,8 +9,8 @@ import pytest
 
 import rlctl
 from rlctl import registry
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, TaskError, UsageError
-from rlctl.registry import EnvSpec
 
 ENV = """
     import gymnasium, numpy as np

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
 from typing import Any
 
-from rlctl import registry
+from rlctl import env_spec, registry
 from rlctl.check_env.library_checkers import library_checkers
 from rlctl.check_env.probe import instances, probe
 from rlctl.check_env.progress import Progress
@@ -35,7 +35,7 @@ def main() -> None:
     progress = Progress(int(sys.argv[2]))
     job = json.loads(sys.argv[3])
     threading.Thread(target=_end_with_parent, args=(connection,), daemon=True).start()
-    for header, arrays in run_part(job["part"], registry.EnvSpec(job["task"], job["parameters"]), progress):
+    for header, arrays in run_part(job["part"], env_spec.EnvSpec(job["task"], job["parameters"]), progress):
         connection.send_bytes(encode(header, arrays))
     connection.send_bytes(encode({"type": "done"}, {}))
 
@@ -47,7 +47,7 @@ def _end_with_parent(connection: Connection) -> None:
         os._exit(1)
 
 
-def run_part(part: str, spec: registry.EnvSpec, progress: Progress | None = None) -> Iterator[Message]:
+def run_part(part: str, spec: env_spec.EnvSpec, progress: Progress | None = None) -> Iterator[Message]:
     """Yield the messages of one part; an environment that cannot be built is one of them."""
     progress = progress or Progress()
     stage = "import"
@@ -75,7 +75,7 @@ def run_part(part: str, spec: registry.EnvSpec, progress: Progress | None = None
         yield {"type": "crashed", "traceback": traceback.format_exc(), "part": part}, {}
 
 
-def _load_error(spec: registry.EnvSpec, stage: str, error: RlctlError) -> dict[str, Any]:
+def _load_error(spec: env_spec.EnvSpec, stage: str, error: RlctlError) -> dict[str, Any]:
     missing = []
     if stage == "constructor":
         if isinstance(error.__cause__, TypeError):
@@ -92,7 +92,7 @@ def _load_error(spec: registry.EnvSpec, stage: str, error: RlctlError) -> dict[s
     }
 
 
-def _is_task(spec: registry.EnvSpec) -> bool:
+def _is_task(spec: env_spec.EnvSpec) -> bool:
     return inspect.isclass(loaded := registry.load(spec.task)) and registry.is_task(loaded)
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import output
-from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
-from rlctl.registry import EnvSpec
 from rlctl.rollout.collect import Episode, run_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
@@ -90,30 +90,16 @@ def run_evaluation(request: EvalRequest, gates: Gates) -> Evaluation:
 
         pin_threads()
     policy = load_policy(path)
-    spec = evaluation_spec(policy, request.task, request.task_parameters)
+    spec = policy.info.env_spec(request.task, request.task_parameters)
     n_envs = min(request.n_envs or _ENVS, request.episodes)
     with Workers(spec, n_envs, timeout_s=request.env_timeout_s) as workers:
-        check_fits(path, policy, workers)
+        policy.info.check_fits(workers.info, path)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
         episodes = _live(workers, policy, request)
     evaluation = _statistics(path, policy, spec, request, episodes)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
-
-
-def evaluation_spec(policy: Policy, task: str | None, parameters: Mapping[str, Any]) -> EnvSpec:
-    """Return the environment a policy was trained on, or that of another task, with parameters put over it."""
-    spec = policy.info.env_spec()
-    if task is not None and task != spec.task:
-        spec = EnvSpec(task, frame_stack=spec.frame_stack)
-    return dataclasses.replace(spec, parameters={**spec.parameters, **parameters})
-
-
-def check_fits(path: Path, policy: Policy, workers: Workers) -> None:
-    """Raise `ArtifactError` if the policy was made for other spaces than these environments have."""
-    if difference := policy.info.env.difference(workers.info):
-        raise ArtifactError(f"{path}: this policy is not for this task: {difference}")
 
 
 def _live(workers: Workers, policy: Policy, request: EvalRequest) -> list[Episode]:

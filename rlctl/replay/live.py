@@ -16,8 +16,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl import registry
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError
-from rlctl.registry import EnvSpec
 from rlctl.run.env_info import EnvInfo, describe
 from rlctl.run.episode import EpisodeInfo, Observations, RecordedEpisode
 from rlctl.run.policy import versions

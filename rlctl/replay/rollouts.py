@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rlctl.errors import ArtifactError
-from rlctl.registry import EnvSpec
+from rlctl.env_spec import EnvSpec
 from rlctl.replay.live import Choose, Env
 from rlctl.run.env_info import describe
 from rlctl.run.policy import Policy, load_policy
@@ -30,8 +29,7 @@ class Actor:
 
     def check_fits(self, env: Env) -> None:
         """Raise `ArtifactError` if the policy was made for other spaces than the environment has."""
-        if difference := self.policy.info.env.difference(describe(env)):
-            raise ArtifactError(f"{self.file}: this policy is not for this task: {difference}")
+        self.policy.info.check_fits(describe(env), self.file)
 
     def episode(self) -> Choose:
         """Begin an episode; returns what chooses its actions."""
@@ -46,7 +44,4 @@ def load_actor(file: Path, task: str | None, parameters: Mapping[str, Any]) -> A
 
         pin_threads()
     policy = load_policy(file)
-    spec = policy.info.env_spec()
-    if task is not None and task != spec.task:
-        spec = EnvSpec(task, frame_stack=spec.frame_stack)
-    return Actor(file, policy, dataclasses.replace(spec, parameters={**spec.parameters, **parameters}))
+    return Actor(file, policy, policy.info.env_spec(task, parameters))

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
+from rlctl.task.body import Body
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
-from rlctl.task.body import Body
 
 Array = NDArray[np.float64]
 _GROUND_SIZE = 8.0  # [m]; a body without joints that is wider both ways is the ground
@@ -84,7 +84,7 @@ class SceneObserver:
 
     def __call__(self, step: int) -> None:
         if step == 0:  # only now: a reset may load the bodies anew
-            self._bodies = [_BodyReader(body, self._env.sim.client) for body in self._env.sim.bodies.values()]
+            self._bodies = [_BodyReader(body) for body in self._env.sim.bodies.values()]
             self._markers = {name: [] for name in self._marker_positions()}
         for reader in self._bodies:
             reader.read()
@@ -109,9 +109,9 @@ class SceneObserver:
 
 
 class _BodyReader:
-    def __init__(self, body: Body, client: int) -> None:
+    def __init__(self, body: Body) -> None:
         self.body = body
-        self.client = client
+        self.client = body.client
         base, _ = pybullet.getBodyInfo(body.id, physicsClientId=self.client)
         self.links = [base.decode(), *body.link_names]
         inertial = pybullet.getDynamicsInfo(body.id, -1, physicsClientId=self.client)[_INERTIAL_POSE]

@@ -7,8 +7,8 @@ import dataclasses
 from collections.abc import Callable, Iterator
 
 from rlctl import registry
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError
-from rlctl.registry import EnvSpec
 from rlctl.replay.live import Choose, Env, Lived, live
 from rlctl.replay.pictures import Camera
 from rlctl.replay.scene import Scene, SceneObserver

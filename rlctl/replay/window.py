@@ -10,8 +10,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 
 from rlctl import registry
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
-from rlctl.registry import EnvSpec
 from rlctl.replay.live import Choose, Env, Lived, frame_time, live
 
 _INSTEAD = "leave out --gui to write a recording instead"

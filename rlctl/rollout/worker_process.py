@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rlctl import registry
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
 from rlctl.run.env_info import describe
@@ -69,7 +69,7 @@ class _Episode:
 
 
 class _Worker:
-    def __init__(self, descriptor: int, spec: registry.EnvSpec, first: int, count: int, total: int) -> None:
+    def __init__(self, descriptor: int, spec: EnvSpec, first: int, count: int, total: int) -> None:
         envs = [spec.make() for _ in range(count)]
         self.info = describe(envs[0])
         self.first = first
@@ -221,7 +221,7 @@ def _serve(job: dict[str, Any]) -> None:
         connection.send_bytes(json.dumps(content).encode())
 
     try:
-        spec = registry.EnvSpec(**job["spec"])
+        spec = EnvSpec(**job["spec"])
         worker = _Worker(int(sys.argv[2]), spec, job["first"], job["count"], job["total"])
     except BaseException as error:
         answer(error=_error(error))

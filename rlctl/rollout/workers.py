@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl import errors
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError, TaskError
-from rlctl.registry import EnvSpec
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
 from rlctl.run.env_info import EnvInfo
 
@@ -201,10 +201,14 @@ class Workers:
         pending = {self._connections[worker]: worker for worker in workers}
         answers: dict[int, Any] = {}
         deadline = time.monotonic() + timeout_s
+        progress = self._progress()
         while pending:
             ready = wait(list(pending), timeout=max(0.0, deadline - time.monotonic()))
             if not ready:
-                self._fail(self._hang(list(pending.values()), timeout_s, doing))
+                # A worker answers once for all its environments: only one that stands still for so long hangs.
+                if progress == (progress := self._progress()):
+                    self._fail(self._hang(list(pending.values()), timeout_s, doing))
+                deadline = time.monotonic() + timeout_s
             for connection in ready:
                 worker = pending.pop(connection)
                 try:
@@ -216,6 +220,10 @@ class Workers:
                     self._fail(self._raised(answer["error"]))
                 answers[worker] = answer
         return answers
+
+    def _progress(self) -> bytes:
+        """Return what changes whenever an environment begins or ends a call."""
+        return self._arrays.inside.tobytes() if self._ready else b""
 
     def _fail(self, error: RlctlError) -> Any:
         self.close(grace_s=0.0)
@@ -295,10 +303,13 @@ def _picked(arrays: dict[str, NDArray[Any]], rows: Any) -> Observations:
 
 
 def _forward(read_end: int, receive: Callable[[str], None]) -> None:
+    last = None
     with os.fdopen(read_end, encoding="utf-8", errors="replace") as lines:
         for line in lines:
-            if not line.startswith("pybullet build time"):
+            # Many environments say the same; once is enough.
+            if line != last and not line.startswith("pybullet build time"):
                 receive(line.rstrip("\n"))
+            last = line
 
 
 def _to_stderr(line: str) -> None:

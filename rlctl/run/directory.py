@@ -6,6 +6,7 @@ import datetime
 import fcntl
 import os
 import re
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -111,6 +112,14 @@ class RunDirectory:
             steps = ", ".join(str(int(each.name)) for each in self.checkpoints())
             raise ArtifactError(f"{self.path}: no checkpoint at step {which}; there are: {steps or 'none'}")
         return file
+
+    def remove_leftovers(self) -> None:
+        """Remove what a killed process left half-written; only for the holder of the lock."""
+        for place in [*self.path.glob(".*.part*"), *self.path.glob("*/.*.part*")]:
+            if place.is_dir():
+                shutil.rmtree(place)
+            else:
+                place.unlink()
 
     def lock(self) -> RunLock:
         """Claim the folder for writing until the lock is released or the process ends."""

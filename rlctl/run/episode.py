@@ -11,8 +11,8 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.registry import EnvSpec
 from rlctl.run import files
 
 FORMAT = 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import json
 import platform
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 import rlctl
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.registry import EnvSpec
 from rlctl.run import files
 from rlctl.run.env_info import EnvInfo
 
@@ -58,11 +59,17 @@ class PolicyInfo(pydantic.BaseModel):
     training_steps: int = 0
     versions: dict[str, str] = {}
 
-    def env_spec(self) -> EnvSpec:
-        """Return what this policy was trained on."""
-        return EnvSpec(
-            self.task, self.task_parameters, self.reward_weights, self.randomize, self.events, self.frame_stack
-        )
+    def env_spec(self, task: str | None = None, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
+        """Return what this policy was trained on, or another task, with parameters put over its own."""
+        if task is not None and task != self.task:
+            return EnvSpec(task, parameters or {}, frame_stack=self.frame_stack)
+        merged = {**self.task_parameters, **(parameters or {})}
+        return EnvSpec(self.task, merged, self.reward_weights, self.randomize, self.events, self.frame_stack)
+
+    def check_fits(self, env: EnvInfo, file: Path) -> None:
+        """Raise `ArtifactError` if the policy in `file` was made for other spaces than `env` has."""
+        if difference := self.env.difference(env):
+            raise ArtifactError(f"{file}: this policy is not for this task: {difference}")
 
 
 def versions() -> dict[str, str]:

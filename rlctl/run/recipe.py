@@ -15,6 +15,7 @@ import pydantic
 from pydantic import Field
 
 from rlctl import registry
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean
 from rlctl.run import yaml_text
 
@@ -76,9 +77,9 @@ class Recipe(_Section):
                 _RANGES[name].check(name, value)
         return values
 
-    def env_spec(self, task: str) -> registry.EnvSpec:
+    def env_spec(self, task: str) -> EnvSpec:
         """Return what the environments of this recipe are made from."""
-        return registry.EnvSpec(task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack)
+        return EnvSpec(task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack)
 
     def to_yaml(self) -> str:
         """Return the recipe as YAML that is itself valid for `--config`."""

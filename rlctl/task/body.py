@@ -24,7 +24,7 @@ class Body:
         self.id = body_id
         self.file = file
         self.fixed = fixed
-        self._client = client
+        self.client = client
         self._substeps = substeps
         self._motor_limits: tuple[Sequence[float], Sequence[float], float] | None = None
         self._cache: dict[Any, Any] = {}
@@ -60,7 +60,7 @@ class Body:
         state = self._cache.get("joints")
         if state is None:
             # None where a body has no joints.
-            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self._client) or ()
+            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client) or ()
             state = (np.array([joint[0] for joint in raw]), np.array([joint[1] for joint in raw]))
             self._cache["joints"] = state
         return state
@@ -79,7 +79,7 @@ class Body:
         state = self._cache.get(("link", link))  # a link may be called "base" or "joints"
         if state is None:
             raw = pybullet.getLinkState(
-                self.id, self._link_index(link), computeForwardKinematics=1, physicsClientId=self._client
+                self.id, self._link_index(link), computeForwardKinematics=1, physicsClientId=self.client
             )
             # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
             state = (np.array(raw[4]), np.array(raw[5]))
@@ -97,7 +97,7 @@ class Body:
     def _base_state(self) -> tuple[Array, Array]:
         state = self._cache.get("base")
         if state is None:
-            position, orientation = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self._client)
+            position, orientation = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
             state = (np.array(position), np.array(orientation))
             self._cache["base"] = state
         return state
@@ -114,7 +114,7 @@ class Body:
 
     def set_base(self, position: Sequence[float], orientation: Sequence[float] = (0, 0, 0, 1)) -> None:
         """Place the base at rest."""
-        pybullet.resetBasePositionAndOrientation(self.id, position, orientation, physicsClientId=self._client)
+        pybullet.resetBasePositionAndOrientation(self.id, position, orientation, physicsClientId=self.client)
         self._cache.clear()
 
     def set_joints(self, positions: Array, velocities: Array | None = None) -> None:
@@ -124,7 +124,7 @@ class Body:
             self.joint_indices,
             positions[:, None].tolist(),
             (np.zeros_like(positions) if velocities is None else velocities)[:, None].tolist(),
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         self._cache.clear()
 
@@ -146,7 +146,7 @@ class Body:
             targetPositions=positions.tolist(),  # half the time of an array
             forces=self._motor_impulses,
             positionGains=self._motor_gains,
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
 
     def _limit_motors(self, max_speed: Sequence[float], max_force: Sequence[float], gain: float) -> None:
@@ -156,13 +156,13 @@ class Body:
         # Only the call for one joint takes a speed; the motor keeps it when the call for all sets the targets.
         for index, speed in zip(self.joint_indices, max_speed, strict=True):
             pybullet.setJointMotorControl2(
-                self.id, index, pybullet.POSITION_CONTROL, maxVelocity=speed, physicsClientId=self._client
+                self.id, index, pybullet.POSITION_CONTROL, maxVelocity=speed, physicsClientId=self.client
             )
 
     @cached_property
     def _nominal(self) -> list[tuple[int, float, float, tuple[float, float, float]]]:
         links = range(-1, len(self._links))
-        infos = [pybullet.getDynamicsInfo(self.id, link, physicsClientId=self._client) for link in links]
+        infos = [pybullet.getDynamicsInfo(self.id, link, physicsClientId=self.client) for link in links]
         return [(link, info[0], info[1], info[2]) for link, info in zip(links, infos, strict=True)]
 
     def _save_nominal(self) -> None:
@@ -181,7 +181,7 @@ class Body:
                 mass=mass,
                 lateralFriction=friction,
                 localInertiaDiagonal=inertia,
-                physicsClientId=self._client,
+                physicsClientId=self.client,
             )
 
     def scale_mass(self, factor: float) -> None:
@@ -194,7 +194,7 @@ class Body:
                 link,
                 mass=mass * factor,
                 localInertiaDiagonal=[element * factor for element in inertia],
-                physicsClientId=self._client,
+                physicsClientId=self.client,
             )
 
     def set_friction(self, friction: float) -> None:
@@ -202,4 +202,4 @@ class Body:
         nominal = self._nominal
         self._changed = True
         for link, *_ in nominal:
-            pybullet.changeDynamics(self.id, link, lateralFriction=friction, physicsClientId=self._client)
+            pybullet.changeDynamics(self.id, link, lateralFriction=friction, physicsClientId=self.client)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from pathlib import Path
 
-from rlctl.registry import EnvSpec
+from rlctl.env_spec import EnvSpec
 from rlctl.rollout.collect import Episode
 from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo
@@ -22,7 +22,6 @@ class EpisodeKeeper:
         self.run = run
         self.spec = spec
         self.info = info
-        self._next = run.next_episode_number()
         self._latest: deque[RecordedEpisode] = deque(maxlen=_LATEST)
 
     def keep(self, episodes: list[Episode], steps: int) -> None:
@@ -40,8 +39,7 @@ class EpisodeKeeper:
         return [(self._write(episode), episode) for episode in list(self._latest)[-count:]] if count else []
 
     def _write(self, episode: RecordedEpisode) -> Path:
-        path = self.run.episode_file(self._next)
-        self._next += 1
+        path = self.run.episode_file(self.run.next_episode_number())
         save_episode(path, episode)
         return path
 

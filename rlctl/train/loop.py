@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, DivergedError, Interrupted
 from rlctl.eval.statistics import mean_return, mean_terms, success_rate
-from rlctl.registry import EnvSpec
 from rlctl.rollout.collect import Episode, run_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import EpisodeResult, Workers
@@ -52,7 +52,7 @@ class Progress:
 
     next_eval: int
     best_success: float | None = None
-    best_return: float = -math.inf
+    best_return: float | None = None
     best_step: int | None = None
     last_eval_step: int | None = None
     good_in_a_row: int = 0
@@ -260,7 +260,7 @@ class TrainingLoop(BaseCallback):
             return True
         if success is not None and best.best_success is not None and success != best.best_success:
             return success > best.best_success
-        return mean > best.best_return
+        return best.best_return is None or mean > best.best_return
 
     def save_checkpoint(self) -> bool:
         """Write a checkpoint of the present boundary; False, with a warning, if the disk does not take it."""

@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
-from rlctl.registry import EnvSpec
+from rlctl.env_spec import EnvSpec
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo, versions
 from rlctl.run.torch_policy import describe_network, policy_name

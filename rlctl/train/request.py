@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import registry
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import DivergedError, Interrupted, RecipeError, RlctlError, TaskError, UsageError
 from rlctl.rollout.workers import Workers
 from rlctl.run import directory, files
@@ -108,6 +109,7 @@ def _resumed(request: TrainRequest) -> _Start:
     recipe = run.recipe()
     recipe = validate({**recipe.model_dump(), **request.settings}, "recipe")
     lock = run.lock()  # before looking: a process that is training removes old checkpoints
+    run.remove_leftovers()
     folder, state = checkpoint.newest(run)
     return _Start(run.status()["task"], recipe, run, lock, folder, state)
 
@@ -129,13 +131,11 @@ def _nothing_to_do(start: _Start) -> TrainResult:
     )
 
 
-def _workers(spec: registry.EnvSpec, n_envs: int, request: TrainRequest, display: Display) -> Workers:
+def _workers(spec: EnvSpec, n_envs: int, request: TrainRequest, display: Display) -> Workers:
     return Workers(spec, n_envs, timeout_s=request.env_timeout_s, on_output=display.message)
 
 
-def _train(
-    request: TrainRequest, start: _Start, spec: registry.EnvSpec, workers: Workers, display: Display
-) -> TrainResult:
+def _train(request: TrainRequest, start: _Start, spec: EnvSpec, workers: Workers, display: Display) -> TrainResult:
     from rlctl.run.torch_policy import pin_threads
     from rlctl.train import checkpoint
     from rlctl.train.algorithms import build_model

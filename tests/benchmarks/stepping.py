@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import rlctl
-from rlctl.registry import EnvSpec
+from rlctl.env_spec import EnvSpec
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.task.bullet import pybullet, pybullet_data
 from tests.benchmarks.row import Row, side_by_side

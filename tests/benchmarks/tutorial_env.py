@@ -17,8 +17,6 @@ from rlctl.task.bullet import pybullet as p
 from rlctl.task.bullet import pybullet_data
 from rlctl_manipulation import reach
 
-HOME_NOISE = 0.1  # [rad]
-GAIN = 0.25  # of the position controller
 JOINTS, HAND = 7, 6  # number of joints; index of the hand's link
 
 
@@ -42,7 +40,7 @@ class TutorialReach(gymnasium.Env[np.ndarray, np.ndarray]):
         p.setPhysicsEngineParameter(numSolverIterations=iterations, physicsClientId=self.client)
         p.loadURDF("plane.urdf", physicsClientId=self.client)
         self.arm = p.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True, physicsClientId=self.client)
-        start = reach.HOME + self.np_random.uniform(-HOME_NOISE, HOME_NOISE, JOINTS)
+        start = reach.HOME + self.np_random.uniform(-reach.HOME_NOISE, reach.HOME_NOISE, JOINTS)
         for joint in range(JOINTS):
             p.resetJointState(self.arm, joint, start[joint], physicsClientId=self.client)
         self.goal = self.np_random.uniform(reach.GOAL_LOW, reach.GOAL_HIGH)
@@ -63,7 +61,7 @@ class TutorialReach(gymnasium.Env[np.ndarray, np.ndarray]):
                 targetPosition=np.clip(target, info[8], info[9]),
                 force=info[10],
                 maxVelocity=reach.MAX_SPEED[joint],
-                positionGain=GAIN,
+                positionGain=reach.GAIN,
                 physicsClientId=self.client,
             )
         for _ in range(self.task.substeps):
@@ -87,7 +85,8 @@ class TutorialReach(gymnasium.Env[np.ndarray, np.ndarray]):
     def _observation(self) -> np.ndarray:
         states = [p.getJointState(self.arm, joint, physicsClientId=self.client) for joint in range(JOINTS)]
         positions, velocities = [state[0] for state in states], [state[1] for state in states]
-        return np.concatenate([positions, velocities, self._hand(), self.goal]).astype(np.float32)
+        hand = self._hand()
+        return np.concatenate([positions, velocities, hand, self.goal - hand]).astype(np.float32)
 
     def close(self) -> None:
         p.disconnect(self.client)

@@ -13,7 +13,7 @@ from rlctl.check_env.child_process import run_part
 from rlctl.check_env.evidence import Evidence
 from rlctl.check_env.judge import judge
 from rlctl.check_env.rules import RULES
-from rlctl.registry import EnvSpec
+from rlctl.env_spec import EnvSpec
 
 BROKEN = Path(__file__).parent / "broken_envs.py"
 PARTS = ("probe", "instances", "checkers")

@@ -9,12 +9,12 @@ import numpy as np
 import onnx
 import pytest
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.export.agreement import Comparison
 from rlctl.export.export import export_onnx
 from rlctl.export.report import show
 from rlctl.export.verify import compare_episodes, verify
-from rlctl.registry import EnvSpec
 from rlctl.rollout.collect import Episode
 from rlctl.rollout.workers import EpisodeResult, Workers
 from rlctl.run.onnx_policy import OnnxPolicy

@@ -186,7 +186,7 @@ def test_unscaling_of_a_squashed_action_in_numbers(small, train, write):
 
 
 def test_file_says_what_it_is(train, tmp_path):
-    from rlctl.registry import EnvSpec
+    from rlctl.env_spec import EnvSpec
     from rlctl.train.pack import pack
 
     spec = EnvSpec("reach", {"tolerance": 0.02})

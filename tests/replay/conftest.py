@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rlctl.registry import EnvSpec
+from rlctl.env_spec import EnvSpec
 from rlctl.replay.watching import Watched, watch, watched_env
 from rlctl.run.episode import save_episode
 from rlctl.task.bullet import pybullet

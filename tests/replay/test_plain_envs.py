@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.registry import EnvSpec
 from rlctl.replay.rrd import write_rrd
 from rlctl.replay.watching import watch, watched_env
 from tests.replay.conftest import ENVS, lived

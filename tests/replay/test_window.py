@@ -1,6 +1,6 @@
 import time
 
-from rlctl.registry import EnvSpec
+from rlctl.env_spec import EnvSpec
 from rlctl.replay.window import show_episodes
 from rlctl.task.bullet import pybullet
 

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from rlctl.registry import EnvSpec
+from rlctl.env_spec import EnvSpec
 from rlctl.rollout.workers import Workers
 
 ENVS = Path(__file__).with_name("envs.py")

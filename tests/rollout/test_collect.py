@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rlctl.registry import EnvSpec
+from rlctl.env_spec import EnvSpec
 from rlctl.rollout.collect import run_episodes
 
 pytestmark = pytest.mark.usefixtures("no_child_left")

@@ -8,8 +8,8 @@ import numpy as np
 import psutil
 import pytest
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError
-from rlctl.registry import EnvSpec
 from rlctl.rollout.workers import Workers
 
 pytestmark = pytest.mark.usefixtures("no_child_left")

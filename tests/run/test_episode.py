@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.registry import EnvSpec
 from rlctl.run import files
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 

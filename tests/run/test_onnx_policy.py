@@ -10,9 +10,9 @@ import pytest
 from onnx import TensorProto, helper
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.export.actor import build
-from rlctl.registry import EnvSpec
 from rlctl.run.env_info import describe
 from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import ROWS, BatchActor, load_policy

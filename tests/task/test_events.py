@@ -33,7 +33,7 @@ def friction(env):
 
 
 def dynamics(body):
-    return pybullet.getDynamicsInfo(body.id, -1, physicsClientId=body.sim.client)
+    return pybullet.getDynamicsInfo(body.id, -1, physicsClientId=body.client)
 
 
 def test_events_rest_unless_asked_for(make):

@@ -1,0 +1,144 @@
+"""What an environment is made from, and making it."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal
+
+from rlctl.errors import RecipeError, TaskError, did_you_mean
+from rlctl.registry import guarded, is_task, load
+
+if TYPE_CHECKING:
+    import gymnasium
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvSpec:
+    """Everything an environment is made from; plain data, so it travels to a worker as JSON."""
+
+    task: str
+    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    randomize: bool = False
+    events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    frame_stack: int = 1
+
+    def make(self, render_mode: Literal["human", "rgb_array"] | None = None) -> gymnasium.Env[Any, Any]:
+        """Build the environment; raises `UsageError` for what the user typed, `TaskError` for what it does."""
+        constructor = load(self.task)
+        if is_task(constructor):
+            env = self._make_task_env(constructor, render_mode)
+        else:
+            for key in ("reward_weights", "events"):
+                if getattr(self, key):
+                    raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
+            env = self._make_plain_env(constructor, render_mode)
+        if self.frame_stack > 1:
+            try:
+                return _stack_frames(env, self.frame_stack)
+            except RecipeError:
+                env.close()
+                raise
+        return env
+
+    def _make_task_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
+        from rlctl.task.env import TaskEnv
+        from rlctl.task.events import EventSettings
+
+        parameters = _task_parameters(constructor, self.parameters)
+        env: gymnasium.Env[Any, Any] = guarded(
+            self.task,
+            lambda: TaskEnv(
+                constructor(**parameters),
+                render_mode=render_mode,
+                reward_weights=self.reward_weights,
+                events=EventSettings(self.randomize, self.events),
+            ),
+        )
+        return env
+
+    def _make_plain_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
+        parameters = dict(self.parameters)
+        _check_keywords(self.task, constructor, parameters)
+        if render_mode is not None:
+            parameters["render_mode"] = render_mode
+        env: gymnasium.Env[Any, Any] = guarded(self.task, lambda: constructor(**parameters))
+        if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
+            raise TaskError(f"{self.task}: {type(env).__name__} is no Gymnasium environment (reset, step, spaces)")
+        return env
+
+
+def make(
+    task: str, *, render_mode: Literal["human", "rgb_array"] | None = None, **parameters: Any
+) -> gymnasium.Env[Any, Any]:
+    """Return the Gymnasium environment of a task; keywords are the task's parameters."""
+    return EnvSpec(task, parameters).make(render_mode)
+
+
+def _check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
+    if hasattr(constructor, "gymnasium_id"):
+        import gymnasium
+        from gymnasium.envs.registration import load_env_creator
+
+        spec = gymnasium.registry.get(constructor.gymnasium_id)
+        if not parameters or spec is None or spec.entry_point is None:
+            return
+        parameters = {key: value for key, value in parameters.items() if key != "max_episode_steps"}  # of Gymnasium
+        entry_point = spec.entry_point
+        constructor = entry_point if callable(entry_point) else load_env_creator(entry_point)
+    signature = inspect.signature(constructor)
+    if any(p.kind is p.VAR_KEYWORD for p in signature.parameters.values()):
+        return
+    for key in parameters:
+        if key not in signature.parameters:
+            raise _no_parameter(task, key, list(signature.parameters))
+
+
+def _no_parameter(task: str, key: str, known: list[str]) -> RecipeError:
+    return RecipeError(
+        f"task.{key}: {task} has no parameter {key!r}.{did_you_mean(key, known)} It has: {', '.join(known) or 'none'}."
+    )
+
+
+def _task_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Check the parameters of a `Task` against its fields: names and types."""
+    import typing
+
+    import pydantic
+
+    fields = task.parameters()
+    hints = guarded(task.__name__, lambda: typing.get_type_hints(task)) if given else {}
+    checked = {}
+    for key, value in given.items():
+        if key not in fields:
+            raise _no_parameter(task.__name__, key, list(fields))
+        try:
+            checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
+        except pydantic.ValidationError as error:
+            told = error.errors()[0]["msg"].removeprefix("Input ")
+            raise RecipeError(f"task.{key}: {told}, got {value!r}") from None
+    return checked
+
+
+def _stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any, Any]:
+    """Observe the last `frames` observations, oldest first, along the last axis."""
+    import numpy as np
+    from gymnasium import spaces
+    from gymnasium.wrappers import FrameStackObservation, TransformObservation
+
+    space = env.observation_space
+    if not isinstance(space, spaces.Box) or len(space.shape) not in (1, 3):
+        raise RecipeError(f"frame_stack: only flat and image observations can be stacked, this task has {space}")
+    # Gymnasium stacks along a new first axis; networks want vectors and images of the same rank.
+    stacked = spaces.Box(
+        np.concatenate([space.low] * frames, axis=-1),
+        np.concatenate([space.high] * frames, axis=-1),
+        dtype=space.dtype.type,
+    )
+    wrapped = FrameStackObservation(env, frames)
+    flat: gymnasium.Env[Any, Any] = TransformObservation(
+        wrapped, lambda stack: np.concatenate(list(stack), axis=-1), stacked
+    )
+    return flat
