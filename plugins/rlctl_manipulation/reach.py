@@ -7,7 +7,8 @@ import numpy as np
 from rlctl.task import Box, Sim, Task, rewards
 
 HOME = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])  # [rad], elbow bent
-MAX_SPEED = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
+SPEED_LIMIT = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
+MAX_SPEED = 0.9 * SPEED_LIMIT  # of the motors: moving joints push each other a little beyond it
 GOAL_LOW, GOAL_HIGH = (0.45, -0.3, 0.2), (0.7, 0.3, 0.6)  # [m], world frame, in front of the arm
 GAIN = 0.5  # part of the position error that the motors take away in a physics step
 HOME_NOISE = 0.1  # [rad]

@@ -93,7 +93,7 @@ def test_the_arm_keeps_its_speed_limits():
                 break  # a blow may turn a joint faster than its motor does
             fastest = np.maximum(fastest, np.abs(env.task.arm.joint_velocities))
     env.close()
-    assert (fastest <= 1.05 * reach.MAX_SPEED).all(), fastest / reach.MAX_SPEED
+    assert (fastest <= reach.SPEED_LIMIT).all(), fastest / reach.SPEED_LIMIT
     assert (fastest > 0.5 * reach.MAX_SPEED).any()  # the actions did ask for it
 
 
