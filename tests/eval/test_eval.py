@@ -148,3 +148,23 @@ def test_a_run_without_a_best_policy(reach_run, tmp_path):
     done = rlctl("eval", "reach", cwd=tmp_path)
     assert done.returncode == 5
     assert "no best policy yet; train longer, or use --checkpoint last" in done.stderr
+
+
+def test_an_exported_policy_is_evaluated_alike_and_without_torch(reach_run, evaluation, tmp_path):
+    from rlctl.export.export import export_onnx
+
+    exported = tmp_path / "policy.onnx"
+    export_onnx(str(reach_run.path), checkpoint="best", output=exported)
+    code = (
+        "import sys; from rlctl.cli import run\n"
+        f"code = run(['eval', {str(exported)!r}, '--task', 'reach', '--episodes', '6', '--json', 'result.json'])\n"
+        "sys.exit(99 if {'torch', 'stable_baselines3', 'onnx'} & set(sys.modules) else code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    alike = json.loads((tmp_path / "result.json").read_text())["episodes"]
+    for ours, theirs in zip(alike, as_json(evaluation)["episodes"], strict=True):
+        assert [ours[key] for key in ("seed", "success", "length")] == [
+            theirs[key] for key in ("seed", "success", "length")
+        ]
+        assert ours["return"] == pytest.approx(theirs["return"], rel=1e-3)
