@@ -23,7 +23,7 @@ class Reach(Task):
 
     robot = "KUKA LBR iiwa"
     control_dt, substeps, episode_s = 4 / 240, 4, 2.0  # [s], -, [s]
-    solver_iterations = 20  # the hand is within a few mm of where 500 would bring it, and a step takes a third less
+    solver_iterations = 10  # after 2 s without feedback the hand is within 13 mm of where 500 would bring it
     action_space = Box(-1.0, 1.0, (7,), np.float32)
     action_meaning = "joint steps; 1 is the joint's top speed for one control step"
     observation_units = {"joint_positions": "rad", "joint_velocities": "rad/s", "hand": "m", "hand_to_goal": "m"}
@@ -58,7 +58,7 @@ class Reach(Task):
         distance = self.distance()
         return {
             "distance": distance,
-            "reached": float(distance < self.tolerance),
+            "reached": rewards.closeness(distance, self.tolerance),
             "action": rewards.squared(action),
             "smoothness": rewards.squared(self.action_change),
         }

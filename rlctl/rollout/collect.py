@@ -63,6 +63,7 @@ def run_episodes(
     """
     arrays = workers.arrays
     arrays.next_seed[:] = -1
+    arrays.record[:] = record
     workers.reset(dict.fromkeys(range(workers.n_envs), -1))
     waiting = list(enumerate(seeds))[::-1]
     running: dict[int, int] = {}

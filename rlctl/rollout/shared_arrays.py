@@ -54,6 +54,7 @@ class SharedArrays:
             "next_seed": ((), np.dtype(np.int64)),
             "inside": ((2,), np.dtype(np.int64)),
             "terms": ((terms,), np.dtype(np.float64)),
+            "record": ((), np.dtype(np.bool_)),
         }
         for key, field in observation.items():
             layout[f"observation/{key}"] = field
@@ -80,7 +81,8 @@ class SharedArrays:
         """Episode seed and step of the call an environment is in, shape (n_envs, 2): to name it when its worker dies
         or hangs. Step 0 is the reset; a negative step: in no call."""
         self.terms = arrays["terms"]
-        """Raw reward terms of the last step, shape (n_envs, terms)."""
+        """Raw reward terms of the last step, shape (n_envs, terms), where `record` is set."""
+        self.record = arrays["record"]
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}
         self.final = {key: arrays[f"final/{key}"] for key in observation}
         """The observation an episode ended with, where one ended in the last step."""

@@ -148,7 +148,7 @@ class _Worker:
         arrays.reward[index] = reward
         arrays.terminated[index] = terminated
         arrays.truncated[index] = truncated
-        if self.term_names:
+        if arrays.record[index]:
             arrays.terms[index] = list(info["metrics"].values())
         if not (terminated or truncated):
             self.store(arrays.observation, episode, observation)

@@ -133,7 +133,20 @@ def build_network(info: PolicyInfo) -> BasePolicy:
     kwargs = dict(info.policy_kwargs)
     if "activation_fn" in kwargs:
         kwargs["activation_fn"] = activation(kwargs["activation_fn"])
-    return cls(network_space(observation_space), action_space, lr_schedule=lambda _: 0.0, **kwargs)
+    return cls(
+        network_space(observation_space),
+        action_space,
+        lr_schedule=lambda _: 0.0,
+        optimizer_class=_NoOptimizer,
+        **kwargs,
+    )
+
+
+class _NoOptimizer:
+    """Stands where SB3 puts an optimiser: a policy that is run needs none, and torch's imports its compiler (0.8 s)."""
+
+    def __init__(self, parameters: Any, **settings: Any) -> None:
+        del parameters, settings
 
 
 class Normalizer:

@@ -75,7 +75,7 @@ class TrainingLoop(BaseCallback):
         run: RunDirectory,
         recipe: Recipe,
         env: WorkerVecEnv,
-        make_eval_workers: Callable[[], Workers],
+        eval_workers: Workers,
         progress: Progress,
         display: Display,
         spec: EnvSpec,
@@ -89,8 +89,7 @@ class TrainingLoop(BaseCallback):
         self.spec = spec
         self.stop_signal: int | None = None
         self.episodes = EpisodeKeeper(run, spec, env.workers.info)
-        self._make_eval_workers = make_eval_workers
-        self._eval_workers: Workers | None = None
+        self._eval_workers = eval_workers
         self._started = time.monotonic() - progress.seconds
         self._last_row = (time.monotonic(), 0)
         self._next_row = 0
@@ -208,8 +207,6 @@ class TrainingLoop(BaseCallback):
     def evaluate(self) -> None:
         """Live the evaluation episodes, keep the best policy, and write the row and the episodes."""
         steps, began = self.model.num_timesteps, time.monotonic()
-        if self._eval_workers is None:
-            self._eval_workers = self._make_eval_workers()
         packed = pack(self.model, self.recipe.algo, self.spec, self.env.workers.info)
         episodes = self._live_episodes(*packed)
         results = [episode.result for episode in episodes]
@@ -244,7 +241,6 @@ class TrainingLoop(BaseCallback):
         self._last_row = (self._last_row[0] + time.monotonic() - began, steps)
 
     def _live_episodes(self, info: PolicyInfo, tensors: dict[str, Any]) -> list[Episode]:
-        assert self._eval_workers is not None
         was_training = self.model.policy.training
         policy = TorchPolicy(info, self.model.policy, Normalizer(info, tensors))
         count = self.recipe.eval.episodes
@@ -288,11 +284,6 @@ class TrainingLoop(BaseCallback):
             self.display.message(f"warning: not saved: {self._unsaved}; training goes on")
             return False
         return True
-
-    def close(self) -> None:
-        """End the evaluation workers."""
-        if self._eval_workers is not None:
-            self._eval_workers.close()
 
 
 def _append_row(path: Path, row: dict[str, Any]) -> None:

@@ -161,10 +161,9 @@ def _train(request: TrainRequest, start: _Start, spec: EnvSpec, workers: Workers
     _write_start(run, start, request)
     model.set_logger(make_logger(run.tensorboard, display.message))
 
-    def make_eval_workers() -> Workers:
-        return _workers(spec, min(recipe.eval.episodes, _EVAL_ENVS), request, display)
-
-    loop = TrainingLoop(run, recipe, env, make_eval_workers, progress, display, spec)
+    # They build their environments beside the first updates, which leave a core idle.
+    eval_workers = _workers(spec, min(recipe.eval.episodes, _EVAL_ENVS), request, display)
+    loop = TrainingLoop(run, recipe, env, eval_workers, progress, display, spec)
     try:
         with _signals(loop, display), writer_errors(display.message):
             _learn(model, loop, recipe)
@@ -174,7 +173,7 @@ def _train(request: TrainRequest, start: _Start, spec: EnvSpec, workers: Workers
             run.write_status({"status": _STATUS.get(type(error), "failed"), "error": str(error), "ended": _now()})
         raise
     finally:
-        loop.close()
+        eval_workers.close()
         lock.release()
     _write_end(run, model.num_timesteps, loop)
     return _result(run, start, model.num_timesteps, progress, recordings)

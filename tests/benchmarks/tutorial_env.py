@@ -71,7 +71,7 @@ class TutorialReach(gymnasium.Env[np.ndarray, np.ndarray]):
         change, self.last_action = action - self.last_action, action
         terms = {
             "distance": distance,
-            "reached": float(distance < self.task.tolerance),
+            "reached": float(np.exp(-((distance / self.task.tolerance) ** 2))),
             "action": float(np.mean(action**2)),
             "smoothness": float(np.mean(change**2)),
         }
