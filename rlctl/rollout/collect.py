@@ -63,7 +63,7 @@ def run_episodes(
     """
     arrays = workers.arrays
     arrays.next_seed[:] = -1
-    arrays.record[:] = record
+    arrays.record[:] = record and bool(workers.info.reward_weights)  # a plain environment has no terms
     workers.reset(dict.fromkeys(range(workers.n_envs), -1))
     waiting = list(enumerate(seeds))[::-1]
     running: dict[int, int] = {}
