@@ -71,6 +71,7 @@ def check_env(
     json: Json = None,
 ) -> None:
     """Find what is wrong with an environment before hours of training do."""
+    _claim_stdout()
     from rlctl.check_env.check import check
     from rlctl.check_env.report import show
 
@@ -125,6 +126,7 @@ def train(
     json: Json = None,
 ) -> None:
     """Train a policy, evaluate as it goes, and keep the best and the last."""
+    _claim_stdout()
     from rlctl.run.recipe import from_command_line
     from rlctl.train.request import TrainRequest, run_training
     from rlctl.train.summary import show
@@ -175,6 +177,7 @@ def evaluate(
     json: Json = None,
 ) -> None:
     """Say how good a policy is: success rate with its interval, returns, reward terms."""
+    _claim_stdout()
     from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
     from rlctl.eval.report import show
 
@@ -211,6 +214,7 @@ def export(
     json: Json = None,
 ) -> None:
     """Turn a policy into a self-contained ONNX file, and verify that it acts the same."""
+    _claim_stdout()
     if not onnx:
         raise UsageError("say what to export to: rlctl export --onnx")
     from rlctl.export.export import export_onnx
@@ -257,6 +261,7 @@ def replay(
     json: Json = None,
 ) -> None:
     """Show what a policy does: rollouts as Rerun recordings, without a display."""
+    _claim_stdout()
     from rlctl.replay.replay import ReplayRequest, run_replay
     from rlctl.replay.report import show
 
@@ -286,6 +291,13 @@ def tasks(
     from rlctl.task_list import list_tasks, show
 
     show(list_tasks(check=check), json)
+
+
+def _claim_stdout() -> None:
+    """Keep stdout for the result: what a plugin prints from now on goes to stderr."""
+    from rlctl import output
+
+    output.results()
 
 
 def _task_settings(settings: list[str]) -> dict[str, Any]:

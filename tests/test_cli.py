@@ -213,7 +213,7 @@ def test_ctrl_c(tmp_path, write_module):
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert process.stdout.readline() == "importing\n"
+    assert process.stderr.readline() == "importing\n"
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=20)
     assert process.returncode == 130

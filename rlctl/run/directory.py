@@ -141,7 +141,10 @@ class RunLock:
         os.pwrite(self._descriptor, f"pid {os.getpid()} on {os.uname().nodename}".encode(), 0)
 
     def release(self) -> None:
-        os.close(self._descriptor)
+        """Let go of the folder; a second call does nothing."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+        self._descriptor = -1
 
 
 def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:

@@ -159,6 +159,10 @@ class Body:
                 self.id, index, pybullet.POSITION_CONTROL, maxVelocity=speed, physicsClientId=self.client
             )
 
+    def cap_joint_speed(self, speed: float) -> None:
+        """Never let a joint, whatever pushes it, turn or slide faster than `speed` [rad/s or m/s]."""
+        pybullet.changeDynamics(self.id, -1, maxJointVelocity=speed, physicsClientId=self.client)
+
     @cached_property
     def _nominal(self) -> list[tuple[int, float, float, tuple[float, float, float]]]:
         links = range(-1, len(self._links))

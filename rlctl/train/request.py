@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import DivergedError, Interrupted, RecipeError, RlctlError, TaskError, UsageError
+from rlctl.errors import DivergedError, Interrupted, RecipeError, TaskError, UsageError
 from rlctl.rollout.workers import Workers
 from rlctl.run import directory, files
 from rlctl.run.directory import RunDirectory, RunLock
@@ -78,6 +78,14 @@ def run_training(request: TrainRequest) -> TrainResult:
     if (request.task is None) == (request.resume is None):
         raise UsageError("give a task to train, or --resume RUN to go on with a run; one of the two")
     start = _new(request) if request.task is not None else _resumed(request)
+    try:
+        return _run(request, start)
+    finally:
+        if start.lock is not None:
+            start.lock.release()
+
+
+def _run(request: TrainRequest, start: _Start) -> TrainResult:
     if start.state and start.state["counters"]["num_timesteps"] >= start.recipe.total_timesteps:
         return _nothing_to_do(start)
     spec = start.recipe.env_spec(start.task)
@@ -109,8 +117,12 @@ def _resumed(request: TrainRequest) -> _Start:
     recipe = run.recipe()
     recipe = validate({**recipe.model_dump(), **request.settings}, "recipe")
     lock = run.lock()  # before looking: a process that is training removes old checkpoints
-    run.remove_leftovers()
-    folder, state = checkpoint.newest(run)
+    try:
+        run.remove_leftovers()
+        folder, state = checkpoint.newest(run)
+    except BaseException:
+        lock.release()
+        raise
     return _Start(run.status()["task"], recipe, run, lock, folder, state)
 
 
@@ -168,9 +180,11 @@ def _train(request: TrainRequest, start: _Start, spec: EnvSpec, workers: Workers
         with _signals(loop, display), writer_errors(display.message):
             _learn(model, loop, recipe)
         recordings = _record(loop, request.record)
-    except RlctlError as error:
+    except BaseException as error:
         with contextlib.suppress(OSError):  # a full disk must not hide the error itself
-            run.write_status({"status": _STATUS.get(type(error), "failed"), "error": str(error), "ended": _now()})
+            run.write_status(
+                {"status": _STATUS.get(type(error), "failed"), "error": str(error) or repr(error), "ended": _now()}
+            )
         raise
     finally:
         eval_workers.close()
@@ -179,7 +193,7 @@ def _train(request: TrainRequest, start: _Start, spec: EnvSpec, workers: Workers
     return _result(run, start, model.num_timesteps, progress, recordings)
 
 
-_STATUS: dict[type[RlctlError], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
+_STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
 
 
 def _may_succeed(workers: Workers) -> bool:

@@ -41,6 +41,7 @@ class TutorialReach(gymnasium.Env[np.ndarray, np.ndarray]):
         p.loadURDF("plane.urdf", physicsClientId=self.client)
         self.arm = p.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True, physicsClientId=self.client)
         start = reach.HOME + self.np_random.uniform(-reach.HOME_NOISE, reach.HOME_NOISE, JOINTS)
+        p.changeDynamics(self.arm, -1, maxJointVelocity=reach.SPEED_LIMIT.max(), physicsClientId=self.client)
         for joint in range(JOINTS):
             p.resetJointState(self.arm, joint, start[joint], physicsClientId=self.client)
         self.goal = self.np_random.uniform(reach.GOAL_LOW, reach.GOAL_HIGH)
@@ -53,7 +54,7 @@ class TutorialReach(gymnasium.Env[np.ndarray, np.ndarray]):
         for joint in range(JOINTS):
             info = p.getJointInfo(self.arm, joint, physicsClientId=self.client)
             position = p.getJointState(self.arm, joint, physicsClientId=self.client)[0]
-            target = position + reach.MAX_SPEED[joint] * self.task.control_dt * action[joint]
+            target = position + reach.JOINT_STEP[joint] * action[joint]
             p.setJointMotorControl2(
                 self.arm,
                 joint,

@@ -102,6 +102,7 @@ def test_terms_of_a_task(spec, start):
     workers.reset({0: 1})
     begin = float(workers.observations()[0, 0])
     workers.arrays.action[:] = 0.25
+    workers.arrays.record[:] = True
     results = [result for _ in range(4) for result in workers.step()]
     # In the order of the weights, though the task gives them in another.
     assert list(workers.info.reward_weights) == ["count", "fixed"]

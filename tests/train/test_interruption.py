@@ -136,3 +136,24 @@ def test_stdout_closed_early_is_silent(tmp_path):
     assert process.wait(timeout=60) == 141
     assert "Traceback" not in stderr
     assert "error" not in stderr
+
+
+def test_what_a_plugin_prints_stays_out_of_the_result(tmp_path):
+    (tmp_path / "chatty.py").write_text(
+        f"import sys; sys.path.append({str(ENVS.parent)!r}); print('hello from the import')\n"
+        "from envs import Line\n"
+        "class Chatty(Line):\n"
+        "    def reset(self, **options):\n"
+        "        print('hello from the reset')\n"
+        "        return super().reset(**options)\n"
+    )
+    done = subprocess.run(
+        [*COMMAND, "chatty.py:Chatty", "-n", "64", *SMALL, "--json", "-"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["steps"] == 64
+    assert "hello from the import" in done.stderr
+    assert "hello from the reset" in done.stderr
