@@ -9,6 +9,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.replay.watching import Watched, watch, watched_env
 from rlctl.run.episode import save_episode
 from rlctl.task.bullet import pybullet
+from rlctl_manipulation.reach import JOINT_STEP
 
 ENVS = Path(__file__).with_name("envs.py")
 HAND = 6  # link index
@@ -34,7 +35,7 @@ def reach(seed: int = 5) -> Watched:
             wanted = pybullet.calculateInverseKinematics(
                 arm.id, HAND, task.goal.tolist(), maxNumIterations=100, physicsClientId=sim.client
             )
-            return np.clip((np.array(wanted) - arm.joint_positions) / task.joint_step, -1, 1).astype(np.float32)
+            return np.clip((np.array(wanted) - arm.joint_positions) / JOINT_STEP, -1, 1).astype(np.float32)
 
         return watch(env, spec, seed, choose, policy="inverse kinematics", tell=print)
 
