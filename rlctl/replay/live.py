@@ -198,13 +198,8 @@ class _Diary:
         steps, terms = self.step, len(self._terms)
         if not self.over:
             self._note("the recorded actions end here", "WARN")
-        info = EpisodeInfo(
-            task=spec.task,
-            task_parameters=dict(spec.parameters),
-            reward_weights=dict(spec.reward_weights),
-            randomize=spec.randomize,
-            events={name: dict(changes) for name, changes in spec.events.items()},
-            frame_stack=spec.frame_stack,
+        info = EpisodeInfo.of(
+            spec,
             seed=self._seed,
             policy=policy,
             success=self._successes[-1] if steps else None,

@@ -41,6 +41,19 @@ class EpisodeInfo(pydantic.BaseModel):
     term_names: list[str] = []
     versions: dict[str, str] = {}
 
+    @classmethod
+    def of(cls, spec: EnvSpec, **rest: Any) -> EpisodeInfo:
+        """Describe an episode that is lived in `spec`; `rest` are the other fields."""
+        return cls(
+            task=spec.task,
+            task_parameters=dict(spec.parameters),
+            reward_weights=dict(spec.reward_weights),
+            randomize=spec.randomize,
+            events={name: dict(changes) for name, changes in spec.events.items()},
+            frame_stack=spec.frame_stack,
+            **rest,
+        )
+
     def env_spec(self) -> EnvSpec:
         """Return what the episode was lived in."""
         return EnvSpec(

@@ -47,13 +47,8 @@ class EpisodeKeeper:
         trajectory = episode.trajectory
         assert trajectory is not None  # evaluations record
         spec = self.spec
-        info = EpisodeInfo(
-            task=spec.task,
-            task_parameters=dict(spec.parameters),
-            reward_weights=dict(spec.reward_weights),
-            randomize=spec.randomize,
-            events={name: dict(changes) for name, changes in spec.events.items()},
-            frame_stack=spec.frame_stack,
+        info = EpisodeInfo.of(
+            spec,
             seed=episode.seed,
             policy=f"training step {steps}",
             success=episode.result.success,
