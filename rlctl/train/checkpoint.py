@@ -42,7 +42,7 @@ def save(
     `progress` is what the training loop wants back, as JSON.
     """
     target = run.checkpoint(model.num_timesteps)
-    tensors, structure = _flatten(_parameters(model))
+    tensors, structure = _flatten(model.get_parameters())
     with files.whole_folder(target) as folder:
         save_policy(folder / _POLICY, *packed)
         files.write_bytes(folder / _TENSORS, save_tensors({**tensors, **_normalizer_tensors(model)}))
@@ -103,11 +103,6 @@ def restore(model: BaseAlgorithm, folder: Path, state: dict[str, Any]) -> None:
 
 def _digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-def _parameters(model: BaseAlgorithm) -> dict[str, Any]:
-    # SB3 leaves SAC's fixed coefficients out and names the rest; policies include target networks.
-    return model.get_parameters()
 
 
 def _flatten(value: Any, path: str = "parameters") -> tuple[dict[str, Any], Any]:

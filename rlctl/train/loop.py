@@ -56,7 +56,6 @@ class Progress:
     best_step: int | None = None
     last_eval_step: int | None = None
     good_in_a_row: int = 0
-    evals: int = 0
     seconds: float = 0.0
     metrics_bytes: int = 0
     evals_bytes: int = 0
@@ -218,7 +217,6 @@ class TrainingLoop(BaseCallback):
         threshold = self.recipe.stop_success
         good = threshold is not None and success is not None and success >= threshold
         progress.good_in_a_row = progress.good_in_a_row + 1 if good else 0
-        progress.evals += 1
         progress.last_eval_step = steps
         while progress.next_eval <= steps:
             progress.next_eval += self.recipe.eval.every_steps or self.recipe.total_timesteps
