@@ -74,8 +74,9 @@ def check_env(
     _claim_stdout()
     from rlctl.check_env.check import check
     from rlctl.check_env.report import show
+    from rlctl.env_spec import EnvSpec
 
-    report = check(task, _task_settings(settings), env_timeout_s=env_timeout)
+    report = check(EnvSpec(task, _task_settings(settings)), env_timeout_s=env_timeout)
     show(report, json)
     raise typer.Exit(report.exit_code)
 

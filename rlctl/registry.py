@@ -137,14 +137,21 @@ def is_task(constructor: Any) -> bool:
 
 def recipe_file(task: str) -> Path | None:
     """Return the recipe that comes with a task: `<name>.yaml` beside its module, `<file>.yaml` beside its file."""
-    _put_current_folder_on_path()
     if entry := find(task):
         return entry.recipe_file
+    file = source_file(task)
+    return _existing(file.with_suffix(".yaml")) if file else None
+
+
+def source_file(task: str) -> Path | None:
+    """Return the file that a task is written in, found without importing it; None for a Gymnasium id."""
+    _put_current_folder_on_path()
+    if entry := find(task):
+        return entry.module_file
     if _GYMNASIUM_ID.match(task) or ":" not in task:
         return None
     place = task.rpartition(":")[0]
-    file = Path(place) if place.endswith(".py") else _module_file(place)
-    return _existing(file.with_suffix(".yaml")) if file else None
+    return Path(place) if place.endswith(".py") else _module_file(place)
 
 
 def _existing(file: Path) -> Path | None:

@@ -1,23 +1,24 @@
-"""`check`: from a task's name to a report. The environment lives in child processes, never in this one."""
+"""`check`: from a description of an environment to a report. It lives in child processes, never in this one."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
+from rlctl import registry
+from rlctl.check_env import studies
 from rlctl.check_env.children import Child, watch
 from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import Severity
+from rlctl.check_env.finding import Rule, Severity
 from rlctl.check_env.judge import Verdict, judge
 from rlctl.check_env.progress import Where
+from rlctl.check_env.rules import RULES
 from rlctl.check_env.wire import Message
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, UsageError
-
-PARTS = {"probe": 0, "instances": 1, "checkers": 0}
-"""The child processes and their hash seeds: that of `instances` is another, so that hash order shows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +30,10 @@ class Report:
     evidence: Evidence
     seconds: float
     """How long the check took."""
+    budget_s: float
+    """How long the studies of one process might take."""
+    strict: bool = False
+    """Whether warnings count as errors."""
 
     @property
     def exit_code(self) -> int:
@@ -37,7 +42,8 @@ class Report:
             return 70
         if self.evidence.built is None:
             return 3
-        return int(any(finding.severity is Severity.ERROR for finding in self.verdict.findings))
+        bad = (Severity.ERROR, Severity.WARNING) if self.strict else (Severity.ERROR,)
+        return int(any(finding.severity in bad for finding in self.verdict.findings))
 
     @property
     def steps_per_second(self) -> float | None:
@@ -52,15 +58,31 @@ class Report:
         episodes = self.evidence.episodes
         return 1e3 * sum(each.reset_s for each in episodes) / len(episodes) if episodes else None
 
+    @property
+    def place(self) -> tuple[Path, int] | None:
+        """File and line of the environment's class; line 1 where only the file is known."""
+        built = self.evidence.built
+        if built is not None and built.file is not None:
+            return Path(built.file), built.line or 1
+        file = registry.source_file(self.task)
+        return (file, 1) if file else None
 
-def check(task: str, parameters: Mapping[str, Any], *, env_timeout_s: float) -> Report:
-    """Check an environment with every rule.
+
+def check(
+    spec: EnvSpec,
+    *,
+    env_timeout_s: float,
+    rules: Sequence[Rule] = RULES,
+    strict: bool = False,
+    budget_s: float = studies.PART_S,
+) -> Report:
+    """Check an environment with some rules.
 
     Raises `UsageError` for a task or a parameter that does not exist. Whatever the environment itself does, a crash
     or a hang of more than `env_timeout_s` seconds in a call included, is in the report.
     """
     started = time.monotonic()
-    evidence = Evidence(task)
+    evidence = Evidence(spec.task, normalizes=_normalizes(spec.task))
     mistakes: list[UsageError] = []
 
     def receive(message: Message) -> None:
@@ -71,11 +93,14 @@ def check(task: str, parameters: Mapping[str, Any], *, env_timeout_s: float) -> 
         else:
             evidence.add(header, arrays)
 
+    needed = {study for rule in rules for study in rule.needs}
     children: list[Child] = []
     try:
-        with _status(task) as say:
-            for part, hash_seed in PARTS.items():
-                children.append(Child(part, task, parameters, hash_seed=hash_seed))
+        with _status(spec.task) as say:
+            for part, hash_seed in studies.PARTS.items():
+                names = [study.name for study in studies.of_part(part, needed)]
+                if names or part == "probe":
+                    children.append(Child(part, spec, names, budget_s, hash_seed=hash_seed))
             watch(children, receive, env_timeout_s, say)
     finally:
         for child in children:
@@ -83,7 +108,18 @@ def check(task: str, parameters: Mapping[str, Any], *, env_timeout_s: float) -> 
     if mistakes:
         raise mistakes[0]
     evidence.printed_lines, evidence.printed_first = children[0].printed, children[0].first_line
-    return Report(task, judge(evidence), evidence, time.monotonic() - started)
+    verdict = judge(evidence, rules)
+    return Report(spec.task, verdict, evidence, time.monotonic() - started, budget_s, strict)
+
+
+def _normalizes(task: str) -> bool | None:
+    """Say whether the recipe that comes with a task normalises observations."""
+    from rlctl.run import recipe
+
+    if registry.recipe_file(task) is None:
+        return None
+    normalize = recipe.resolve(task, None, {}).normalize
+    return normalize is not None and normalize.observation
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""What runs in a child process of check-env: one part of the probe, told to the parent message by message."""
+"""What runs in a child process of check-env: its part of the studies, told to the parent message by message."""
 
 from __future__ import annotations
 
@@ -9,23 +9,21 @@ import re
 import signal
 import sys
 import threading
+import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from multiprocessing.connection import Connection
 from typing import Any
 
 from rlctl import env_spec, registry
-from rlctl.check_env.library_checkers import library_checkers
-from rlctl.check_env.probe import instances, probe
+from rlctl.check_env import studies
+from rlctl.check_env.built import built
+from rlctl.check_env.context import Context
+from rlctl.check_env.failures import EnvironmentRaised, failure
 from rlctl.check_env.progress import Progress
-from rlctl.check_env.wire import Message, encode
+from rlctl.check_env.recording import Budget
+from rlctl.check_env.wire import Message, encode, skip
 from rlctl.errors import RlctlError, TaskError, UsageError
-
-PARTS: Mapping[str, Callable[[Callable[[], Any], Progress], Iterator[Message]]] = {
-    "probe": probe,
-    "instances": instances,
-    "checkers": library_checkers,
-}
 
 
 def main() -> None:
@@ -35,7 +33,8 @@ def main() -> None:
     progress = Progress(int(sys.argv[2]))
     job = json.loads(sys.argv[3])
     threading.Thread(target=_end_with_parent, args=(connection,), daemon=True).start()
-    for header, arrays in run_part(job["part"], env_spec.EnvSpec(job["task"], job["parameters"]), progress):
+    spec = env_spec.EnvSpec(**job["spec"])
+    for header, arrays in run_part(job["part"], spec, job["studies"], job["seconds"], progress):
         connection.send_bytes(encode(header, arrays))
     connection.send_bytes(encode({"type": "done"}, {}))
 
@@ -47,41 +46,77 @@ def _end_with_parent(connection: Connection) -> None:
         os._exit(1)
 
 
-def run_part(part: str, spec: env_spec.EnvSpec, progress: Progress | None = None) -> Iterator[Message]:
-    """Yield the messages of one part; an environment that cannot be built is one of them."""
-    progress = progress or Progress()
-    stage = "import"
-
-    def make() -> Any:
-        nonlocal stage
-        # Loaded before it is built, to tell an import error from a constructor's.
-        progress.enter("load")
-        registry.load(spec.task)
-        stage = "constructor"
-        progress.enter("build")
-        env = spec.make()
-        progress.leave()
-        return env
-
+def run_part(
+    part: str,
+    spec: env_spec.EnvSpec,
+    names: Collection[str] | None = None,
+    seconds: float = studies.PART_S,
+    progress: Progress | None = None,
+) -> Iterator[Message]:
+    """Yield the messages of one part, all its studies by default; an environment that cannot be built is one."""
+    context = Context(spec, progress)
+    chosen = studies.of_part(part, studies.names() if names is None else names)
     try:
-        for header, arrays in PARTS[part](make, progress):
+        for header, arrays in _part(part, context, chosen, seconds):
             yield {**header, "part": part}, arrays
     except UsageError as error:
         yield {"type": "usage_error", "kind": type(error).__name__, "message": str(error), "part": part}, {}
     except RlctlError as error:
-        yield {**_load_error(spec, stage, error), "part": part}, {}
-    except Exception:
-        # The environment's own exceptions were caught where it was called, so this one is ours.
-        yield {"type": "crashed", "traceback": traceback.format_exc(), "part": part}, {}
+        yield {**_load_error(context, error), "part": part}, {}
 
 
-def _load_error(spec: env_spec.EnvSpec, stage: str, error: RlctlError) -> dict[str, Any]:
+def _part(part: str, context: Context, chosen: list[studies.Study], seconds: float) -> Iterator[Message]:
+    if part == "probe":
+        instance = context.first()
+        yield built(instance)
+        if not _can_act(instance.env):
+            for study in chosen:
+                yield skip(study.name, "its action space is no Gymnasium space")
+            return
+    yield from _studies(context, chosen, seconds)
+    yield from context.close()
+
+
+def _studies(context: Context, chosen: list[studies.Study], seconds: float) -> Iterator[Message]:
+    """Run the studies; each has its share of the time, and what those before it left."""
+    started = time.monotonic()
+    shares = sum(study.share for study in chosen)
+    share = 0.0
+    for study in chosen:
+        share += study.share
+        deadline = started + seconds * share / shares
+        begun = time.monotonic()
+        if begun > deadline:
+            yield skip(study.name, f"the studies before it took the {seconds:g} s there are")
+            continue
+        context.progress.phase(study.name)
+        context.budget = Budget(deadline)
+        try:
+            yield from study.run(context)
+        except EnvironmentRaised as error:
+            yield failure(error, context.progress), {}
+        except RlctlError:
+            raise
+        except Exception:
+            # The environment's own exceptions were caught where it was called, so this one is ours.
+            yield {"type": "crashed", "study": study.name, "traceback": traceback.format_exc()}, {}
+        yield {"type": "studied", "study": study.name, "seconds": time.monotonic() - begun}, {}
+
+
+def _can_act(env: Any) -> bool:
+    from gymnasium import spaces
+
+    return isinstance(env.action_space, spaces.Space)
+
+
+def _load_error(context: Context, error: RlctlError) -> dict[str, Any]:
+    stage = context.stage
     missing = []
     if stage == "constructor":
         if isinstance(error.__cause__, TypeError):
             missing = _missing_arguments(str(error.__cause__))
         # The registry's own verdict; what the constructor raised comes with its traceback.
-        elif isinstance(error, TaskError) and error.details is None and not _is_task(spec):
+        elif isinstance(error, TaskError) and error.details is None and not _is_task(context.spec):
             stage = "kind"
     return {
         "type": "load_error",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -12,12 +13,13 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from rlctl.check_env.progress import Progress, Where
-from rlctl.check_env.wire import Message, decode
+from rlctl.check_env.wire import Message, decode, skip
+from rlctl.env_spec import EnvSpec
 from rlctl.rollout.shared_arrays import anonymous_file
 
 # Started this way a child finds what its parent finds, and the caller's script is not run again.
@@ -30,6 +32,8 @@ BUILD_TIMEOUT_S = 60.0
 """How long importing and building may take, unless a step may take longer."""
 CHECKER_CALLS = 40
 """A library's checker is one call to us; it makes at most so many calls into the environment."""
+CHECKERS_GRACE_S = 5.0
+"""How much longer than the other studies the libraries' checkers may take: they have torch to load [s]."""
 IDLE_TIMEOUT_S = 300.0
 """How long a child may do nothing with the environment: loading torch on a busy machine, at the worst."""
 _POLL_S = 0.1
@@ -41,7 +45,7 @@ _NOT_ITS_OWN = ("pybullet build time", "argv[")
 class Child:
     """One part of the probe in a process of its own."""
 
-    def __init__(self, part: str, task: str, parameters: Mapping[str, Any], *, hash_seed: int) -> None:
+    def __init__(self, part: str, spec: EnvSpec, names: Sequence[str], seconds: float, *, hash_seed: int) -> None:
         self.part = part
         self.printed = 0
         """Lines that were written to stdout."""
@@ -52,7 +56,16 @@ class Child:
         self._progress = Progress(self._memory)
         self._changed = (-1, time.monotonic())
         ours, theirs = socket.socketpair()
-        job = {"part": part, "task": task, "parameters": dict(parameters), "sys_path": sys.path}
+        self._names = names
+        self._seconds = seconds
+        self._started = time.monotonic()
+        job = {
+            "part": part,
+            "spec": dataclasses.asdict(spec),
+            "studies": names,
+            "seconds": seconds,
+            "sys_path": sys.path,
+        }
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         with theirs:
             self.process = subprocess.Popen(
@@ -92,6 +105,12 @@ class Child:
         if where.counter != self._changed[0]:
             self._changed = (where.counter, time.monotonic())
         return time.monotonic() - self._changed[1] > _limit_s(where.call, env_timeout_s)
+
+    def given_up(self) -> Iterator[Message]:
+        """Yield what is not known of a library's checker that goes on for too long: only it cannot be told to stop."""
+        if self.part == "checkers" and time.monotonic() - self._started > self._seconds + CHECKERS_GRACE_S:
+            for name in self._names:
+                yield skip(name, f"the libraries' checkers took longer than {self._seconds + CHECKERS_GRACE_S:g} s")
 
     def death(self) -> str:
         """Wait for the end of a child whose connection closed; say how it ended."""
@@ -154,7 +173,12 @@ def watch(
             else:
                 receive(message)
         for child in list(active.values()):
-            if child.hangs(env_timeout_s):
+            if given_up := list(child.given_up()):
+                for message in given_up:
+                    receive(message)
+                child.close()
+                del active[child.connection]
+            elif child.hangs(env_timeout_s):
                 receive(
                     _failure(child, "hung", f"did not come back in {_limit_s(child.where.call, env_timeout_s):g} s")
                 )

@@ -9,12 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.check_env import results
 from rlctl.check_env.leaves import Leaf, leaf_from_wire, leaf_name
 
 Arrays = dict[str, NDArray[Any]]
 
 FIRST_SEED = 1000
 SECOND_SEED = 1001
+
+GYMNASIUM, SB3 = "Gymnasium", "Stable-Baselines3"
+RAISED = "the environment raised "
+"""How a complaint of a library's checker begins that is the environment's own exception."""
 
 ENDS = ("terminated", "truncated", "both")
 
@@ -37,6 +42,14 @@ class Built:
     accepts_seed: bool = True
     is_env: bool = True
     """Whether it inherits from `gymnasium.Env`."""
+    metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    uses_pybullet: bool = False
+    """Whether a PyBullet client was connected once it was built."""
+    waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Per rule that its class waives, the reason."""
+    file: str | None = None
+    """Where its class is written."""
+    line: int | None = None
 
     def element(self, leaf: int, index: int) -> str:
         """Name one number of an observation by the place of its array and its flat index."""
@@ -68,7 +81,7 @@ class Form:
     """A type that something had: where it was first seen, and how often."""
 
     what: str
-    """`observation`, `keys`, `reward`, `terminated`, `truncated`, `info`, `reset` or `step`."""
+    """`observation`, `memory`, `keys`, `reward`, `terminated`, `truncated`, `info`, `reset` or `step`."""
     type: str
     step: int
     count: int
@@ -96,6 +109,10 @@ class Trajectory:
     reward_is_number: NDArray[np.bool_]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
+    action_values: NDArray[np.float64]
+    """Numbers of each action, in the order of the action space's leaves. Shape (T, A)."""
+    infos: Mapping[str, Series]
+    """Numbers in info, by name; those in a dictionary of info as `reward_terms/distance`. Values have shape (n,)."""
     forms: list[Form]
     step_s: float
     """Time in `step`, summed [s]."""
@@ -169,10 +186,16 @@ class Evidence:
     complaints: list[Complaint] = dataclasses.field(default_factory=list)
     checkers: dict[str, str | None] = dataclasses.field(default_factory=dict)
     """Per checker that was tried: None, or why it could not run."""
+    results: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Per kind of result, by the name of its class in `results`."""
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Per study that was done, how long it took."""
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Roles that were not lived, and why."""
+    """Studies and parts of them that were not done, and why."""
     crashes: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Per part of the probe that crashed by itself, its traceback."""
+    """Per study that crashed by itself, its traceback."""
+    normalizes: bool | None = None
+    """Whether the packaged recipe normalises observations; None without a recipe."""
     printed_lines: int = 0
     """Lines that the probe's environment wrote to stdout."""
     printed_first: str = ""
@@ -203,7 +226,11 @@ class Evidence:
                 failed = Failure("raised", "build", str(part), "build", 0, 0, 0, content["message"])
                 self.failures.append(failed)
         elif kind == "crashed":
-            self.crashes[str(part)] = content["traceback"]
+            self.crashes[content["study"]] = content["traceback"]
+        elif kind == "result":
+            self.results[content["kind"]] = results.decode(content["kind"], content["content"])
+        elif kind == "studied":
+            self.seconds[content["study"]] = content["seconds"]
         elif kind == "skipped":
             self.skipped[content["role"]] = content["reason"]
         elif kind == "checked":
@@ -227,11 +254,17 @@ def _trajectory(content: dict[str, Any], arrays: Arrays) -> Trajectory:
         Form(**{**each, "shape": None if each["shape"] is None else tuple(each["shape"])})
         for each in content.pop("forms")
     ]
+    infos = {
+        name: Series(arrays[f"info/{i}/steps"], arrays[f"info/{i}/values"])
+        for i, name in enumerate(content.pop("infos"))
+    }
     observations = {leaf: Series(arrays[f"steps/{leaf}"], arrays[f"values/{leaf}"]) for leaf in content.pop("recorded")}
     return Trajectory(
         **content,
         forms=forms,
         observations=observations,
+        infos=infos,
+        action_values=arrays.get("actions", np.zeros((0, 0))),
         rewards=arrays["rewards"],
         reward_is_number=arrays["reward_is_number"],
         terminated=arrays["terminated"],

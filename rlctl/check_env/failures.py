@@ -41,7 +41,7 @@ def describe(error: BaseException) -> str:
     """Return an exception in a line, with the place in the environment's code."""
     if isinstance(error, RlctlError):
         return str(error)
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename).parent != _HERE]
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _HERE not in Path(frame.filename).parents]
     own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
     place = f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
     text = " ".join(str(error).split()) or "no message"

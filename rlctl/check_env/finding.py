@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rlctl.check_env.evidence import Complaint, Evidence
+from rlctl.check_env.studies import CHECKERS, LIVES
 
 
 class Severity(enum.StrEnum):
@@ -55,6 +56,10 @@ class NotJudged(Exception):
     """Raised by a check that has too little to go by; the text says why."""
 
 
+class NotApplicable(Exception):
+    """Raised by a check that has nothing to look at in this kind of environment; the text says why."""
+
+
 Check = Callable[[Evidence], Iterable[Seen]]
 
 
@@ -69,6 +74,8 @@ class Rule:
     meaning: str
     """What it means and why it matters."""
     check: Check
+    needs: tuple[str, ...]
+    """The studies whose results it reads."""
     complaints: tuple[re.Pattern[str], ...]
     """What the libraries' checkers say about the same thing."""
     only_complaints: bool
@@ -90,6 +97,7 @@ def rule(
     severity: Severity,
     fix: str,
     *,
+    needs: Iterable[str] = LIVES,
     complaints: Iterable[str] = (),
     only_complaints: bool = False,
 ) -> Callable[[Check], Rule]:
@@ -98,6 +106,7 @@ def rule(
     def decorate(check: Check) -> Rule:
         patterns = tuple(re.compile(pattern, re.IGNORECASE) for pattern in complaints)
         meaning = inspect.getdoc(check) or ""
-        return Rule(id, name, severity, fix, meaning, check, patterns, only_complaints)
+        studies = CHECKERS if only_complaints else tuple(needs)
+        return Rule(id, name, severity, fix, meaning, check, studies, patterns, only_complaints)
 
     return decorate

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rlctl.check_env.evidence import Complaint, Evidence
-from rlctl.check_env.finding import Finding, NotJudged, Rule, Severity
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Rule, Severity
 from rlctl.check_env.rules import RULES, libraries, observations
+from rlctl.errors import UsageError, did_you_mean
 
 LOADING = "RL0"
 """The family that is judged even where no instance could be built."""
@@ -20,20 +21,25 @@ class Verdict:
     """What the rules say."""
 
     findings: list[Finding] = dataclasses.field(default_factory=list)
+    waived: list[Finding] = dataclasses.field(default_factory=list)
+    """What the environment's class says is meant."""
     judged: list[str] = dataclasses.field(default_factory=list)
     not_judged: dict[str, str] = dataclasses.field(default_factory=dict)
     """Rule id, or the part of the environment that no rule could look into, and why."""
+    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Rule id, and what this kind of environment does not have."""
     crashed: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Rule id and traceback."""
+    """Rule id or name of a study, and traceback."""
 
 
 def judge(evidence: Evidence, rules: Sequence[Rule] = RULES) -> Verdict:
-    """Apply the rules; the findings come worst first."""
+    """Apply the rules; the findings come worst first. Raises `UsageError` for a waiver that is none."""
     verdict = Verdict(crashed=dict(evidence.crashes))
     for rule in rules:
         _apply(rule, evidence, verdict)
     if evidence.built is not None:
         _add_complaints(evidence, rules, verdict)
+        _waive(verdict, evidence.built.waivers)
     for unseen in observations.not_judged(evidence):
         name, _, reason = unseen.partition(": ")
         verdict.not_judged[name] = reason
@@ -51,11 +57,27 @@ def _apply(rule: Rule, evidence: Evidence, verdict: Verdict) -> None:
         found = [rule.finding(seen) for seen in rule.check(evidence)]
     except NotJudged as reason:
         verdict.not_judged[rule.id] = str(reason)
+    except NotApplicable as reason:
+        verdict.not_applicable[rule.id] = str(reason)
     except Exception:  # a rule's bug must not hide what the other rules found, and must not look like a pass
         verdict.crashed[rule.id] = traceback.format_exc()
     else:
         verdict.judged.append(rule.id)
         verdict.findings += found
+
+
+def _waive(verdict: Verdict, waivers: Mapping[str, str]) -> None:
+    known = [rule.id for rule in RULES]
+    for rule_id, reason in waivers.items():
+        if rule_id not in known:
+            raise UsageError(
+                f"rlctl_ignore: no rule {rule_id!r}.{did_you_mean(rule_id, known)} "
+                'Write rlctl_ignore = {"RL604": "why this is meant"}.'
+            )
+        if not reason.strip():
+            raise UsageError(f"rlctl_ignore: {rule_id} is waived without a reason. Say why this is meant.")
+    verdict.waived = [each for each in verdict.findings if each.rule in waivers]
+    verdict.findings = [each for each in verdict.findings if each.rule not in waivers]
 
 
 def _add_complaints(evidence: Evidence, rules: Sequence[Rule], verdict: Verdict) -> None:
@@ -66,12 +88,13 @@ def _add_complaints(evidence: Evidence, rules: Sequence[Rule], verdict: Verdict)
     for complaint in evidence.complaints:
         if libraries.is_noise(complaint):
             continue
-        owning = [rule for rule in rules if rule.owns(complaint)]
+        owning = [rule for rule in RULES if rule.owns(complaint)]
         if any(rule.id in found for rule in owning):
             continue
         owner = owning[0] if owning else libraries.OF_CHECKER[complaint.checker]
-        owners[owner.id] = owner
-        said.setdefault(owner.id, []).append(complaint)
+        if owner in rules:
+            owners[owner.id] = owner
+            said.setdefault(owner.id, []).append(complaint)
     for rule_id, complaints in said.items():
         verdict.findings += _from_complaints(owners[rule_id], complaints)
 

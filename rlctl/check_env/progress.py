@@ -9,10 +9,13 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.check_env import studies
+
 CALLS = ("", "load", "build", "reset", "step", "close", "sample", "check")
 PHASES = (
     "build",
-    "episodes",
+    *studies.names(),
+    # Parts of studies.
     "reused",
     "dirty",
     "seeds",
@@ -21,7 +24,6 @@ PHASES = (
     "interleaved",
     "after close",
     "close",
-    "checkers",
 )
 
 _SIZE = 64  # [bytes]

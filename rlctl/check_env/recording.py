@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.check_env.actions import actions
 from rlctl.check_env.failures import EnvironmentRaised, failure
 from rlctl.check_env.leaves import Leaf, pick
 from rlctl.check_env.progress import Progress
 from rlctl.check_env.wire import Message
+
+NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
+MOST_INFOS = 100
 
 
 @dataclasses.dataclass
@@ -47,9 +52,12 @@ class Plan:
 class Instance:
     """One environment, and how it is called."""
 
-    def __init__(self, env: Any, leaves: list[Leaf], accepts_seed: bool, progress: Progress) -> None:
+    def __init__(
+        self, env: Any, leaves: list[Leaf], action_leaves: list[Leaf], accepts_seed: bool, progress: Progress
+    ) -> None:
         self.env = env
         self.leaves = leaves
+        self.action_leaves = action_leaves
         self.accepts_seed = accepts_seed
         self.progress = progress
 
@@ -84,6 +92,9 @@ class Recording:
         self._is_number: list[bool] = []
         self._flags: list[tuple[bool, bool]] = []
         self._forms: dict[tuple[Any, ...], list[int]] = {}
+        self._infos: dict[str, tuple[list[int], list[float]]] = {}
+        self._acted: list[NDArray[np.float64]] = []
+        self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
         self._step_s = self._reset_s = 0.0
 
     def run(self) -> list[Message]:
@@ -128,6 +139,7 @@ class Recording:
         call, env = self.instance.call, self.instance.env
         try:
             action = call("sample", next, self._actions, step=self._step)
+            self._acted.append(flat_action(self.instance.action_leaves, action))
             started = time.perf_counter()
             result = call("step", env.step, action, step=self._step)
         except EnvironmentRaised as error:
@@ -184,6 +196,12 @@ class Recording:
 
     def _note_info(self, info: Any) -> None:
         self._note("info", _type(info))
+        if isinstance(info, dict):
+            for name, value in numbers_in(info):
+                if name in self._infos or len(self._infos) < MOST_INFOS:
+                    steps, values = self._infos.setdefault(name, ([], []))
+                    steps.append(self._step)
+                    values.append(value)
 
     def _reward(self, reward: Any) -> None:
         self._note("reward", _type(reward))
@@ -214,12 +232,22 @@ class Recording:
             self._note("observation", _type(value), index, None, None)
             return
         self._note("observation", _type(value), index, str(array.dtype), array.shape)
+        self._compare_memory(index, value, array)
         if array.shape != leaf.shape or array.dtype.kind not in "biuf":
             return
         steps, values = self._values.setdefault(index, ([], []))
         steps.append(self._step)
         values.append(array)
         self.budget.bytes_left -= array.nbytes + 100
+
+    def _compare_memory(self, index: int, value: Any, copy: NDArray[Any]) -> None:
+        """Note an observation that a later step has changed: both are one memory."""
+        if not isinstance(value, np.ndarray) or not value.shape:
+            return
+        earlier = self._previous.get(index)
+        if earlier is not None and np.shares_memory(earlier[0], value) and not np.array_equal(*earlier, equal_nan=True):
+            self._note("memory", "shared", index)
+        self._previous[index] = value, copy
 
     @property
     def steps(self) -> int:
@@ -239,6 +267,11 @@ class Recording:
             "terminated": np.array([flag for flag, _ in self._flags], np.bool_),
             "truncated": np.array([flag for _, flag in self._flags], np.bool_),
         }
+        if self._acted:
+            arrays["actions"] = np.stack(self._acted)
+        for index, (steps, numbers) in enumerate(self._infos.values()):
+            arrays[f"info/{index}/steps"] = np.array(steps, np.int64)
+            arrays[f"info/{index}/values"] = np.array(numbers, np.float64)
         for index, (steps, values) in self._values.items():
             arrays[f"steps/{index}"] = np.array(steps, np.int64)
             arrays[f"values/{index}"] = np.stack(values)
@@ -250,12 +283,30 @@ class Recording:
             "actions": self.plan.actions,
             "ended": self._ended,
             "recorded": list(self._values),
+            "infos": list(self._infos),
             "forms": [_form(key, step, count) for key, (step, count) in self._forms.items()],
             "step_s": self._step_s,
             "reset_s": self._reset_s,
         }
         failed: list[Message] = [(self.failure, {})] if self.failure else []
         return [(header, arrays), *failed]
+
+
+def flat_action(leaves: list[Leaf], action: Any) -> NDArray[np.float64]:
+    """Return an action's numbers in the order of the action space's leaves; those of unknown kinds are left out."""
+    parts = [np.ravel(pick(action, leaf.path)).astype(np.float64) for leaf in leaves if leaf.supported]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def numbers_in(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
+    """Yield the numbers of an info by name; those in a dictionary of it as `reward_terms/distance`."""
+    for key, value in info.items():
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                if isinstance(inner, NUMBERS):
+                    yield f"{key}/{name}", float(inner)
+        elif isinstance(value, NUMBERS):
+            yield str(key), float(value)
 
 
 def _form(key: tuple[Any, ...], step: int, count: int) -> dict[str, Any]:

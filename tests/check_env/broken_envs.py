@@ -15,7 +15,7 @@ LIMIT = 50  # [steps]
 
 
 class Clean(gymnasium.Env):
-    """A point in a square is pushed; nothing is wrong with it."""
+    """A point in a square is pushed to its middle; nothing is wrong with it."""
 
     metadata = {"render_modes": []}
 
@@ -34,8 +34,10 @@ class Clean(gymnasium.Env):
         self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)
 
     def step(self, action):
+        if not np.all(np.isfinite(action)):
+            raise ValueError(f"action {action} is not finite")
         self.steps += 1
-        self.move(action)
+        self.move(np.clip(action, -1.0, 1.0))
         return self.observe(), self.reward(), self.is_terminated(), self.is_truncated(), self.info()
 
     def move(self, action):
@@ -48,13 +50,13 @@ class Clean(gymnasium.Env):
         return -float(np.linalg.norm(self.position))
 
     def is_terminated(self):
-        return bool(np.abs(self.position).max() >= self.size)
+        return False
 
     def is_truncated(self):
         return self.steps >= LIMIT
 
     def info(self):
-        return {}
+        return {"is_success": bool(np.linalg.norm(self.position) < 0.1)}
 
 
 class CleanDict(Clean):
@@ -203,7 +205,7 @@ class NoOptions(Clean):
 
 class NumpyBool(Clean):
     def is_terminated(self):
-        return np.abs(self.position).max() >= self.size
+        return np.linalg.norm(self.position) < 0
 
 
 class ArrayReward(Clean):
@@ -324,7 +326,7 @@ class FixedStartNoise(FixedStart):
 
 class TimeInInfo(Clean):
     def info(self):
-        return {"time": time.perf_counter()}
+        return {**super().info(), "time": time.perf_counter()}
 
 
 class UnseededLater(Clean):
@@ -440,9 +442,6 @@ class BothFlags(Clean):
 
 
 class Endless(Clean):
-    def is_terminated(self):
-        return False
-
     def is_truncated(self):
         return False
 

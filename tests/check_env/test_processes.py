@@ -13,6 +13,7 @@ from rlctl.check_env.check import check
 from rlctl.check_env.evidence import Evidence
 from rlctl.check_env.finding import Severity, rule
 from rlctl.check_env.rules import RULES
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, UsageError
 
 FOLDER = Path(__file__).parent
@@ -41,7 +42,7 @@ def in_root(monkeypatch):
     ],
 )
 def test_without_an_instance_there_is_a_finding_and_exit_code_3(task, expected, message, fix, in_root):
-    report = check(task, {}, env_timeout_s=10)
+    report = check(EnvSpec(task), env_timeout_s=10)
     (finding,) = report.verdict.findings
     assert finding.rule == expected
     assert message in finding.message
@@ -51,7 +52,7 @@ def test_without_an_instance_there_is_a_finding_and_exit_code_3(task, expected, 
 
 
 def test_segfault_is_a_finding(in_root):
-    report = check(f"{BROKEN}:Segfaults", {}, env_timeout_s=10)
+    report = check(EnvSpec(f"{BROKEN}:Segfaults"), env_timeout_s=10)
     (finding,) = report.verdict.findings
     assert (finding.rule, finding.message) == ("RL208", "the process was killed by SIGSEGV in step 7")
     assert finding.evidence["seed"] == 1000
@@ -61,7 +62,7 @@ def test_segfault_is_a_finding(in_root):
 
 def test_hang_is_a_finding_after_the_timeout(in_root):
     started = time.monotonic()
-    report = check(f"{BROKEN}:Hangs", {}, env_timeout_s=0.7)
+    report = check(EnvSpec(f"{BROKEN}:Hangs"), env_timeout_s=0.7)
     assert time.monotonic() - started < 20
     (finding,) = report.verdict.findings
     assert (finding.rule, finding.message) == ("RL209", "step 7 did not come back in 0.7 s")
@@ -79,23 +80,24 @@ def test_printing_is_worth_knowing_and_does_not_reach_the_result(in_root):
 
 
 def test_hash_order_shows_in_a_new_process(in_root):
-    report = check(f"{BROKEN}:HashOrder", {}, env_timeout_s=10)
+    report = check(EnvSpec(f"{BROKEN}:HashOrder"), env_timeout_s=10)
     assert [finding.rule for finding in report.verdict.findings] == ["RL305"]
 
 
 def test_unknown_names_are_usage_errors(in_root):
     with pytest.raises(UsageError, match=r"no task 'reech'. Did you mean 'reach'\?"):
-        check("reech", {}, env_timeout_s=10)
+        check(EnvSpec("reech"), env_timeout_s=10)
     with pytest.raises(RecipeError, match=r"no parameter 'sise'. Did you mean 'size'\?"):
-        check(f"{BROKEN}:Clean", {"sise": 1.0}, env_timeout_s=10)
+        check(EnvSpec(f"{BROKEN}:Clean", {"sise": 1.0}), env_timeout_s=10)
     with pytest.raises(UsageError, match="NUMBER is a int, not a class"):
-        check(f"{BROKEN}:NUMBER", {}, env_timeout_s=10)
+        check(EnvSpec(f"{BROKEN}:NUMBER"), env_timeout_s=10)
 
 
 def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
     code = (
         "import sys; from rlctl.check_env.check import check; import rlctl.check_env.report; "
-        "check('tests/check_env/broken_import.py:Anything', {}, env_timeout_s=10); "
+        "from rlctl.env_spec import EnvSpec; "
+        "check(EnvSpec('tests/check_env/broken_import.py:Anything'), env_timeout_s=10); "
         "print([name for name in ('torch', 'stable_baselines3', 'pybullet', 'broken_import') if name in sys.modules])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
@@ -120,7 +122,7 @@ def test_command_of_a_clean_environment(tmp_path):
     run = rlctl("CartPole-v1")
     assert (run.returncode, run.stderr) == (0, "")
     lines = run.stdout.splitlines()
-    assert lines[0].startswith("CartPole-v1: no findings; 42 rules judged in ")
+    assert lines[0].startswith("CartPole-v1: no findings; 43 rules judged in ")
     assert len(lines) == 2
     assert "steps/s" in lines[1]
     assert "\x1b" not in run.stdout

@@ -15,6 +15,19 @@ from rlctl.check_env.rules import (
     spaces,
 )
 
+FAMILIES = {
+    "RL0": "loading",
+    "RL1": "spaces and observations",
+    "RL2": "interface",
+    "RL3": "determinism",
+    "RL4": "isolation and resources",
+    "RL5": "episodes",
+    "RL6": "reward",
+    "RL7": "actions",
+    "RL8": "physics (PyBullet)",
+    "RL9": "speed",
+}
+
 RULES: tuple[Rule, ...] = (
     loading.imports,
     loading.constructs,
@@ -50,6 +63,7 @@ RULES: tuple[Rule, ...] = (
     determinism.seeds_differ,
     determinism.same_info,
     determinism.later_episodes,
+    determinism.global_random,
     isolation.interleaved,
     isolation.closing,
     isolation.second_instance,

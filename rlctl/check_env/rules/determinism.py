@@ -6,6 +6,7 @@ simplest cause to the farthest; where a nearer one explains a difference, the fa
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,7 +14,8 @@ import numpy as np
 from rlctl.check_env.comparison import Difference, first_difference
 from rlctl.check_env.evidence import Evidence, Trajectory
 from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
-from rlctl.check_env.rules.known import built, lived, one
+from rlctl.check_env.results import GlobalRandom
+from rlctl.check_env.rules.known import built, lived, one, result
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
 
@@ -188,3 +190,18 @@ def later_episodes(evidence: Evidence) -> Iterator[Seen]:
     if difference is not None:
         _require_repeatable(evidence)
         yield _seen(evidence, trajectory, difference, "reset with a seed and then without one, twice")
+
+
+@rule(
+    "RL309",
+    "global random generator",
+    WARNING,
+    "Draw from self.np_random. Give a library that needs a generator this one, or a seed drawn from it.",
+    needs=("global random",),
+)
+def global_random(evidence: Evidence) -> Iterator[Seen]:
+    """reset or step draws from, or seeds, a generator that belongs to the whole process (`numpy.random`, `random`,
+    `torch`). Environments in one process then change each other's episodes, and the learner's own random numbers."""
+    for use in result(evidence, GlobalRandom, "global random").uses:
+        at = f" at step {use.step}" if use.call == "step" else ""
+        yield Seen(f"{use.call} moves the global generator {use.generator}{at}", dataclasses.asdict(use))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from rlctl.check_env.evidence import Evidence, Failure, Form, Trajectory
+from rlctl.check_env import studies
+from rlctl.check_env.evidence import RAISED, Evidence, Failure, Form, Trajectory
 from rlctl.check_env.finding import Seen, Severity, rule
-from rlctl.check_env.library_checkers import RAISED
 from rlctl.check_env.rules.known import built, lived
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
@@ -18,6 +18,8 @@ NUMBERS = ("float", "int", "numpy.float64")
 MANY_LINES = 0.1
 """Lines printed per step from which printing is slow."""
 MOST_FAILURES = 3
+NOT_ALONE = ("interleaved", "after close", *studies.PROVOKING)
+"""Where a failure is another rule's matter."""
 
 
 def first_form(evidence: Evidence, what: str, *fine: str) -> Iterator[tuple[Trajectory, Form]]:
@@ -142,7 +144,7 @@ def calls_alone(evidence: Evidence, kind: str) -> Iterator[Failure]:
     """Yield the calls of one kind that failed on an instance that was alone, each error once."""
     seen: set[tuple[str, str]] = set()
     for failure in evidence.failures:
-        if failure.kind != kind or failure.call in ("load", "build") or failure.phase in ("interleaved", "after close"):
+        if failure.kind != kind or failure.call in ("load", "build") or failure.phase in NOT_ALONE:
             continue
         if failure.part == "checkers" and seen:
             continue

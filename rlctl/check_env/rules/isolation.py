@@ -91,6 +91,6 @@ def second_instance(evidence: Evidence) -> Iterator[Seen]:
     built(evidence)
     for failure in evidence.failures:
         if failure.call in ("load", "build") and failure.part != "probe":
-            beside = "in a second process" if failure.phase in ("build", "alone", "checkers") else "in one process"
+            beside = "in one process" if failure.phase in ("fresh instance", "interleaved") else "in a second process"
             yield Seen(f"a second instance {beside} cannot be built: {failure.error}", where(failure))
             return

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 from rlctl.check_env.evidence import Built, Evidence, Trajectory
-from rlctl.check_env.finding import NotJudged
+from rlctl.check_env.finding import NotApplicable, NotJudged
+
+T = TypeVar("T")
 
 
 def built(evidence: Evidence) -> Built:
@@ -28,3 +32,27 @@ def one(evidence: Evidence, role: str) -> Trajectory:
     if not found:
         raise NotJudged(evidence.skipped.get(role, f"the comparison {role!r} could not be made"))
     return found[0]
+
+
+def result(evidence: Evidence, kind: type[T], study: str) -> T:
+    """Return what a study found out; raises `NotJudged` with the reason where it did not come to its end."""
+    found: T | None = evidence.results.get(kind.__name__)
+    if found is None:
+        raise NotJudged(why_missing(evidence, study))
+    return found
+
+
+def why_missing(evidence: Evidence, study: str) -> str:
+    """Return why there is no result of a study."""
+    if study in evidence.skipped:
+        return evidence.skipped[study]
+    failed = [failure for failure in evidence.failures if failure.phase == study]
+    if failed:
+        return f"the environment failed in {failed[0].call} while it was tried: {failed[0].error}"
+    return f"the process ended before {study!r} could be tried"
+
+
+def require_pybullet(evidence: Evidence) -> None:
+    """Raise `NotApplicable` for an environment that has no PyBullet client."""
+    if not built(evidence).uses_pybullet:
+        raise NotApplicable("no PyBullet world")

@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from rlctl.check_env.evidence import Complaint, Evidence
+from rlctl.check_env.evidence import GYMNASIUM, SB3, Complaint, Evidence
 from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
-from rlctl.check_env.library_checkers import GYMNASIUM, SB3
 
 NOISE = tuple(
     re.compile(pattern)
@@ -34,14 +33,26 @@ def _require(evidence: Evidence, checker: str) -> None:
         raise NotJudged(f"{checker}'s checker could not run: {problem}")
 
 
-@rule("RL290", "Gymnasium's checker", Severity.WARNING, "See gymnasium.utils.env_checker.check_env.")
+@rule(
+    "RL290",
+    "Gymnasium's checker",
+    Severity.WARNING,
+    "See gymnasium.utils.env_checker.check_env.",
+    needs=("gymnasium checker",),
+)
 def gymnasium(evidence: Evidence) -> Iterator[Seen]:
     """Gymnasium's check_env says something that no other rule covers."""
     _require(evidence, GYMNASIUM)
     return iter(())
 
 
-@rule("RL291", "Stable-Baselines3's checker", Severity.WARNING, "See stable_baselines3.common.env_checker.check_env.")
+@rule(
+    "RL291",
+    "Stable-Baselines3's checker",
+    Severity.WARNING,
+    "See stable_baselines3.common.env_checker.check_env.",
+    needs=("sb3 checker",),
+)
 def stable_baselines3(evidence: Evidence) -> Iterator[Seen]:
     """Stable-Baselines3's check_env says something that no other rule covers."""
     _require(evidence, SB3)

@@ -235,11 +235,17 @@ def finite(evidence: Evidence) -> Iterator[Seen]:
     WARNING,
     "Return a copy: `return self._observation.copy(), ...`; the same for objects in info.",
     complaints=(r"share an object",),
-    only_complaints=True,
 )
 def own_memory(evidence: Evidence) -> Iterator[Seen]:
     """Two observations or infos are the same memory, so that a later step changes what a buffer kept earlier."""
-    return iter(())
+    known = built(evidence)
+    for trajectory in lived(evidence):
+        for form in trajectory.forms:
+            if form.what == "memory" and form.leaf is not None:
+                name = leaf_name(known.leaves[form.leaf])
+                evidence_ = {**trajectory.place, "step": form.step, "steps": form.count}
+                yield Seen(f"step {form.step} wrote into the memory of the {name} returned before it", evidence_)
+                return
 
 
 def not_judged(evidence: Evidence) -> Iterator[str]:

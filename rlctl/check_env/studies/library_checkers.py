@@ -9,14 +9,10 @@ from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any
 
+from rlctl.check_env.context import Context
+from rlctl.check_env.evidence import GYMNASIUM, RAISED, SB3
 from rlctl.check_env.failures import describe
-from rlctl.check_env.progress import Progress
 from rlctl.check_env.wire import Message
-
-GYMNASIUM, SB3 = "Gymnasium", "Stable-Baselines3"
-
-RAISED = "the environment raised "
-"""How a complaint begins that is the environment's own exception."""
 
 _LIBRARIES = re.compile(r"[/\\](gymnasium|stable_baselines3|rlctl[/\\]check_env)[/\\](?!envs[/\\])")
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
@@ -25,13 +21,14 @@ _LONGEST = 400  # characters
 Complaints = list[dict[str, str]]
 
 
-def library_checkers(make: Callable[[], Any], progress: Progress | None = None) -> Iterator[Message]:
-    """Run each checker on an instance of its own; yield a message per checker."""
-    progress = progress or Progress()
-    progress.phase("checkers")
-    yield _message(GYMNASIUM, make, _gymnasium_checker, progress)
-    # Last, because it loads torch, which takes seconds.
-    yield _message(SB3, make, _sb3_checker, progress)
+def gymnasium_checker(context: Context) -> Iterator[Message]:
+    """Run Gymnasium's checker on an instance of its own."""
+    yield _message(GYMNASIUM, context, _gymnasium_checker)
+
+
+def sb3_checker(context: Context) -> Iterator[Message]:
+    """Run Stable-Baselines3's checker on an instance of its own."""
+    yield _message(SB3, context, _sb3_checker)
 
 
 def _gymnasium_checker() -> Callable[[Any], None]:
@@ -63,9 +60,7 @@ def _without_gymnasiums_wrappers(env: Any) -> Any:
     return env
 
 
-def _message(
-    name: str, make: Callable[[], Any], load: Callable[[], Callable[[Any], None]], progress: Progress
-) -> Message:
+def _message(name: str, context: Context, load: Callable[[], Callable[[Any], None]]) -> Message:
     problem = None
     complaints: Complaints = []
     try:
@@ -73,10 +68,10 @@ def _message(
     except Exception as error:
         problem = f"importing it failed: {describe(error)}"
     else:
-        env = make()
-        progress.enter("check")
+        env = context.make()
+        context.progress.enter("check")
         complaints = complaints_of(checker, env)
-        progress.leave()
+        context.progress.leave()
     return {"type": "checked", "checker": name, "problem": problem, "complaints": _named(name, complaints)}, {}
 
 

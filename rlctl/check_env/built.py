@@ -1,0 +1,89 @@
+"""Describes an environment that was built: its spaces, and what it tells about itself."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from typing import Any
+
+from rlctl.check_env.leaves import leaf_to_wire
+from rlctl.check_env.recording import Instance
+from rlctl.check_env.wire import Message
+
+WAIVERS = "rlctl_ignore"
+"""The class attribute that waives rules: rule id -> reason."""
+
+
+def built(instance: Instance) -> Message:
+    """Return the message that describes an environment."""
+    import gymnasium
+
+    env = instance.env
+    inner = getattr(env, "unwrapped", env)
+    spec = getattr(env, "spec", None)
+    task_env = sys.modules.get("rlctl.task.env")
+    is_task = task_env is not None and isinstance(inner, task_env.TaskEnv)
+    author = type(inner.task) if is_task else type(inner)
+    parts = {"leaves": instance.leaves, "action_leaves": instance.action_leaves}
+    header = {
+        "type": "built",
+        **{name: [leaf_to_wire(leaf) for leaf in leaves] for name, leaves in parts.items()},
+        "observation_space": _short(getattr(env, "observation_space", None)),
+        "action_space": _short(env.action_space),
+        "names": dict(inner.observation_sizes) if is_task else {},
+        "max_steps": inner.max_steps if is_task else getattr(spec, "max_episode_steps", None),
+        "nondeterministic": bool(getattr(spec, "nondeterministic", False)),
+        "accepts_seed": instance.accepts_seed,
+        "is_env": isinstance(env, gymnasium.Env),
+        "metadata": _metadata(inner),
+        "uses_pybullet": "pybullet" in sys.modules and bool(_clients()),
+        "waivers": _waivers(author),
+        **_place(author),
+    }
+    arrays = {}
+    for name, leaves in parts.items():
+        for i, leaf in enumerate(leaves):
+            if leaf.low is not None and leaf.high is not None:
+                arrays[f"{name}/{i}/low"], arrays[f"{name}/{i}/high"] = leaf.low, leaf.high
+    return header, arrays
+
+
+def _clients() -> list[int]:
+    from rlctl.check_env.bullet_clients import connected
+
+    return connected()
+
+
+def _metadata(env: Any) -> dict[str, Any]:
+    metadata = getattr(env, "metadata", None)
+    if not isinstance(metadata, dict):
+        return {}
+    return {
+        str(key): value if isinstance(value, (int, float, str)) else [str(each) for each in value]
+        for key, value in metadata.items()
+        if isinstance(value, (int, float, str, list, tuple))
+    }
+
+
+def _waivers(author: type) -> Any:
+    """Return the waivers as they are written; whether they are good is judged where they are used."""
+    waivers = getattr(author, WAIVERS, {})
+    if isinstance(waivers, dict):
+        return {str(rule): reason if isinstance(reason, str) else "" for rule, reason in waivers.items()}
+    return {repr(waivers)[:40]: ""}
+
+
+def _place(author: type) -> dict[str, Any]:
+    """Return where the class that somebody wrote stands."""
+    try:
+        return {"file": inspect.getsourcefile(author), "line": inspect.getsourcelines(author)[1]}
+    except (OSError, TypeError):
+        return {"file": None, "line": None}
+
+
+def _short(space: Any) -> str:
+    text = " ".join(str(space).split())
+    if len(text) <= 100:
+        return text
+    shape = getattr(space, "shape", None)
+    return f"{type(space).__name__}{shape or ''}"
