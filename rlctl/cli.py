@@ -24,10 +24,12 @@ app = typer.Typer(
     },
 )
 
-Task = Annotated[
-    str,
+OptionalTask = Annotated[
+    Optional[str],  # noqa: UP045
     typer.Argument(
-        help="Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id.", show_default=False
+        metavar="TASK",
+        help="Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id.",
+        show_default=False,
     ),
 ]
 Run = Annotated[
@@ -65,30 +67,55 @@ def _root(
 
 @app.command("check-env")
 def check_env(
-    task: Task,
+    task: OptionalTask = None,
     settings: Set = [],  # noqa: B006 (Typer copies it)
-    env_timeout: EnvTimeout = 10.0,
+    select: Annotated[
+        list[str],
+        typer.Option(metavar="RULES", help="Judge only these: RL3,RL501.", show_default=False),
+    ] = [],  # noqa: B006
+    ignore: Annotated[
+        list[str], typer.Option(metavar="RULES", help="Leave these out: RL107.", show_default=False)
+    ] = [],  # noqa: B006
+    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 for warnings too.")] = False,
+    form: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--format", metavar="text|json|sarif|github", help="Form of the report.", show_default="text"),
+    ] = None,
+    output: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--output", "-o", metavar="FILE", help="Where the report goes.", show_default="stdout"),
+    ] = None,
     json: Json = None,
+    env_timeout: EnvTimeout = 10.0,
+    list_rules: Annotated[bool, typer.Option("--list", help="List all rules, and do nothing else.")] = False,
+    explain: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(metavar="RULE", help="Say what a rule means, and do nothing else.", show_default=False),
+    ] = None,
 ) -> None:
     """Find what is wrong with an environment before hours of training do."""
     _claim_stdout()
+    from rlctl.check_env import formats
     from rlctl.check_env.check import check
-    from rlctl.check_env.report import show
+    from rlctl.check_env.formats import rules
+    from rlctl.check_env.rules.selection import chosen
     from rlctl.env_spec import EnvSpec
 
-    report = check(EnvSpec(task, _task_settings(settings)), env_timeout_s=env_timeout)
-    show(report, json)
+    if list_rules or explain is not None:
+        rules.show_list() if explain is None else rules.explain(explain)
+        return
+    if task is None:
+        raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
+    form, target = formats.choose(form, output, json)
+    spec = EnvSpec(task, _task_settings(settings))
+    report = check(spec, rules=chosen(select, ignore), strict=strict, env_timeout_s=env_timeout)
+    formats.show(report, form, target)
     raise typer.Exit(report.exit_code)
 
 
 @app.command()
 def train(
-    task: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Argument(
-            help="Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id.", show_default=False
-        ),
-    ] = None,
+    task: OptionalTask = None,
     resume: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
@@ -120,6 +147,7 @@ def train(
         ),
     ] = None,
     record: Annotated[int, typer.Option(metavar="N", help="Write the last N evaluation episodes as .rrd.", min=0)] = 0,
+    no_check: Annotated[bool, typer.Option("--no-check", help="Train without checking the environment first.")] = False,
     env_timeout: EnvTimeout = 60.0,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where run folders go.")] = Path(
         "runs"
@@ -143,6 +171,7 @@ def train(
         record=record,
         env_timeout_s=env_timeout,
         root=output,
+        check=not no_check,
     )
     show(run_training(request), json)
 

@@ -25,7 +25,7 @@ class EnvSpec:
     events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     frame_stack: int = 1
 
-    def make(self, render_mode: Literal["human", "rgb_array"] | None = None) -> gymnasium.Env[Any, Any]:
+    def make(self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None) -> gymnasium.Env[Any, Any]:
         """Build the environment; raises `UsageError` for what the user typed, `TaskError` for what it does."""
         constructor = load(self.task)
         if is_task(constructor):

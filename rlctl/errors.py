@@ -31,6 +31,14 @@ class UsageError(RlctlError):
     exit_code = 2
 
 
+class NoSuchClassError(UsageError):
+    """A module was imported and does not define the class that was asked for."""
+
+
+class OldGymError(UsageError):
+    """An id is registered with the old gym, not with Gymnasium."""
+
+
 class RecipeError(UsageError):
     """A recipe or a `--set` has an unknown key, a wrong type or a value out of range."""
 

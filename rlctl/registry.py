@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlctl.errors import TaskError, UsageError, did_you_mean
+from rlctl.errors import NoSuchClassError, OldGymError, TaskError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
     pass
@@ -200,13 +200,13 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
         if not hasattr(constructor, part):
             classes = [name for name, value in vars(module).items() if inspect.isclass(value)]
             own = [name for name in classes if getattr(module, name).__module__ == module.__name__]
-            raise UsageError(
+            raise NoSuchClassError(
                 f"{place} has no {attribute!r}.{did_you_mean(attribute, classes)} "
                 f"It defines: {', '.join(own) or 'no class'}."
             )
         constructor = getattr(constructor, part)
     if not callable(constructor):
-        raise UsageError(f"{target}: {attribute} is a {type(constructor).__name__}, not a class or a function")
+        raise NoSuchClassError(f"{target}: {attribute} is a {type(constructor).__name__}, not a class or a function")
     return constructor  # type: ignore[no-any-return]
 
 
@@ -250,13 +250,28 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
         try:
             return gymnasium.make(task, disable_env_checker=True, **parameters)
         except gymnasium.error.UnregisteredEnv:
-            close = did_you_mean(task.rpartition(":")[2], gymnasium.registry)
+            name = task.rpartition(":")[2]
+            if _of_old_gym(name):
+                raise OldGymError(f"{name} is registered with the old gym, where Gymnasium does not find it") from None
+            close = did_you_mean(name, gymnasium.registry)
             raise UsageError(f"Gymnasium has no environment {task!r}.{close}") from None
-        except (ModuleNotFoundError, gymnasium.error.DeprecatedEnv) as error:
+        except gymnasium.error.DeprecatedEnv as error:
+            raise UsageError(f"Gymnasium: {task}: {error}") from None
+        except ModuleNotFoundError as error:
+            missing = getattr(error.__cause__, "name", None) or error.name
+            if missing and missing != task.partition(":")[0]:
+                raise  # the module is there, and something that it imports is not
             raise UsageError(f"Gymnasium: {task}: {error}") from None
 
     constructor.gymnasium_id = task  # type: ignore[attr-defined]
     return constructor
+
+
+def _of_old_gym(name: str) -> bool:
+    """Say whether the old gym, if something has imported it, knows an id."""
+    old = getattr(sys.modules.get("gym"), "envs", None)
+    known = getattr(old, "registry", {})
+    return name in getattr(known, "env_specs", known)
 
 
 def guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:

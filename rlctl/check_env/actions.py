@@ -14,7 +14,8 @@ HOLD_STEPS = 10
 
 
 def actions(space: spaces.Space[Any], kind: str, seed: int) -> Iterator[Any]:
-    """Yield actions without end: `random`, `zero`, or `extreme` (corners of the space, each held for a while)."""
+    """Yield actions without end: `random`, `zero`, `repeated` (a random one, always the same), or `extreme` (corners of
+    the space, each held for a while)."""
     # A copy: the environment's own space has a generator that it may use, or share with other instances.
     space = copy.deepcopy(space)
     space.seed(seed)
@@ -23,7 +24,11 @@ def actions(space: spaces.Space[Any], kind: str, seed: int) -> Iterator[Any]:
             yield space.sample()
     if kind == "zero":
         while True:
-            yield _zero(space)
+            yield zero_action(space)
+    if kind == "repeated":
+        repeated = space.sample()
+        while True:
+            yield copy.deepcopy(repeated)
     rng = np.random.default_rng(seed)
     while True:
         corner = _corner(space, rng)
@@ -31,7 +36,8 @@ def actions(space: spaces.Space[Any], kind: str, seed: int) -> Iterator[Any]:
             yield copy.deepcopy(corner)
 
 
-def _zero(space: spaces.Space[Any]) -> Any:
+def zero_action(space: spaces.Space[Any]) -> Any:
+    """Return the action that is nearest to doing nothing: zeros, or what stands first."""
     if isinstance(space, spaces.Box):
         return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
     if isinstance(space, spaces.Discrete):
@@ -41,9 +47,9 @@ def _zero(space: spaces.Space[Any]) -> Any:
     if isinstance(space, spaces.MultiBinary):
         return np.zeros(space.shape, space.dtype)
     if isinstance(space, spaces.Dict):
-        return {key: _zero(value) for key, value in space.spaces.items()}
+        return {key: zero_action(value) for key, value in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        return tuple(_zero(value) for value in space.spaces)
+        return tuple(zero_action(value) for value in space.spaces)
     return space.sample()
 
 
@@ -55,7 +61,7 @@ def _corner(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
         return space.start + (space.n - 1) * int(rng.integers(2))
     if isinstance(space, spaces.MultiDiscrete):
         last = (space.nvec - 1) * rng.integers(2, size=space.shape)
-        return (_zero(space) + last).astype(space.dtype)
+        return (zero_action(space) + last).astype(space.dtype)
     if isinstance(space, spaces.MultiBinary):
         return rng.integers(2, size=space.shape).astype(space.dtype)
     if isinstance(space, spaces.Dict):

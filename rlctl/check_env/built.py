@@ -6,8 +6,8 @@ import inspect
 import sys
 from typing import Any
 
+from rlctl.check_env.instance import Instance
 from rlctl.check_env.leaves import leaf_to_wire
-from rlctl.check_env.recording import Instance
 from rlctl.check_env.wire import Message
 
 WAIVERS = "rlctl_ignore"
@@ -35,6 +35,7 @@ def built(instance: Instance) -> Message:
         "nondeterministic": bool(getattr(spec, "nondeterministic", False)),
         "accepts_seed": instance.accepts_seed,
         "is_env": isinstance(env, gymnasium.Env),
+        "is_old_gym": any(base.__module__.partition(".")[0] == "gym" for base in type(inner).__mro__),
         "metadata": _metadata(inner),
         "uses_pybullet": "pybullet" in sys.modules and bool(_clients()),
         "waivers": _waivers(author),

@@ -5,17 +5,17 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 from rlctl import registry
 from rlctl.check_env import studies
-from rlctl.check_env.children import Child, watch
 from rlctl.check_env.evidence import Evidence
 from rlctl.check_env.finding import Rule, Severity
 from rlctl.check_env.judge import Verdict, judge
 from rlctl.check_env.progress import Where
 from rlctl.check_env.rules import RULES
+from rlctl.check_env.watch import Watch
 from rlctl.check_env.wire import Message
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, UsageError
@@ -46,19 +46,6 @@ class Report:
         return int(any(finding.severity in bad for finding in self.verdict.findings))
 
     @property
-    def steps_per_second(self) -> float | None:
-        """Speed of `step` in the probe; None where none was taken."""
-        episodes = self.evidence.episodes
-        seconds = sum(each.step_s for each in episodes)
-        return sum(each.steps for each in episodes) / seconds if seconds > 0 else None
-
-    @property
-    def reset_ms(self) -> float | None:
-        """Mean time of a reset in the probe [ms]."""
-        episodes = self.evidence.episodes
-        return 1e3 * sum(each.reset_s for each in episodes) / len(episodes) if episodes else None
-
-    @property
     def place(self) -> tuple[Path, int] | None:
         """File and line of the environment's class; line 1 where only the file is known."""
         built = self.evidence.built
@@ -74,9 +61,11 @@ def check(
     env_timeout_s: float,
     rules: Sequence[Rule] = RULES,
     strict: bool = False,
+    only: Collection[str] | None = None,
     budget_s: float = studies.PART_S,
+    show_progress: bool = True,
 ) -> Report:
-    """Check an environment with some rules.
+    """Check an environment with some rules, or with what these can tell from some studies `only`.
 
     Raises `UsageError` for a task or a parameter that does not exist. Whatever the environment itself does, a crash
     or a hang of more than `env_timeout_s` seconds in a call included, is in the report.
@@ -93,21 +82,17 @@ def check(
         else:
             evidence.add(header, arrays)
 
-    needed = {study for rule in rules for study in rule.needs}
-    children: list[Child] = []
+    needed = {study for rule in rules for study in rule.needs if only is None or study in only}
+    parts = {part: [study.name for study in studies.of_part(part, needed)] for part in studies.PARTS}
+    watch = Watch(spec, budget_s, env_timeout_s, receive)
     try:
-        with _status(spec.task) as say:
-            for part, hash_seed in studies.PARTS.items():
-                names = [study.name for study in studies.of_part(part, needed)]
-                if names or part == "probe":
-                    children.append(Child(part, spec, names, budget_s, hash_seed=hash_seed))
-            watch(children, receive, env_timeout_s, say)
+        with _status(spec.task, show_progress) as say:
+            watch.run({part: names for part, names in parts.items() if names or part == "probe"}, say)
     finally:
-        for child in children:
-            child.close()
+        watch.close()
     if mistakes:
         raise mistakes[0]
-    evidence.printed_lines, evidence.printed_first = children[0].printed, children[0].first_line
+    evidence.printed_lines, evidence.printed_first = watch.children[0].printed, watch.children[0].first_line
     verdict = judge(evidence, rules)
     return Report(spec.task, verdict, evidence, time.monotonic() - started, budget_s, strict)
 
@@ -123,12 +108,12 @@ def _normalizes(task: str) -> bool | None:
 
 
 @contextlib.contextmanager
-def _status(task: str) -> Iterator[Callable[[Where], None]]:
+def _status(task: str, wanted: bool) -> Iterator[Callable[[Where], None]]:
     """Show a line about what is going on, on a terminal only."""
     from rlctl import output
 
     console = output.err()
-    if not console.is_terminal:
+    if not wanted or not console.is_terminal:
         yield lambda where: None
         return
     with console.status(f"checking {task}") as status:

@@ -20,10 +20,11 @@ from rlctl.check_env import studies
 from rlctl.check_env.built import built
 from rlctl.check_env.context import Context
 from rlctl.check_env.failures import EnvironmentRaised, failure
+from rlctl.check_env.instance import Budget
+from rlctl.check_env.missing_files import missing_file
 from rlctl.check_env.progress import Progress
-from rlctl.check_env.recording import Budget
 from rlctl.check_env.wire import Message, encode, skip
-from rlctl.errors import RlctlError, TaskError, UsageError
+from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
 
 
 def main() -> None:
@@ -59,6 +60,8 @@ def run_part(
     try:
         for header, arrays in _part(part, context, chosen, seconds):
             yield {**header, "part": part}, arrays
+    except (NoSuchClassError, OldGymError) as error:
+        yield {**_load_error(context, error), "part": part}, {}
     except UsageError as error:
         yield {"type": "usage_error", "kind": type(error).__name__, "message": str(error), "part": part}, {}
     except RlctlError as error:
@@ -110,21 +113,38 @@ def _can_act(env: Any) -> bool:
 
 
 def _load_error(context: Context, error: RlctlError) -> dict[str, Any]:
-    stage = context.stage
-    missing = []
-    if stage == "constructor":
-        if isinstance(error.__cause__, TypeError):
-            missing = _missing_arguments(str(error.__cause__))
-        # The registry's own verdict; what the constructor raised comes with its traceback.
-        elif isinstance(error, TaskError) and error.details is None and not _is_task(context.spec):
-            stage = "kind"
+    cause = error.__cause__
+    missing = _missing_arguments(str(cause)) if isinstance(cause, TypeError) else []
+    file = missing_file(cause)
+    kind = context.stage
+    if isinstance(error, NoSuchClassError):
+        kind = "class"
+    elif isinstance(error, OldGymError) or _imports_old_gym(cause):
+        kind = "old gym"
+    elif file is not None:
+        kind = "file"
+    elif kind == "constructor" and missing:
+        kind = "arguments"
+    elif (
+        kind == "constructor" and isinstance(error, TaskError) and error.details is None and not _is_task(context.spec)
+    ):
+        kind = "no environment"  # the registry's own verdict; what the constructor raised comes with its traceback
     return {
         "type": "load_error",
-        "stage": stage,
+        "kind": kind,
         "message": str(error),
         "details": error.details,
         "missing": missing,
+        "file": file,
     }
+
+
+def _imports_old_gym(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "gym":
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _is_task(spec: env_spec.EnvSpec) -> bool:

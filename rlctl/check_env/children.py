@@ -1,4 +1,4 @@
-"""Child processes that environments live in, watched from outside: a crash or a hang is seen, not suffered."""
+"""The child process that an environment lives in: a crash or a hang is seen, not suffered."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from multiprocessing.connection import Connection, wait
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
 from typing import Any
 
 from rlctl.check_env.progress import Progress, Where
-from rlctl.check_env.wire import Message, decode, skip
 from rlctl.env_spec import EnvSpec
 from rlctl.rollout.shared_arrays import anonymous_file
 
@@ -30,13 +29,12 @@ _BOOTSTRAP = (
 
 BUILD_TIMEOUT_S = 60.0
 """How long importing and building may take, unless a step may take longer."""
+FIRST_CALL_TIMEOUT_S = 30.0
+"""How long the first reset and the first step of a process may take, where much is compiled or loaded [s]."""
 CHECKER_CALLS = 40
 """A library's checker is one call to us; it makes at most so many calls into the environment."""
-CHECKERS_GRACE_S = 5.0
-"""How much longer than the other studies the libraries' checkers may take: they have torch to load [s]."""
 IDLE_TIMEOUT_S = 300.0
 """How long a child may do nothing with the environment: loading torch on a busy machine, at the worst."""
-_POLL_S = 0.1
 _KEPT_LINES = 8
 _NOT_ITS_OWN = ("pybullet build time", "argv[")
 """Lines that PyBullet prints when it is imported and when it connects."""
@@ -56,8 +54,8 @@ class Child:
         self._progress = Progress(self._memory)
         self._changed = (-1, time.monotonic())
         ours, theirs = socket.socketpair()
-        self._names = names
-        self._seconds = seconds
+        self.names = names
+        self.seconds = seconds
         self._started = time.monotonic()
         job = {
             "part": part,
@@ -99,18 +97,18 @@ class Child:
     def where(self) -> Where:
         return self._progress.read()
 
-    def hangs(self, env_timeout_s: float) -> bool:
-        """Say whether the call that the child is in takes longer than it may."""
+    def hangs(self, env_timeout_s: float) -> str | None:
+        """Say so if the call that the child is in takes longer than it may."""
         where = self.where
         if where.counter != self._changed[0]:
             self._changed = (where.counter, time.monotonic())
-        return time.monotonic() - self._changed[1] > _limit_s(where.call, env_timeout_s)
+        limit_s = _limit_s(where, env_timeout_s)
+        return f"did not come back in {limit_s:g} s" if time.monotonic() - self._changed[1] > limit_s else None
 
-    def given_up(self) -> Iterator[Message]:
-        """Yield what is not known of a library's checker that goes on for too long: only it cannot be told to stop."""
-        if self.part == "checkers" and time.monotonic() - self._started > self._seconds + CHECKERS_GRACE_S:
-            for name in self._names:
-                yield skip(name, f"the libraries' checkers took longer than {self._seconds + CHECKERS_GRACE_S:g} s")
+    @property
+    def is_over_time(self) -> bool:
+        """Whether it is a library's checker that goes on for too long: only such a one cannot be told to stop."""
+        return self.part == "checkers" and time.monotonic() - self._started > self.seconds
 
     def death(self) -> str:
         """Wait for the end of a child whose connection closed; say how it ended."""
@@ -142,67 +140,12 @@ class Child:
         self._memory = -1
 
 
-def _limit_s(call: str, env_timeout_s: float) -> float:
+def _limit_s(where: Where, env_timeout_s: float) -> float:
+    call = where.call
+    if where.is_first and call in ("reset", "step"):
+        return max(FIRST_CALL_TIMEOUT_S, env_timeout_s)
     if call in ("load", "build"):
         return max(BUILD_TIMEOUT_S, env_timeout_s)
     if call == "check":
         return CHECKER_CALLS * env_timeout_s
     return env_timeout_s if call else IDLE_TIMEOUT_S
-
-
-def watch(
-    children: list[Child],
-    receive: Callable[[Message], None],
-    env_timeout_s: float,
-    on_poll: Callable[[Where], None],
-) -> None:
-    """Pass on what the children say until all are done, dead or hanging; the latter two become messages too."""
-    active = {child.connection: child for child in children}
-    while active:
-        for ready in wait(list(active), timeout=_POLL_S):
-            child = active[ready]  # type: ignore[index]
-            try:
-                message = decode(child.connection.recv_bytes())
-            except (EOFError, OSError):
-                receive(_failure(child, "died", child.death()))
-                del active[child.connection]
-                continue
-            if message[0]["type"] == "done":
-                child.is_done = True
-                del active[child.connection]
-            else:
-                receive(message)
-        for child in list(active.values()):
-            if given_up := list(child.given_up()):
-                for message in given_up:
-                    receive(message)
-                child.close()
-                del active[child.connection]
-            elif child.hangs(env_timeout_s):
-                receive(
-                    _failure(child, "hung", f"did not come back in {_limit_s(child.where.call, env_timeout_s):g} s")
-                )
-                child.close()
-                del active[child.connection]
-                # The checkers would hang in the same call, for much longer.
-                for other in [each for each in active.values() if each.part == "checkers"]:
-                    other.close()
-                    del active[other.connection]
-        on_poll(next(iter(active.values()), children[0]).where)
-
-
-def _failure(child: Child, kind: str, error: str) -> Message:
-    where = child.where
-    header = {
-        "type": "failure",
-        "kind": kind,
-        "call": where.call or "between calls",
-        "part": child.part,
-        "phase": where.phase,
-        "episode": where.episode,
-        "seed": where.seed,
-        "step": where.step,
-        "error": error,
-        "details": "\n".join(child.last_lines) or None,
-    }
-    return header, {}

@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 from rlctl import env_spec, registry
 from rlctl.check_env.failures import EnvironmentRaised, describe, failure
+from rlctl.check_env.instance import Budget, Instance
 from rlctl.check_env.leaves import leaves_of
 from rlctl.check_env.progress import Progress
-from rlctl.check_env.recording import Budget, Instance
 from rlctl.check_env.wire import Message
 from rlctl.errors import TaskError
 
@@ -29,7 +29,7 @@ class Context:
         """What the study that is running may use."""
         self._instance: Instance | None = None
 
-    def make(self, render_mode: Literal["rgb_array"] | None = None) -> Any:
+    def make(self, render_mode: Literal["rgb_array", "ansi"] | None = None) -> Any:
         """Return a new environment; whatever the environment raises is an `RlctlError`."""
         self.stage = "import"
         # Loaded before it is built, to tell an import error from a constructor's.
@@ -41,7 +41,7 @@ class Context:
         self.progress.leave()
         return env
 
-    def build(self, render_mode: Literal["rgb_array"] | None = None) -> Instance:
+    def build(self, render_mode: Literal["rgb_array", "ansi"] | None = None) -> Instance:
         """Return a new instance; what its constructor raises is an `EnvironmentRaised`."""
         try:
             return self._wrap(self.make(render_mode))
@@ -61,14 +61,15 @@ class Context:
         return self._instance
 
     @contextlib.contextmanager
-    def fresh(self, render_mode: Literal["rgb_array"] | None = None) -> Iterator[Instance]:
+    def fresh(self, render_mode: Literal["rgb_array", "ansi"] | None = None) -> Iterator[Instance]:
         """A new instance for one study, closed after it; what its close raises is another study's matter."""
         instance = self.build(render_mode)
         try:
             yield instance
         finally:
-            with contextlib.suppress(EnvironmentRaised):
-                instance.close()
+            if hasattr(instance.env, "close"):
+                with contextlib.suppress(EnvironmentRaised):
+                    instance.close()
 
     def close(self) -> Iterator[Message]:
         """Close the instance that this process keeps."""

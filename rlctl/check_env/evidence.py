@@ -21,6 +21,8 @@ GYMNASIUM, SB3 = "Gymnasium", "Stable-Baselines3"
 RAISED = "the environment raised "
 """How a complaint of a library's checker begins that is the environment's own exception."""
 
+MOST_INFOS = 100
+"""So many numbers of info are recorded per episode, by name."""
 ENDS = ("terminated", "truncated", "both")
 
 
@@ -42,6 +44,8 @@ class Built:
     accepts_seed: bool = True
     is_env: bool = True
     """Whether it inherits from `gymnasium.Env`."""
+    is_old_gym: bool = False
+    """Whether it inherits from the old gym."""
     metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     uses_pybullet: bool = False
     """Whether a PyBullet client was connected once it was built."""
@@ -149,18 +153,22 @@ class Failure:
     error: str
     details: str | None = None
     """A traceback, or the last lines that a dying process printed."""
+    file: Mapping[str, Any] | None = None
+    """A file that was not found, as in `LoadError`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LoadError:
     """Why no environment could be made."""
 
-    stage: str
-    """`import`, `constructor` or `kind`."""
+    kind: str
+    """`import`, `constructor`, `class`, `arguments`, `file`, `old gym` or `no environment`."""
     message: str
     details: str | None
     missing: list[str]
     """Constructor arguments that have no value."""
+    file: Mapping[str, Any] | None
+    """A file that was not found: its name, the folders that were searched, and a similar file."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,7 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+from rlctl.check_env.missing_files import missing_file
 from rlctl.check_env.progress import Progress
 from rlctl.errors import RlctlError
 
@@ -34,6 +35,7 @@ def failure(error: EnvironmentRaised, progress: Progress) -> dict[str, Any]:
         "step": where.step,
         "error": describe(cause),
         "details": "".join(traceback.format_exception(cause)),
+        "file": missing_file(cause),
     }
 
 

@@ -12,8 +12,8 @@ from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Rule, Sev
 from rlctl.check_env.rules import RULES, libraries, observations
 from rlctl.errors import UsageError, did_you_mean
 
-LOADING = "RL0"
-"""The family that is judged even where no instance could be built."""
+LOADING = ("RL0", "RL216")
+"""What is judged even where no instance could be built: loading, and windows that end it."""
 
 
 @dataclasses.dataclass

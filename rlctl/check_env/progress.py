@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.check_env import studies
 
-CALLS = ("", "load", "build", "reset", "step", "close", "sample", "check")
+CALLS = ("", "load", "build", "reset", "step", "close", "sample", "check", "render")
 PHASES = (
     "build",
     *studies.names(),
@@ -40,6 +40,8 @@ class Where:
     episode: int
     seed: int
     step: int
+    is_first: bool
+    """Whether it is the first call of its kind in the process: what is compiled or loaded late is in it."""
 
 
 class Progress:
@@ -51,6 +53,7 @@ class Progress:
         else:
             os.ftruncate(descriptor, _SIZE)
             self._numbers = np.frombuffer(mmap.mmap(descriptor, _SIZE), np.int64)
+        self._called: set[str] = set()
 
     def phase(self, name: str) -> None:
         """Note what is being tried."""
@@ -62,7 +65,8 @@ class Progress:
 
     def enter(self, call: str, step: int = 0) -> None:
         """Note that a call into the environment begins."""
-        self._numbers[5] = step
+        self._numbers[5:7] = step, call not in self._called
+        self._called.add(call)
         self._numbers[1] = CALLS.index(call)
         self._numbers[0] += 1
 
@@ -73,5 +77,5 @@ class Progress:
 
     def read(self) -> Where:
         """Return where the child is."""
-        counter, call, phase, episode, seed, step = self._numbers[:6].tolist()
-        return Where(counter, CALLS[call], PHASES[phase], episode, seed, step)
+        counter, call, phase, episode, seed, step, is_first = self._numbers[:7].tolist()
+        return Where(counter, CALLS[call], PHASES[phase], episode, seed, step, bool(is_first))

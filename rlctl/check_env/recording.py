@@ -4,33 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.actions import actions
+from rlctl.check_env.evidence import MOST_INFOS
 from rlctl.check_env.failures import EnvironmentRaised, failure
+from rlctl.check_env.instance import Budget, Instance
 from rlctl.check_env.leaves import Leaf, pick
-from rlctl.check_env.progress import Progress
+from rlctl.check_env.returned import flat_action, numbers_in, truth, type_name
 from rlctl.check_env.wire import Message
-
-NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
-MOST_INFOS = 100
-
-
-@dataclasses.dataclass
-class Budget:
-    """What the episodes of a probe may use together."""
-
-    deadline: float
-    """On `time.monotonic`'s clock [s]."""
-    bytes_left: int = 48 * 2**20
-
-    @property
-    def seconds_left(self) -> float:
-        return self.deadline - time.monotonic()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,33 +33,8 @@ class Plan:
     max_s: float = 10.0
     then_unseeded: bool = False
     """Reset with the seed, and then once more without one."""
-
-
-class Instance:
-    """One environment, and how it is called."""
-
-    def __init__(
-        self, env: Any, leaves: list[Leaf], action_leaves: list[Leaf], accepts_seed: bool, progress: Progress
-    ) -> None:
-        self.env = env
-        self.leaves = leaves
-        self.action_leaves = action_leaves
-        self.accepts_seed = accepts_seed
-        self.progress = progress
-
-    def call(self, name: str, function: Any, *arguments: Any, step: int = 0, **keywords: Any) -> Any:
-        """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`."""
-        self.progress.enter(name, step)
-        try:
-            return function(*arguments, **keywords)
-        except BaseException as error:
-            raise EnvironmentRaised(name) from error
-        finally:
-            self.progress.leave()
-
-    def close(self) -> None:
-        """Close the environment."""
-        self.call("close", self.env.close)
+    given: Iterable[Any] | None = None
+    """The actions themselves, at least `max_steps` of them; `actions` is then only their kind's name."""
 
 
 class Recording:
@@ -109,8 +70,7 @@ class Recording:
         seed = self.plan.seed
         self.instance.progress.episode(self.plan.episode, seed)
         self._deadline = min(time.monotonic() + self.plan.max_s, self.budget.deadline)
-        chosen = self.plan.action_seed
-        self._actions = actions(self.instance.env.action_space, self.plan.actions, seed if chosen is None else chosen)
+        self._actions = self._chosen_actions()
         keywords = {"seed": seed} if self.instance.accepts_seed else {}
         started = time.perf_counter()
         try:
@@ -126,11 +86,18 @@ class Recording:
         self._note_info(info)
         self._observe(observation)
 
+    def _chosen_actions(self) -> Iterator[Any]:
+        plan = self.plan
+        if plan.given is not None:
+            return iter(plan.given)
+        seed = plan.seed if plan.action_seed is None else plan.action_seed
+        return actions(self.instance.env.action_space, plan.actions, seed)
+
     def _unpack_reset(self, result: Any) -> tuple[Any, Any]:
         if isinstance(result, tuple) and len(result) == 2:
             return result
         size = f" of {len(result)}" if isinstance(result, tuple) else ""
-        self._note("reset", _type(result) + size)
+        self._note("reset", type_name(result) + size)
         return result, {}
 
     def step(self) -> None:
@@ -152,11 +119,11 @@ class Recording:
             self._ended = "raised"
             return
         observation, reward, terminated, truncated, info = unpacked
-        self._note("terminated", _type(terminated))
-        self._note("truncated", _type(truncated))
+        self._note("terminated", type_name(terminated))
+        self._note("truncated", type_name(truncated))
         self._note_info(info)
         self._reward(reward)
-        flags = (_truth(terminated), _truth(truncated))
+        flags = (truth(terminated), truth(truncated))
         self._flags.append(flags)
         self._observe(observation)
         self._continue(*flags)
@@ -169,7 +136,7 @@ class Recording:
             observation, reward, done, info = result
             return observation, reward, done, False, info
         size = f" of {len(result)}" if isinstance(result, tuple) else ""
-        self._note("step", _type(result) + size)
+        self._note("step", type_name(result) + size)
         return None
 
     def _continue(self, terminated: bool, truncated: bool) -> None:
@@ -195,7 +162,7 @@ class Recording:
         seen[1] += 1
 
     def _note_info(self, info: Any) -> None:
-        self._note("info", _type(info))
+        self._note("info", type_name(info))
         if isinstance(info, dict):
             for name, value in numbers_in(info):
                 if name in self._infos or len(self._infos) < MOST_INFOS:
@@ -204,7 +171,7 @@ class Recording:
                     values.append(value)
 
     def _reward(self, reward: Any) -> None:
-        self._note("reward", _type(reward))
+        self._note("reward", type_name(reward))
         try:
             self._rewards.append(float(reward))
             self._is_number.append(True)
@@ -229,9 +196,9 @@ class Recording:
         try:
             array = np.array(value)  # a copy: an environment may write into what it returned
         except Exception:  # a ragged list, or an object of its own kind; its type is noted, and is a finding
-            self._note("observation", _type(value), index, None, None)
+            self._note("observation", type_name(value), index, None, None)
             return
-        self._note("observation", _type(value), index, str(array.dtype), array.shape)
+        self._note("observation", type_name(value), index, str(array.dtype), array.shape)
         self._compare_memory(index, value, array)
         if array.shape != leaf.shape or array.dtype.kind not in "biuf":
             return
@@ -292,35 +259,6 @@ class Recording:
         return [(header, arrays), *failed]
 
 
-def flat_action(leaves: list[Leaf], action: Any) -> NDArray[np.float64]:
-    """Return an action's numbers in the order of the action space's leaves; those of unknown kinds are left out."""
-    parts = [np.ravel(pick(action, leaf.path)).astype(np.float64) for leaf in leaves if leaf.supported]
-    return np.concatenate(parts) if parts else np.zeros(0)
-
-
-def numbers_in(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
-    """Yield the numbers of an info by name; those in a dictionary of it as `reward_terms/distance`."""
-    for key, value in info.items():
-        if isinstance(value, dict):
-            for name, inner in value.items():
-                if isinstance(inner, NUMBERS):
-                    yield f"{key}/{name}", float(inner)
-        elif isinstance(value, NUMBERS):
-            yield str(key), float(value)
-
-
 def _form(key: tuple[Any, ...], step: int, count: int) -> dict[str, Any]:
     names = ("what", "type", "leaf", "dtype", "shape")
     return {**dict.fromkeys(names), **dict(zip(names, key, strict=False)), "step": step, "count": count}
-
-
-def _type(value: Any) -> str:
-    kind = type(value)
-    return kind.__qualname__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__qualname__}"
-
-
-def _truth(flag: Any) -> bool:
-    try:
-        return bool(np.any(flag))
-    except Exception:  # its type is noted, and is a finding
-        return False

@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from rlctl.check_env.world_results import Source, Worlds  # noqa: F401 (found by name)
+
 
 def decode(kind: str, content: Mapping[str, Any]) -> Any:
     """Return the result that a study sent."""
@@ -30,3 +32,210 @@ class GlobalUse:
     call: str
     """`build`, `reset` or `step`."""
     step: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionEffects:
+    """What each dimension of the action does."""
+
+    dimensions: list[ActionEffect]
+    """Those that were tried."""
+    total: int
+    """How many the action has."""
+    left_out: str
+    """Why not all were tried; empty if they were."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionEffect:
+    """What one dimension of the action does."""
+
+    name: str
+    """`action[2]`."""
+    effect: str
+    """`lasting`; `cost`: in the reward of its own step only; `copy`: beside that, only as a copy of itself in the
+    observation; `none`."""
+    saturates: str
+    """`switch`: only its sign counts; `range`: from a fifth of its range on nothing changes; empty otherwise."""
+    seeds: list[int]
+    steps: int
+    """How far the longest comparison went."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OutOfRange:
+    """An episode with actions of twice the bounds, against one at the bounds."""
+
+    raised: str | None
+    """What the first such action raised."""
+    seed: int
+    steps: int
+    difference: str
+    """`observation`, `reward`, `end`; empty if there is none."""
+    step: int
+    inside: float
+    outside: float
+
+
+@dataclasses.dataclass(frozen=True)
+class NanAction:
+    """What came of an action of NaN."""
+
+    raised: str | None
+    finite: bool
+    """Whether all observations and rewards that came back were finite."""
+    seed: int
+    step: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Leaks:
+    """Counts after each reset of one instance: what it keeps of earlier episodes."""
+
+    clients: list[int]
+    """PyBullet clients of the process."""
+    bodies: list[int]
+    """Bodies in the worlds of all clients."""
+    descriptors: list[int]
+    threads: list[int]
+    memory: list[int]
+    """Resident memory [bytes] once the warm-up is over, half way, and at the end; empty where it is not known."""
+    measured: list[int]
+    """After how many resets each of these was measured."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SharedSpaces:
+    """What two instances have in common."""
+
+    objects: list[str]
+    """`action_space` and `observation_space`, where it is one object."""
+    generators: list[str]
+    """The same, where only the random generator is."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Attributes:
+    """Attributes that wrappers and learners use."""
+
+    problems: list[str]
+    truncation: str
+    """What the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Windows:
+    """Windows that opened unasked."""
+
+    gui_clients: int
+    """PyBullet clients with a window, though no render mode was asked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WorkerBuild:
+    """An instance built in a daemonic process that `multiprocessing` spawned."""
+
+    kind: str
+    """`done`, `raised`, `died`, `hung` or `unknown`."""
+    call: str
+    """How far it came: `import`, `load`, `build`, `reset`, `step` or `close`."""
+    error: str
+    details: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class StepBeforeReset:
+    """A step of an instance that was not reset."""
+
+    raised: str | None
+
+
+@dataclasses.dataclass(frozen=True)
+class CloseTwice:
+    """Closing an instance that is closed."""
+
+    raised: str | None
+
+
+@dataclasses.dataclass(frozen=True)
+class AfterEnd:
+    """Steps after the end of an episode."""
+
+    seed: int
+    ended: int
+    """The step that ended it."""
+    steps: int
+    """How many were taken after it."""
+    raised: str | None
+    rewards: list[float]
+    """The finite ones."""
+    problems: list[AfterEndProblem]
+
+
+@dataclasses.dataclass(frozen=True)
+class AfterEndProblem:
+    """Something that came back after the end and is no observation or reward."""
+
+    kind: str
+    """`shape`, `not finite` or `outside`."""
+    what: str
+    """The observation's part, or the reward."""
+    step: int
+    value: str
+    expected: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Rendering:
+    """Pictures of an environment."""
+
+    attempts: list[RenderAttempt]
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderAttempt:
+    """One render mode."""
+
+    mode: str
+    problem: str
+    """`missing` (a library), `build`, `render`, `type`, `plain` (a picture of one colour), or empty."""
+    text: str
+    """What was raised or returned instead."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Speed:
+    """How long steps and resets take, and what takes that long."""
+
+    step_s: float | None
+    """A step with a random action, with nothing measured but time [s]; None where none could be taken."""
+    reset_s: float | None
+    steps: int
+    """How many were timed."""
+    resets: int
+    slowest_in_step: list[TimedCall]
+    """By their own time, what they call left out; the slowest first."""
+    slowest_in_reset: list[TimedCall]
+    suspicious_in_step: list[TimedCall]
+    """Calls that step should not make, with what they call; none is inside another."""
+    suspicious_in_reset: list[TimedCall]
+    rebuilds: bool
+    """Whether it is a task of rlctl that says itself that every reset loads the world anew."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TimedCall:
+    """The calls of one function in all steps, or in all resets."""
+
+    name: str
+    """`pybullet.stepSimulation`."""
+    place: str
+    """Where in the environment's code most of its time goes, `file.py:12`; empty if that is not known."""
+    share: float
+    """Its part of the time of all steps, or of all resets."""
+    calls: float
+    """How many per step, or per reset."""
+    kind: str = ""
+    """`rendering`, `sleeping`, `loading` or `connecting`, for what is suspicious."""
+    inside: str = ""
+    """Another suspicious function that it calls itself."""

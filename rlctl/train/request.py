@@ -23,6 +23,7 @@ from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.policy import versions
 from rlctl.run.recipe import Recipe, resolve, validate
 from rlctl.train.display import Display, make_display
+from rlctl.train.precheck import Precheck
 
 if TYPE_CHECKING:
     from rlctl.train.loop import Progress, TrainingLoop
@@ -43,6 +44,8 @@ class TrainRequest:
     record: int = 0
     env_timeout_s: float = 60.0
     root: Path = directory.ROOT
+    check: bool = False
+    """Whether to check the environment first, and to refuse one that has errors."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,10 +94,11 @@ def _run(request: TrainRequest, start: _Start) -> TrainResult:
     spec = start.recipe.env_spec(start.task)
     title = f"{'resume' if start.state else 'train'} {start.task} ({start.recipe.algo})"
     with make_display(title, start.recipe.total_timesteps) as display:
-        # The workers build their environments while this process imports torch.
+        # The workers build their environments, and the check runs, while this process imports torch.
         workers = _workers(spec, start.recipe.n_envs, request, display)
+        precheck = Precheck(spec, request.env_timeout_s) if request.check and not start.state else None
         try:
-            return _train(request, start, spec, workers, display)
+            return _train(request, start, spec, workers, precheck, display)
         finally:
             workers.close()
 
@@ -147,7 +151,14 @@ def _workers(spec: EnvSpec, n_envs: int, request: TrainRequest, display: Display
     return Workers(spec, n_envs, timeout_s=request.env_timeout_s, on_output=display.message)
 
 
-def _train(request: TrainRequest, start: _Start, spec: EnvSpec, workers: Workers, display: Display) -> TrainResult:
+def _train(
+    request: TrainRequest,
+    start: _Start,
+    spec: EnvSpec,
+    workers: Workers,
+    precheck: Precheck | None,
+    display: Display,
+) -> TrainResult:
     from rlctl.run.torch_policy import pin_threads
     from rlctl.train import checkpoint
     from rlctl.train.algorithms import build_model
@@ -166,6 +177,8 @@ def _train(request: TrainRequest, start: _Start, spec: EnvSpec, workers: Workers
     model = build_model(recipe, env, request.device)
     if start.checkpoint is not None:
         checkpoint.restore(model, start.checkpoint, dict(start.state))
+    if precheck is not None:
+        precheck.refuse_errors(display)
     run = start.run or directory.create(start.task, recipe.seed, request.root)
     lock = start.lock or run.lock()
     if start.state:

@@ -5,7 +5,10 @@ import functools
 import sys
 from pathlib import Path
 
+import pybullet
+
 from rlctl.check_env import studies
+from rlctl.check_env.bullet_clients import connected
 from rlctl.check_env.child_process import run_part
 from rlctl.check_env.evidence import Evidence
 from rlctl.check_env.judge import judge
@@ -33,6 +36,8 @@ def case(broken: str, *expected: tuple[str, str], twin: str = "broken_envs.py:Cl
 def evidence_of(task, parts=PARTS):
     task = str(FOLDER / task) if ".py:" in task else task
     evidence = Evidence(task)
+    for client in connected():  # of an environment that was not closed
+        pybullet.disconnect(client)
     for part in parts:
         # As in a new process: nothing that an earlier part left in the module.
         for name in [name for name in sys.modules if name.startswith("broken_")]:

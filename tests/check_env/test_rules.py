@@ -4,11 +4,12 @@ Lives the environments in this process; what needs a process of its own is in `t
 """
 
 import re
+from importlib import import_module
 
 import pytest
 
 from rlctl.check_env.rules import RULES
-from tests.check_env.judging import case, check_case, evidence_of, found, verdict_of
+from tests.check_env.judging import FOLDER, case, check_case, evidence_of, found, verdict_of
 
 CASES = [
     case("broken_envs.py:OldGym", ("RL003", "error"), ("RL201", "error"), ("RL202", "error")),
@@ -22,6 +23,10 @@ CASES = [
     case("broken_envs.py:UnboundedActions", ("RL106", "error")),
     case("broken_envs.py:WideActions", ("RL107", "info")),
     case("broken_envs.py:OddImage", ("RL108", "warning")),
+    case("broken_spaces.py:FloatPicture", ("RL108", "warning"), twin="broken_spaces.py:Seen"),
+    case("broken_spaces.py:TwoAxes", ("RL108", "warning"), twin="broken_spaces.py:Seen"),
+    case("broken_spaces.py:Dark", ("RL108", "warning"), twin="broken_spaces.py:Seen"),
+    case("broken_spaces.py:Asymmetric", ("RL107", "info"), ("RL113", "warning")),
     case("broken_envs.py:TupleObservation", ("RL109", "warning")),
     case("broken_envs.py:FourValues", ("RL201", "error")),
     case("broken_envs.py:NoSeed", ("RL202", "error")),
@@ -41,7 +46,7 @@ CASES = [
     case("broken_envs.py:TimeInInfo", ("RL307", "warning")),
     case("broken_envs.py:UnseededLater", ("RL308", "warning")),
     case("broken_envs.py:Residue", ("RL301", "warning")),
-    case("broken_envs.py:SharedWorld", ("RL401", "error"), ("RL402", "error")),
+    case("broken_envs.py:SharedWorld", ("RL401", "error"), ("RL402", "error"), ("RL808", "error")),
     case("broken_envs.py:CloseBreaks", ("RL402", "error")),
     case("broken_envs.py:OnlyOne", ("RL403", "error")),
     case("broken_envs.py:TimeLimitTerminates", ("RL501", "error")),
@@ -49,6 +54,8 @@ CASES = [
     case("broken_envs.py:Endless", ("RL503", "warning")),
     case("broken_envs.py:EndsAtOnce", ("RL504", "warning")),
     case("broken_envs.py:NanReward", ("RL601", "error")),
+    case("broken_checkers.py:OwnSeed", ("RL290", "warning")),
+    case("broken_checkers.py:OtherReward", ("RL291", "error"), twin="broken_checkers.py:Goal"),
 ]
 
 
@@ -129,6 +136,16 @@ def test_space_that_no_rule_can_look_into_is_said():
     verdict = verdict_of("broken_envs.py:TextObservation", ("probe", "instances"))
     assert verdict.findings == []
     assert verdict.not_judged["observation['say']"] == "no rule can look into a Text space"
+
+
+IN_PROCESSES = {"RL004", "RL208", "RL209", "RL211", "RL216", "RL305"}
+"""What only shows with real child processes: in test_processes.py, and RL216 in test_interface.py."""
+
+
+def test_every_rule_has_an_environment_that_breaks_it():
+    modules = [import_module(f"tests.check_env.{file.stem}") for file in FOLDER.glob("test_*.py")]
+    broken = {rule for module in modules for case in getattr(module, "CASES", []) for rule, _ in case.expected}
+    assert broken | IN_PROCESSES == {rule.id for rule in RULES}
 
 
 def test_rules_are_complete():

@@ -107,3 +107,24 @@ class NoSuccess(Line):
 
     def step(self, action):
         return (*super().step(action)[:4], {})
+
+
+class Unseeded(Line):
+    """Draws from a generator that no seed reaches."""
+
+    def step(self, action):
+        return super().step(action + np.random.uniform(-1, 1))  # noqa: NPY002
+
+
+class FixedStart(Line):
+    """Starts always at the same place."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = 0.2
+        return self._observation(), {}
+
+
+class Unbuilt(Line):
+    def __init__(self):
+        raise RuntimeError("no licence")

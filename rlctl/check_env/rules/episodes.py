@@ -6,9 +6,11 @@ from collections.abc import Iterator
 
 from rlctl.check_env.evidence import ENDS, Evidence, Trajectory
 from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
-from rlctl.check_env.rules.known import built
+from rlctl.check_env.results import Attributes
+from rlctl.check_env.rules.known import built, result
+from rlctl.check_env.studies import LIVES
 
-ERROR, WARNING = Severity.ERROR, Severity.WARNING
+ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
 
 FEWEST_EPISODES = 6
 SHORTEST_LIMIT = 5
@@ -130,3 +132,36 @@ def ends_at_once(evidence: Evidence) -> Iterator[Seen]:
     episodes = _episodes(evidence)
     if len(episodes) >= FEWEST_EPISODES and all(each.has_ended and each.steps == 1 for each in episodes):
         yield Seen(f"all {len(episodes)} episodes end on step 1", {"step": 1, "episodes": len(episodes)})
+
+
+@rule(
+    "RL506",
+    "no time limit",
+    WARNING,
+    "Wrap it in gymnasium.wrappers.TimeLimit, register it with max_episode_steps, or count steps and truncate.",
+    needs=(*LIVES, "attributes"),
+)
+def limited(evidence: Evidence) -> Iterator[Seen]:
+    """Every episode so far ended by failing (or succeeding), and there is no time limit. The episode of a good policy
+    that neither falls nor arrives then never ends: training and evaluation stop in it."""
+    known, episodes = built(evidence), _episodes(evidence)
+    if known.max_steps is not None or any(each.ended != "terminated" for each in episodes):
+        return  # RL503 tells of those that did not end
+    lengths = [each.steps for each in episodes]
+    is_continuous = any(leaf.kind == "Box" for leaf in known.leaves)
+    if len(set(lengths)) == 1 or (max(lengths) < SHORTEST_TIE and not is_continuous):
+        return  # a bandit, or a game of a few moves
+    if any(form.what == "step" for each in episodes for form in each.forms):
+        raise NotJudged("step returns one flag for both (RL201)")
+    if list(time_limit.check(evidence)):
+        raise NotJudged("a time limit seems to be flagged as terminated (RL501)")
+    truncation = result(evidence, Attributes, "attributes").truncation
+    if truncation == "computed":
+        return  # its limit was not reached
+    why = "step always returns truncated=False" if truncation == "never" else "none is declared or was seen"
+    yield Seen(
+        f"no time limit: {why}; all {len(episodes)} episodes ended with terminated=True, the longest after "
+        f"{max(lengths)} steps",
+        {"episodes": len(episodes), "value": None, "expected": "max_episode_steps", "step": max(lengths)},
+        WARNING if is_continuous and truncation == "never" else INFO,
+    )

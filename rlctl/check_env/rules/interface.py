@@ -7,8 +7,9 @@ from typing import Any
 
 from rlctl.check_env import studies
 from rlctl.check_env.evidence import RAISED, Evidence, Failure, Form, Trajectory
-from rlctl.check_env.finding import Seen, Severity, rule
-from rlctl.check_env.rules.known import built, lived
+from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.results import Attributes
+from rlctl.check_env.rules.known import built, lived, lost_display, result
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
 
@@ -175,7 +176,8 @@ def _in_call(failure: Failure) -> str:
 )
 def raises(evidence: Evidence) -> Iterator[Seen]:
     """A call into the environment raises with actions from its own action space. Training ends there."""
-    for count, failure in enumerate(calls_alone(evidence, "raised")):
+    raised = (failure for failure in calls_alone(evidence, "raised") if failure.file is None)  # RL007 has those
+    for count, failure in enumerate(raised):
         if count == MOST_FAILURES:
             break
         yield Seen(f"{_in_call(failure)} raised {failure.error}", where(failure))
@@ -192,6 +194,8 @@ def survives(evidence: Evidence) -> Iterator[Seen]:
     """A call into the environment crashes or ends the interpreter. In training it takes the worker with it."""
     built(evidence)
     for failure in calls_alone(evidence, "died"):
+        if lost_display(failure):
+            continue  # RL216 says why
         yield Seen(f"the process {failure.error} in {_in_call(failure)}", where(failure))
 
 
@@ -236,3 +240,21 @@ def silent(evidence: Evidence) -> Iterator[Seen]:
     yield Seen(
         f"{lines} lines on stdout in {steps} steps, the first: {first!r}", {"value": lines, "expected": 0}, severity
     )
+
+
+@rule(
+    "RL214",
+    "attributes that wrappers need",
+    WARNING,
+    "Leave np_random, metadata, render_mode and unwrapped as gymnasium.Env has them, and make each space once, in the "
+    "constructor.",
+    needs=("attributes",),
+    complaints=(r"no attribute 'bit_generator'", r"'(list|tuple|str|NoneType)' object has no attribute 'get'"),
+)
+def attributes(evidence: Evidence) -> Iterator[Seen]:
+    """An attribute that every gymnasium.Env has is missing, or is something else: wrappers that read it fail, or see
+    something that changes under them. Old code puts a RandomState into np_random."""
+    if not built(evidence).is_env:
+        raise NotJudged("it is no gymnasium.Env (RL003)")
+    for problem in result(evidence, Attributes, "attributes").problems:
+        yield Seen(problem, {"value": problem})

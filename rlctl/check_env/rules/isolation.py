@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from rlctl.check_env.comparison import first_difference
 from rlctl.check_env.evidence import Evidence, Failure, Trajectory
 from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.results import SharedSpaces
 from rlctl.check_env.rules.determinism import compared
 from rlctl.check_env.rules.interface import calls_alone, where
-from rlctl.check_env.rules.known import built, one
+from rlctl.check_env.rules.known import built, one, result
 
-ERROR, WARNING = Severity.ERROR, Severity.WARNING
+ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
 
 CLIENT_FIX = (
     "Give each instance its own state. With PyBullet: keep the id that p.connect returned and pass "
@@ -94,3 +95,25 @@ def second_instance(evidence: Evidence) -> Iterator[Seen]:
             beside = "in one process" if failure.phase in ("fresh instance", "interleaved") else "in a second process"
             yield Seen(f"a second instance {beside} cannot be built: {failure.error}", where(failure))
             return
+
+
+@rule(
+    "RL404",
+    "instances share a space",
+    WARNING,
+    "Make the spaces in the constructor, self.action_space = spaces.Box(...), not on the class or in the module.",
+    needs=("attributes",),
+)
+def shared_spaces(evidence: Evidence) -> Iterator[Seen]:
+    """Two instances have one space object, or one random generator in theirs. Seeding or sampling the actions of one
+    changes what the other draws: the random actions of a training cannot be repeated, or are the same everywhere."""
+    if not built(evidence).is_env:
+        raise NotJudged("it is no gymnasium.Env (RL003)")
+    shared = result(evidence, SharedSpaces, "attributes")
+    for what, names in (("", shared.objects), (" random generator", shared.generators)):
+        if names:
+            # Nobody samples observations.
+            severity = WARNING if "action_space" in names else INFO
+            spaces = " and ".join(f"the {name}'s{what}" if what else name for name in names)
+            message = f"two instances have one object as {spaces}" if not what else f"two instances share {spaces}"
+            yield Seen(message, {"value": names, "expected": []}, severity)

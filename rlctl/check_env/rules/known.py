@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from typing import TypeVar
 
-from rlctl.check_env.evidence import Built, Evidence, Trajectory
+from rlctl.check_env.evidence import Built, Evidence, Failure, Trajectory
 from rlctl.check_env.finding import NotApplicable, NotJudged
 
 T = TypeVar("T")
+
+NO_DISPLAY = re.compile(
+    r"cannot connect to x server|could ?n.t connect to display|could not connect to display|no \$DISPLAY|"
+    r"DISPLAY environment variable is missing|no available video device|cannot open display|"
+    r"could not load the qt platform plugin|NoSuchDisplayException|failed to open display",
+    re.IGNORECASE,
+)
+"""What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
 
 
 def built(evidence: Evidence) -> Built:
@@ -56,3 +65,8 @@ def require_pybullet(evidence: Evidence) -> None:
     """Raise `NotApplicable` for an environment that has no PyBullet client."""
     if not built(evidence).uses_pybullet:
         raise NotApplicable("no PyBullet world")
+
+
+def lost_display(failure: Failure) -> bool:
+    """Say whether a process ended for want of a display."""
+    return failure.kind == "died" and NO_DISPLAY.search(failure.details or "") is not None

@@ -29,7 +29,9 @@ def global_random(context: Context) -> Iterator[Message]:
         before = _states()
         recording.step()
         _compare(before, "step", recording.steps, uses)
-    if recording.failure is None:
+    if recording.failure is not None:
+        yield recording.failure, {}
+    else:
         yield result(GlobalRandom(list(uses.values())))
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
+import os
 import re
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -82,37 +85,50 @@ def _named(name: str, complaints: Complaints) -> list[dict[str, str]]:
 def complaints_of(checker: Callable[[Any], None], env: Any) -> Complaints:
     """Run a checker on an environment and return what it said; warnings of other code are left out."""
     complaints: Complaints = []
+    home = _home(env)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         try:
             checker(env)
         except BaseException as error:  # an environment may raise anything, SystemExit too
-            complaints.append({"kind": "error", "text": _text(error)})
+            complaints.append({"kind": "error", "text": _text(error, home)})
         finally:
-            _close(env, complaints)
+            _close(env, complaints, home)
     said = [str(each.message) for each in told if _LIBRARIES.search(each.filename)]
     return [{"kind": "warning", "text": _clean(text)} for text in dict.fromkeys(said)] + complaints
 
 
-def _close(env: Any, complaints: Complaints) -> None:
+def _home(env: Any) -> str:
+    """Return the folder of the package that the environment's class is written in, or its file."""
+    try:
+        file = Path(inspect.getfile(type(getattr(env, "unwrapped", env))))
+    except (OSError, TypeError):
+        return ""
+    packages = [folder for folder in file.parents if (folder / "__init__.py").is_file()]
+    return f"{packages[-1]}{os.sep}" if packages else str(file)
+
+
+def _close(env: Any, complaints: Complaints, home: str) -> None:
     if not hasattr(env, "close"):
         return
     try:
         env.close()
     except BaseException as error:
-        complaints.append({"kind": "error", "text": _text(error)})
+        complaints.append({"kind": "error", "text": _text(error, home)})
 
 
-def _text(error: BaseException) -> str:
-    if _from_environment(error.__traceback__):
+def _text(error: BaseException, home: str) -> str:
+    if _from_environment(error.__traceback__, home):
         return RAISED + describe(error)
     text = _clean(str(error)) or "no message"
     return text if isinstance(error, AssertionError) else f"{type(error).__name__}: {text}"
 
 
-def _from_environment(trace: TracebackType | None) -> bool:
+def _from_environment(trace: TracebackType | None, home: str) -> bool:
     """Say whether an exception passed through code that is neither a checker's nor a library's below it."""
     files = [frame.filename for frame in traceback.extract_tb(trace)]
+    if home and not _LIBRARIES.search(home) and any(file.startswith(home) for file in files):
+        return True
     return any("site-packages" not in file and not _LIBRARIES.search(file) for file in files) or any(
         re.search(r"[/\\]gymnasium[/\\]envs[/\\]", file) for file in files
     )

@@ -10,12 +10,14 @@ from collections.abc import Iterator
 
 from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED, SECOND_SEED
-from rlctl.check_env.recording import Instance, Plan, Recording
+from rlctl.check_env.instance import Instance
+from rlctl.check_env.recording import Plan, Recording
 from rlctl.check_env.wire import Message, skip
 
 EPISODES = [
     *("random", "zero", "extreme", "random", "random", "random"),
     *("extreme", "zero", "random", "random", "extreme", "random", "extreme", "random"),
+    *("repeated", "repeated"),
 ]
 """How the actions of each episode are chosen; the first three come first, in case time runs out."""
 COMPARED_STEPS = 300

@@ -1,0 +1,39 @@
+"""What there is to find: `--list` and `--explain`."""
+
+from __future__ import annotations
+
+import textwrap
+
+from rlctl import output
+from rlctl.check_env.finding import Severity
+from rlctl.check_env.formats.plain import STYLES
+from rlctl.check_env.rules import FAMILIES, RULES
+from rlctl.check_env.rules.selection import find
+
+
+def show_list() -> None:
+    """Print every rule, by family."""
+    from rich.text import Text
+
+    out = output.out()
+    for family, title in FAMILIES.items():
+        out.print(Text(f"{family} {title}", "bold"))
+        for rule in RULES:
+            if rule.id.startswith(family):
+                severity = Text(f"{rule.severity:<8}", STYLES[rule.severity])
+                out.print(Text(f"  {rule.id}  ").append_text(severity).append(rule.name))
+    counts = ", ".join(f"{sum(rule.severity is each for rule in RULES)} {each}s" for each in Severity)
+    out.print(f"{len(RULES)} rules: {counts}. rlctl check-env --explain {RULES[0].id} says more.", markup=False)
+
+
+def explain(code: str) -> None:
+    """Print what a rule means, and what to do about it."""
+    from rich.text import Text
+
+    out, rule = output.out(), find(code)
+    out.print(Text(f"{rule.id}  {rule.name}", "bold"))
+    out.print(Text(f"{rule.severity}, {FAMILIES[rule.id[:3]]}", STYLES[rule.severity]))
+    for paragraph in rule.meaning.split("\n\n"):
+        out.print("\n" + textwrap.fill(" ".join(paragraph.split()), 100), markup=False)
+    out.print(f"\nfix: {textwrap.fill(rule.fix, 100)}", markup=False)
+    out.print(f'waive: rlctl_ignore = {{"{rule.id}": "why this is meant"}} on the class', style="dim", markup=False)

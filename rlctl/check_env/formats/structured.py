@@ -1,0 +1,101 @@
+"""A report as JSON; its schema is report.schema.json beside the package's modules."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from rlctl import __version__
+from rlctl.check_env.check import Report
+from rlctl.check_env.finding import Finding
+from rlctl.check_env.formats.ranges import Row, action_rows, observation_rows
+from rlctl.check_env.results import Speed
+
+SCHEMA = Path(__file__).parent.parent / "report.schema.json"
+
+
+def text(report: Report) -> str:
+    """Return a report as JSON text."""
+    return json.dumps(content(report), indent=2, allow_nan=False) + "\n"
+
+
+def content(report: Report) -> dict[str, Any]:
+    """Return a report as plain data."""
+    verdict, evidence = report.verdict, report.evidence
+    return {
+        "format": "rlctl check-env 1",
+        "rlctl": __version__,
+        "task": report.task,
+        "exit_code": report.exit_code,
+        "strict": report.strict,
+        "findings": [finding_json(each) for each in verdict.findings],
+        "waived": [
+            {**finding_json(each), "reason": evidence.built.waivers[each.rule] if evidence.built else ""}
+            for each in verdict.waived
+        ],
+        "judged": verdict.judged,
+        "not_judged": [{"what": rule, "reason": why} for rule, why in verdict.not_judged.items()],
+        "not_applicable": [{"rule": rule, "reason": why} for rule, why in verdict.not_applicable.items()],
+        "crashed": [{"what": name, "traceback": trace} for name, trace in verdict.crashed.items()],
+        "environment": _environment(report),
+        "speed": _speed(report),
+        "episodes": len(evidence.episodes),
+        "steps": sum(each.steps for each in evidence.trajectories),
+        "seconds": report.seconds,
+        "budget_seconds": report.budget_s,
+        "studies": evidence.seconds,
+    }
+
+
+def finding_json(finding: Finding) -> dict[str, Any]:
+    """Return a finding as plain data."""
+    return {
+        "rule": finding.rule,
+        "name": finding.name,
+        "severity": str(finding.severity),
+        "message": finding.message,
+        "evidence": plain(finding.evidence),
+        "fix": finding.fix,
+    }
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: infinity and NaN become text."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, dict):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(each) for each in value]
+    return value
+
+
+def _environment(report: Report) -> dict[str, Any] | None:
+    built = report.evidence.built
+    if built is None:
+        return None
+    return {
+        "observation_space": built.observation_space,
+        "action_space": built.action_space,
+        "observations": [_row(row) for row in observation_rows(report.evidence)],
+        "actions": [_row(row) for row in action_rows(report.evidence)],
+        "max_steps": built.max_steps,
+        "uses_pybullet": built.uses_pybullet,
+        "file": built.file,
+        "line": built.line,
+    }
+
+
+def _speed(report: Report) -> Any:
+    """What one process does; null where no step could be timed."""
+    speed: Speed | None = report.evidence.results.get(Speed.__name__)
+    if speed is None or speed.step_s is None:
+        return None
+    return plain({**dataclasses.asdict(speed), "steps_per_second": 1 / speed.step_s})
+
+
+def _row(row: Row) -> Any:
+    return plain(dataclasses.asdict(row))

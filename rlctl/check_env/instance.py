@@ -1,0 +1,51 @@
+"""One environment, how it is called, and what may be used on it."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any
+
+from rlctl.check_env.failures import EnvironmentRaised
+from rlctl.check_env.leaves import Leaf
+from rlctl.check_env.progress import Progress
+
+
+@dataclasses.dataclass
+class Budget:
+    """What the episodes of a probe may use together."""
+
+    deadline: float
+    """On `time.monotonic`'s clock [s]."""
+    bytes_left: int = 48 * 2**20
+
+    @property
+    def seconds_left(self) -> float:
+        return self.deadline - time.monotonic()
+
+
+class Instance:
+    """One environment, and how it is called."""
+
+    def __init__(
+        self, env: Any, leaves: list[Leaf], action_leaves: list[Leaf], accepts_seed: bool, progress: Progress
+    ) -> None:
+        self.env = env
+        self.leaves = leaves
+        self.action_leaves = action_leaves
+        self.accepts_seed = accepts_seed
+        self.progress = progress
+
+    def call(self, name: str, function: Any, *arguments: Any, step: int = 0, **keywords: Any) -> Any:
+        """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`."""
+        self.progress.enter(name, step)
+        try:
+            return function(*arguments, **keywords)
+        except BaseException as error:
+            raise EnvironmentRaised(name) from error
+        finally:
+            self.progress.leave()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.call("close", self.env.close)

@@ -1,0 +1,171 @@
+"""Environments whose actions do nothing, too little or too much; and twins that only look so."""
+
+import numpy as np
+from broken_envs import Clean
+from gymnasium import spaces
+
+
+class DeadAction(Clean):
+    def move(self, action):
+        super().move(action * np.array([1, 0], np.float32))
+
+
+class NoAction(Clean):
+    """A point that drifts, whatever is done."""
+
+    def move(self, action):
+        super().move(self.np_random.uniform(-1, 1, 2).astype(np.float32))
+
+
+class LateAction(Clean):
+    """The second number acts only near the end: nothing is wrong with it."""
+
+    def move(self, action):
+        super().move(action * np.array([1, self.steps > 40], np.float32))
+
+
+class HiddenAction(Clean):
+    """The second number moves something that is not observed, and that is rewarded: it acts."""
+
+    def start(self):
+        super().start()
+        self.heat = 0.0
+
+    def move(self, action):
+        self.heat = 0.9 * self.heat + float(action[1])
+        super().move(action * np.array([1, 0], np.float32))
+
+    def reward(self):
+        return super().reward() - 0.01 * abs(self.heat)
+
+
+class CostlyAction(Clean):
+    """The second number costs, and moves nothing."""
+
+    def move(self, action):
+        self.cost = 0.1 * float(action[1]) ** 2
+        super().move(action * np.array([1, 0], np.float32))
+
+    def reward(self):
+        return super().reward() - self.cost
+
+
+class Watched(CostlyAction):
+    """Actions are rewarded, and change nothing else: a series that is watched."""
+
+    def move(self, action):
+        super().move(action)
+        self.cost = float((action * self.position).sum())
+        self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+
+class CopiedAction(Clean):
+    """The last action is observed; the second number does nothing else."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Box(-5.0, 5.0, (4,), np.float32)
+
+    def start(self):
+        super().start()
+        self.last = np.zeros(2, np.float32)
+
+    def move(self, action):
+        self.last = action
+        super().move(action * np.array([1, 0], np.float32))
+
+    def observe(self):
+        return np.concatenate([self.position, self.last])
+
+
+class DeadChoice(Clean):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Discrete(4)
+
+    def move(self, action):
+        super().move(self.np_random.uniform(-1, 1, 2).astype(np.float32))
+
+
+class Choice(DeadChoice):
+    """Four directions: nothing is wrong with it."""
+
+    def step(self, action):
+        self.chosen = int(action)
+        return super().step(np.zeros(2, np.float32))
+
+    def move(self, action):
+        way = [(1, 0), (-1, 0), (0, 1), (0, -1)][self.chosen]
+        Clean.move(self, np.array(way, np.float32))
+
+
+class DeadLater(DeadAction):
+    """Its first episode is not like the others: a dead action shows all the same."""
+
+    first = True
+
+    def start(self):
+        super().start()
+        self.position += np.float32(1e-6 * self.first)
+        self.first = False
+
+
+class Saturated(Clean):
+    def move(self, action):
+        super().move(np.clip(10.0 * action, -1.0, 1.0).astype(np.float32))
+
+
+class Switch(Clean):
+    """The second number opens or closes."""
+
+    def move(self, action):
+        super().move(np.array([action[0], np.sign(action[1])], np.float32))
+
+
+class OneWay(Clean):
+    """Only pushes, never pulls: nothing is wrong with it."""
+
+    def move(self, action):
+        super().move(np.maximum(action, 0.0))
+
+
+class Unclipped(Clean):
+    def step(self, action):
+        self.asked = np.asarray(action, np.float32)
+        return super().step(action)
+
+    def move(self, action):
+        super().move(self.asked)
+
+
+class UnclippedCost(Unclipped):
+    """What moves is clipped, what costs is not."""
+
+    def move(self, action):
+        Clean.move(self, action)
+
+    def reward(self):
+        return super().reward() - 0.1 * float(self.asked @ self.asked)
+
+
+class SwallowsNan(Clean):
+    def step(self, action):
+        return super().step(np.nan_to_num(action))
+
+
+class SpreadsNan(Clean):
+    def step(self, action):
+        self.shift = np.float32(0.0 if np.isfinite(action).all() else np.nan)
+        return super().step(np.nan_to_num(action))
+
+    def move(self, action):
+        super().move(action + self.shift)
+
+
+class DiesOfNan(Clean):
+    def step(self, action):
+        if not np.isfinite(action).all():
+            import os
+
+            os._exit(9)
+        return super().step(action)

@@ -1,0 +1,50 @@
+"""What only the libraries' own checkers look for."""
+
+import numpy as np
+from broken_envs import Clean
+from gymnasium import spaces
+
+
+class OwnSeed(Clean):
+    def seed(self, seed=None):
+        return [seed]
+
+
+class Goal(Clean):
+    """The point has to go to a place that is drawn: nothing is wrong with it."""
+
+    def __init__(self):
+        super().__init__()
+        place = self.observation_space
+        self.observation_space = spaces.Dict(observation=place, achieved_goal=place, desired_goal=place)
+
+    def start(self):
+        super().start()
+        self.goal = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+    def observe(self):
+        return {
+            "observation": self.position.copy(),
+            "achieved_goal": self.position.copy(),
+            "desired_goal": self.goal.copy(),
+        }
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        """Of one goal, or of as many as there are rows."""
+        return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+    def reward(self):
+        return float(self.compute_reward(self.position, self.goal, {}))
+
+    def info(self):
+        return {"is_success": self.reward() > -0.1}
+
+
+class OtherReward(Goal):
+    """Learns from another reward than what hindsight computes."""
+
+    def reward(self):
+        return super().reward() - 0.5
+
+    def info(self):
+        return {"is_success": self.reward() > -0.6}

@@ -1,0 +1,185 @@
+"""Environments that take misuse badly, promise pictures that they cannot make, or hide what wrappers read."""
+
+import os
+
+import numpy as np
+import pybullet
+from broken_envs import Clean
+from gymnasium import spaces
+
+
+class StepsAtOnce(Clean):
+    """Can be stepped without a reset."""
+
+    def __init__(self):
+        super().__init__()
+        self.steps = 0
+        self.position = np.zeros(2, np.float32)
+
+
+class ExitsAtOnce(Clean):
+    steps = -1
+
+    def step(self, action):
+        if self.steps < 0:
+            os._exit(5)
+        return super().step(action)
+
+
+class ClosesOnce(Clean):
+    is_open = True
+
+    def close(self):
+        if not self.is_open:
+            raise RuntimeError("Not connected to physics server.")
+        self.is_open = False
+
+
+class ListMetadata(Clean):
+    metadata = ["human"]
+
+
+class OldGenerator(Clean):
+    """As old code seeds."""
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            self.np_random = np.random.RandomState(seed)
+        return super().reset()
+
+
+class NewSpaces(Clean):
+    def __init__(self):
+        self.size = 5.0
+        self.observation_space = spaces.Box(-5.0, 5.0, (2,), np.float32)
+
+    @property
+    def action_space(self):
+        return spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+class Renders(Clean):
+    """Draws the point: nothing is wrong with it."""
+
+    metadata = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 20}
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self):
+        return str(self.position) if self.render_mode == "ansi" else self.draw()
+
+    def draw(self):
+        picture = np.zeros((20, 30, 3), np.uint8)
+        picture[10, 15 + int(10 * self.position[0])] = 255
+        return picture
+
+
+class TakesNoMode(Clean):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+
+class RenderRaises(Renders):
+    def draw(self):
+        raise RuntimeError("no camera")
+
+
+class RenderNeedsGraphics(Renders):
+    def draw(self):
+        raise RuntimeError("Cannot initialize a EGL device display")
+
+
+class RenderFloats(Renders):
+    def draw(self):
+        return super().draw() / 255
+
+
+class RenderNothing(Renders):
+    def render(self):
+        return None
+
+
+class RenderBlack(Renders):
+    def draw(self):
+        return np.zeros((20, 30, 3), np.uint8)
+
+
+class RenderWithoutLibrary(Renders):
+    def draw(self):
+        import library_for_pictures  # noqa: F401
+
+
+class Gui(Clean):
+    def __init__(self):
+        super().__init__()
+        self.client = pybullet.connect(pybullet.GUI)
+
+
+class GuiInReset(Clean):
+    def start(self):
+        super().start()
+        pybullet.connect(pybullet.GUI)
+
+
+class NanAfterEnd(Clean):
+    def observe(self):
+        return self.position * np.float32("nan" if self.steps > 50 else 1)
+
+
+class RewardAfterEnd(Clean):
+    def reward(self):
+        return -1e6 if self.steps == 52 else super().reward()
+
+
+class ShapeAfterEnd(Clean):
+    def observe(self):
+        return self.position[: 1 if self.steps > 50 else 2].copy()
+
+
+class FarAfterEnd(Clean):
+    def observe(self):
+        return self.position + np.float32(100 * (self.steps > 50))
+
+
+class DiesAfterEnd(Clean):
+    def move(self, action):
+        if self.steps > 50:
+            os.abort()
+        super().move(action)
+
+
+class RaisesAfterEnd(Clean):
+    """Refuses: nothing is wrong with it."""
+
+    def move(self, action):
+        if self.steps > 50:
+            raise RuntimeError("the episode has ended")
+        super().move(action)
+
+
+class Falls(Clean):
+    """Falls soon with bad actions, and never ends with good ones; nothing is ever truncated."""
+
+    def move(self, action):
+        super().move(3.0 * self.position + action)
+
+    def reward(self):
+        return float(np.exp(-np.linalg.norm(self.position)))
+
+    def info(self):
+        return {"is_success": self.steps > 8}
+
+    def step(self, action):
+        observation, reward, _, _, info = super().step(action)
+        terminated = bool(np.abs(self.position).max() > 4)
+        return observation, reward, terminated, False, info
+
+
+class FallsInTime(Falls):
+    """The same with a limit, which random actions do not reach."""
+
+    def step(self, action):
+        observation, reward, terminated, _, info = super().step(action)
+        truncated = self.steps >= 1000 and not terminated
+        return observation, reward, terminated, truncated, info

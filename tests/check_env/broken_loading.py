@@ -1,0 +1,67 @@
+"""Environments that cannot be built, or say the wrong things about themselves."""
+
+import pybullet
+import pybullet_data
+from broken_envs import Clean
+
+
+class Raising(Clean):
+    def __init__(self):
+        raise RuntimeError("no licence")
+
+
+class NeedsArguments(Clean):
+    def __init__(self, gain, *, offset):
+        super().__init__()
+
+
+class NoFile(Clean):
+    def __init__(self):
+        super().__init__()
+        with open("gains.yaml") as file:
+            self.gains = file.read()
+
+
+class NoModel(Clean):
+    """PyBullet says only that it cannot load, and searches in more than one folder."""
+
+    model = "kuka_iiwa/modell.urdf"
+
+    def __init__(self):
+        super().__init__()
+        self.client = pybullet.connect(pybullet.DIRECT)
+        pybullet.setAdditionalSearchPath(pybullet_data.getDataPath(), physicsClientId=self.client)
+        self.arm = pybullet.loadURDF(self.model, useFixedBase=True, physicsClientId=self.client)
+
+
+class NoModelAtReset(Clean):
+    def __init__(self):
+        super().__init__()
+        self.client = pybullet.connect(pybullet.DIRECT)
+
+    def start(self):
+        super().start()
+        pybullet.loadURDF("robot.urdf", physicsClientId=self.client)
+
+
+class OldKeys(Clean):
+    metadata = {"render.modes": ["human"], "video.frames_per_second": 30}
+
+
+class NoFrameRate(Clean):
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self):
+        import numpy as np
+
+        image = np.zeros((64, 64, 3), np.uint8)
+        image[10:20] = 255
+        return image
+
+
+class FrameRate(NoFrameRate):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}

@@ -1,0 +1,276 @@
+"""`Cart`, a small PyBullet world without a mistake, and worlds that differ from it in one mistake each."""
+
+from pathlib import Path
+
+import numpy as np
+import pybullet as p
+from broken_envs import Clean
+from gymnasium import spaces
+from pybullet_utils.bullet_client import BulletClient
+
+CART = str(Path(__file__).parent / "cart.urdf")
+SHOULDER, TIP = 0, 1
+STEPS = 30
+STANDING = 0.051  # [m], height of the base when the cart stands
+
+
+class Cart(Clean):
+    """A box on the floor is pushed to the middle and raises its arm; nothing is wrong with it."""
+
+    rlctl_ignore = dict.fromkeys(("RL902", "RL904"), "loads anew at every reset, so that each is exactly the same")
+    fixed = False
+    height = STANDING
+
+    def __init__(self):
+        super().__init__(size=100.0)
+        self.observation_space = spaces.Box(-100.0, 100.0, (3,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (1 if self.fixed else 3,), np.float32)
+        self.client = p.connect(p.DIRECT)
+
+    def start(self):
+        super().start()
+        c = self.client
+        p.resetSimulation(physicsClientId=c)
+        p.setPhysicsEngineParameter(numSubSteps=4, deterministicOverlappingPairs=1, physicsClientId=c)
+        p.setTimeStep(1 / 60, physicsClientId=c)
+        p.setGravity(0, 0, -9.81, physicsClientId=c)
+        shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[50, 50, 0.5], physicsClientId=c)
+        self.floor = p.createMultiBody(0.0, shape, basePosition=[0, 0, -0.5], physicsClientId=c)
+        place = [*self.position.tolist(), self.height]
+        self.cart = p.loadURDF(CART, place, useFixedBase=self.fixed, physicsClientId=c)
+        self.vary()
+        self.read()
+
+    def vary(self):
+        """Change what this episode is about."""
+
+    def move(self, action):
+        c = self.client
+        if not self.fixed:
+            self.push([30 * float(action[1]), 30 * float(action[2]), 0.0])
+        speed = 3 * float(action[0])
+        p.setJointMotorControl2(
+            self.cart, SHOULDER, p.VELOCITY_CONTROL, targetVelocity=speed, force=2.0, physicsClientId=c
+        )
+        p.stepSimulation(physicsClientId=c)
+        self.read()
+
+    def push(self, force):
+        place, _ = p.getBasePositionAndOrientation(self.cart, physicsClientId=self.client)
+        p.applyExternalForce(self.cart, -1, force, place, p.WORLD_FRAME, physicsClientId=self.client)
+
+    def read(self):
+        place, _ = p.getBasePositionAndOrientation(self.cart, physicsClientId=self.client)
+        self.position = np.clip(place[:2], -50, 50).astype(np.float32)
+        self.angle = p.getJointState(self.cart, SHOULDER, physicsClientId=self.client)[0]
+
+    def observe(self):
+        return np.array([*self.position, np.clip(self.angle, -50, 50)], np.float32)
+
+    def reward(self):
+        return -abs(self.angle - 0.3) - (0 if self.fixed else float(np.linalg.norm(self.position)))
+
+    def is_truncated(self):
+        return self.steps >= STEPS
+
+    def info(self):
+        is_near = self.fixed or np.linalg.norm(self.position) < 0.5
+        return {"is_success": bool(is_near and abs(self.angle - 0.3) < 0.1)}
+
+    def close(self):
+        if self.client >= 0:
+            p.disconnect(physicsClientId=self.client)
+        self.client = -1
+
+
+class FixedCart(Cart):
+    """Its base is part of the world; nothing is wrong with it."""
+
+    fixed = True
+
+
+class NoGravity(Cart):
+    def vary(self):
+        p.setGravity(0, 0, 0, physicsClientId=self.client)
+
+
+class Flat(FixedCart):
+    """Gravity is off, but nothing could fall: the arm turns about an upright axis."""
+
+    def vary(self):
+        upright = p.getQuaternionFromEuler([np.pi / 2, 0, 0])
+        place = [*self.position.tolist(), 1.0]
+        p.resetBasePositionAndOrientation(self.cart, place, upright, physicsClientId=self.client)
+        p.setGravity(0, 0, 0, physicsClientId=self.client)
+
+
+class NoCollisions(Cart):
+    def vary(self):
+        for link in range(-1, 2):
+            p.setCollisionFilterGroupMask(self.cart, link, 0, 0, physicsClientId=self.client)
+
+
+class OnlySomeGroups(Cart):
+    """Collides with one group only, the floor's; nothing is wrong with it."""
+
+    def vary(self):
+        p.setCollisionFilterGroupMask(self.floor, -1, 4, 4, physicsClientId=self.client)
+        for link in range(-1, 2):
+            p.setCollisionFilterGroupMask(self.cart, link, 4, 4, physicsClientId=self.client)
+
+
+class InTheFloor(Cart):
+    """A block is set back into the floor at every step."""
+
+    def vary(self):
+        c = self.client
+        shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.1, 0.1, 0.1], physicsClientId=c)
+        self.block = p.createMultiBody(1.0, shape, basePosition=[3, 3, 0.1], physicsClientId=c)
+
+    def move(self, action):
+        place, turn = [3, 3, 0.05], [0, 0, 0, 1]
+        p.resetBasePositionAndOrientation(self.block, place, turn, physicsClientId=self.client)
+        super().move(action)
+
+
+class BeyondLimits(Cart):
+    def move(self, action):
+        super().move(action)
+        self.angle = 1.8 * float(action[0])
+        p.resetJointState(self.cart, SHOULDER, self.angle, physicsClientId=self.client)
+
+
+class Explodes(Cart):
+    """A ball beside the cart is driven by a force without a bound."""
+
+    def vary(self):
+        shape = p.createCollisionShape(p.GEOM_SPHERE, radius=0.1, physicsClientId=self.client)
+        self.ball = p.createMultiBody(1.0, shape, basePosition=[5, 5, 0.1], physicsClientId=self.client)
+
+    def move(self, action):
+        place, _ = p.getBasePositionAndOrientation(self.ball, physicsClientId=self.client)
+        force = [1e6 * float(each) for each in action]
+        p.applyExternalForce(self.ball, -1, force, place, p.WORLD_FRAME, physicsClientId=self.client)
+        super().move(action)
+
+
+class FrictionOfNothing(Cart):
+    def vary(self):
+        p.changeDynamics(self.cart, TIP, lateralFriction=self.np_random.uniform(0.5, 1.5), physicsClientId=self.client)
+
+
+class FrictionOfAll(Cart):
+    """Also of the tip, which touches nothing; nothing is wrong with it."""
+
+    def vary(self):
+        for link in range(-1, 2):
+            friction = self.np_random.uniform(0.5, 1.5)
+            p.changeDynamics(self.cart, link, lateralFriction=friction, physicsClientId=self.client)
+
+
+class MassWithoutBase(Cart):
+    first = 0
+
+    def vary(self):
+        factor = self.np_random.uniform(0.8, 1.2)
+        for link in range(self.first, 2):
+            mass = p.getDynamicsInfo(self.cart, link, physicsClientId=self.client)[0]
+            p.changeDynamics(self.cart, link, mass=factor * mass, physicsClientId=self.client)
+
+
+class MassOfAll(MassWithoutBase):
+    first = -1
+
+
+class FixedBaseGetsMass(FixedCart):
+    """A base that is given a mass is fixed no longer. It is loaded before the first reset, too."""
+
+    def __init__(self):
+        super().__init__()
+        self.loaded = False
+        self.np_random = np.random.default_rng(0)
+        self.start()
+        self.loaded = True
+
+    def vary(self):
+        if self.loaded:
+            p.changeDynamics(self.cart, -1, mass=2.0, physicsClientId=self.client)
+
+
+class StartsInTheFloor(Cart):
+    height = -0.02
+
+
+class Drops(Cart):
+    height = 0.5
+
+
+class ReadsCentre(Cart):
+    def read(self):
+        super().read()
+        self.tip = p.getLinkState(self.cart, TIP, physicsClientId=self.client)[0]
+
+
+class ReadsFrame(Cart):
+    """Reads the frame of one link, and the centre of mass of one that has it in its frame."""
+
+    def read(self):
+        super().read()
+        self.tip = p.getLinkState(self.cart, TIP, physicsClientId=self.client)[4]
+
+
+class ForceAtOrigin(Cart):
+    def push(self, force):
+        p.applyExternalForce(self.cart, -1, force, [0, 0, 0], p.WORLD_FRAME, physicsClientId=self.client)
+
+
+class TermsOfReward(Cart):
+    """Says what its reward is made of; nothing is wrong with it."""
+
+    def push(self, force):
+        super().push(force)
+        p.applyExternalTorque(self.cart, -1, [0, 0, 0.1 * force[0]], p.WORLD_FRAME, physicsClientId=self.client)
+
+    def terms(self):
+        linear, _ = p.getBaseVelocity(self.cart, physicsClientId=self.client)
+        return {"forward_velocity": 2 * linear[0], "place": super().reward()}
+
+    def reward(self):
+        return sum(self.terms().values())
+
+    def info(self):
+        return {**super().info(), "reward_terms": self.terms()}
+
+
+class YawAsVelocity(TermsOfReward):
+    def terms(self):
+        _, turn = p.getBasePositionAndOrientation(self.cart, physicsClientId=self.client)
+        return {**super().terms(), "forward_velocity": 2 * p.getEulerFromQuaternion(turn)[2] + 1}
+
+
+class ThroughBulletClient(Clean):
+    """All calls go through an object that adds the client; nothing is wrong with it."""
+
+    rlctl_ignore = Cart.rlctl_ignore
+
+    def __init__(self):
+        super().__init__(size=100.0)
+        self.p = BulletClient(p.DIRECT)
+
+    def start(self):
+        super().start()
+        self.p.resetSimulation()
+        self.p.setGravity(0, 0, -10)
+        shape = self.p.createCollisionShape(self.p.GEOM_SPHERE, radius=0.1)
+        self.ball = self.p.createMultiBody(1.0, shape, basePosition=[*self.position, 1.0])
+
+    def move(self, action):
+        p = self.p
+        p.resetBaseVelocity(self.ball, [float(action[0]), float(action[1]), 0.0])
+        p.stepSimulation()
+        self.position = np.array(p.getBasePositionAndOrientation(self.ball)[0][:2], np.float32)
+
+    def close(self):
+        if self.p is not None:
+            self.p.disconnect()
+        self.p = None

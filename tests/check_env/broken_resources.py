@@ -1,0 +1,150 @@
+"""Environments that keep what they take, share spaces, or cannot be built in a worker process."""
+
+import multiprocessing
+import os
+import sys
+import threading
+import time
+
+import numpy as np
+import pybullet
+from broken_envs import Clean, OwnWorld
+from gymnasium import spaces
+
+
+class Reconnects(OwnWorld):
+    """A new client on every reset; the old one is never disconnected."""
+
+    def start(self):
+        self.client = pybullet.connect(pybullet.DIRECT)
+        super().start()
+
+
+class ReconnectsProperly(OwnWorld):
+    """The old client is disconnected: nothing leaks."""
+
+    def start(self):
+        self.close()
+        self.client = pybullet.connect(pybullet.DIRECT)
+        super().start()
+
+
+class LeavesBodies(OwnWorld):
+    """Takes the ball away, and forgets the marker."""
+
+    ball = -1
+
+    def start(self):
+        Clean.start(self)
+        own = {"physicsClientId": self.client}
+        pybullet.setGravity(0, 0, -10, **own)
+        if self.ball >= 0:
+            pybullet.removeBody(self.ball, **own)
+        shape = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.1, **own)
+        self.ball = pybullet.createMultiBody(1.0, shape, basePosition=[*self.position, 1.0], **own)
+        pybullet.createMultiBody(0.0, -1, -1, **own)
+
+
+class KeepsFiles(Clean):
+    def __init__(self):
+        super().__init__()
+        self.files = []
+
+    def start(self):
+        super().start()
+        self.files.append(open(os.devnull))  # noqa: SIM115
+
+    def close(self):
+        while self.files:
+            self.files.pop().close()
+
+
+class KeepsThreads(Clean):
+    def __init__(self):
+        super().__init__()
+        self.end = threading.Event()
+        self.threads = []
+
+    def start(self):
+        super().start()
+        self.threads.append(threading.Thread(target=self.end.wait, daemon=True))
+        self.threads[-1].start()
+
+    def close(self):
+        self.end.set()
+
+
+class KeepsMemory(Clean):
+    def __init__(self):
+        super().__init__()
+        self.kept = []
+
+    def start(self):
+        super().start()
+        self.kept.append(np.ones(50_000))
+
+
+class Caches(KeepsMemory):
+    """Keeps what it made in the first resets only."""
+
+    def start(self):
+        super().start()
+        del self.kept[20:]
+
+
+class ClassSpaces(Clean):
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self):
+        super().__init__()
+        del self.action_space
+
+
+class ClassObservations(Clean):
+    observation_space = spaces.Box(-5.0, 5.0, (2,), np.float32)
+
+    def __init__(self):
+        super().__init__()
+        del self.observation_space
+
+
+class SharedGenerator(Clean):
+    generator = np.random.default_rng(0)
+
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32, seed=self.generator)
+
+
+class StartsProcess(Clean):
+    def __init__(self):
+        super().__init__()
+        helper = multiprocessing.get_context("fork").Process(target=int)
+        helper.start()
+        helper.join()
+
+
+def in_worker():
+    return multiprocessing.current_process().daemon
+
+
+class ExitsInWorker(Clean):
+    def start(self):
+        super().start()
+        if in_worker():
+            os._exit(3)
+
+
+class SlowInWorker(Clean):
+    def __init__(self):
+        super().__init__()
+        if in_worker():
+            time.sleep(100)
+
+
+class NeedsPath(Clean):
+    """Finds its module only where its folder is on the path."""
+
+    def __init__(self):
+        super().__init__()
+        assert any(entry.endswith("check_env") for entry in sys.path)

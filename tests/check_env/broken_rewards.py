@@ -1,0 +1,226 @@
+"""Environments with one mistake each in their reward, or in what they call success."""
+
+import numpy as np
+from broken_envs import Clean
+
+
+class ConstantReward(Clean):
+    def reward(self):
+        return 1.0
+
+
+class SparseNeverFound(Clean):
+    """-1 per step; its goal is too far for any search, so is_success cannot be told apart from a broken one."""
+
+    def reward(self):
+        return -1.0
+
+    def info(self):
+        return {"is_success": bool(self.position[0] > 4.9)}
+
+
+class LargeReward(Clean):
+    def reward(self):
+        return 100.0 * super().reward()
+
+
+class HugeOnce(Clean):
+    def reward(self):
+        return super().reward() - 5000.0 * (self.steps == 20)
+
+
+class FinalBonus(Clean):
+    """A large bonus at the end: nothing is wrong with it."""
+
+    def reward(self):
+        return super().reward() + 100.0 * self.is_truncated()
+
+
+class Falls(Clean):
+    """Ends outside of a square; the reward is negative everywhere."""
+
+    fall = 0.0
+
+    def has_fallen(self):
+        return bool(np.abs(self.position).max() > 1.5)
+
+    def is_terminated(self):
+        return self.has_fallen()
+
+    def reward(self):
+        return super().reward() - self.fall * self.has_fallen()
+
+
+class FallsBadly(Falls):
+    """The same with a penalty that outweighs all steps to come."""
+
+    fall = 200.0
+
+
+class FallsUntold(Falls):
+    """Success is not told."""
+
+    def info(self):
+        return {}
+
+
+class EndsAtUntoldGoal(Clean):
+    """Its goal ends the episode, and it does not say that this is success."""
+
+    def is_terminated(self):
+        return bool(np.linalg.norm(self.position) < 0.1)
+
+    def info(self):
+        return {}
+
+
+class Hovering(Clean):
+    """+10 per step within 0.4 of the goal; the episode ends within 0.1."""
+
+    bonus = 0.0
+
+    def distance(self):
+        return float(np.linalg.norm(self.position))
+
+    def is_terminated(self):
+        return self.distance() < 0.1
+
+    def reward(self):
+        return -self.distance() + 10.0 * (self.distance() < 0.4) + self.bonus * (self.distance() < 0.1)
+
+
+class HoveringUntold(Hovering):
+    """The same, without is_success, and with a bonus that is too small."""
+
+    bonus = 5.0
+
+    def info(self):
+        return {}
+
+
+class FinishingPays(Hovering):
+    """The same with a bonus for finishing that outweighs hovering."""
+
+    bonus = 500.0
+
+
+class PaysProgress(Hovering):
+    """Pays for coming nearer: nothing is to be earned by staying."""
+
+    def start(self):
+        super().start()
+        self.last = self.distance()
+
+    def reward(self):
+        progress, self.last = self.last - self.distance(), self.distance()
+        return 10.0 * progress
+
+
+class Terms(Clean):
+    """A reward of three terms, told in info: nothing is wrong with it."""
+
+    def reward(self):
+        return sum(self.terms().values())
+
+    def terms(self):
+        distance = float(np.linalg.norm(self.position))
+        return {"distance": -distance, "near": float(np.exp(-distance)), "effort": self.effort()}
+
+    def effort(self):
+        return -0.05 * float(np.square(self.action).sum())
+
+    def start(self):
+        super().start()
+        self.action = np.zeros(2)
+
+    def move(self, action):
+        super().move(action)
+        self.action = action
+
+    def info(self):
+        return {**super().info(), "reward_terms": self.terms()}
+
+
+class TermLeftOut(Terms):
+    def info(self):
+        left = {name: value for name, value in self.terms().items() if name != "effort"}
+        return {**super().info(), "reward_terms": left}
+
+
+class Float32Terms(Terms):
+    """Rounding is no mistake."""
+
+    def info(self):
+        return {**super().info(), "reward_terms": {name: np.float32(each) for name, each in self.terms().items()}}
+
+
+class OneTerm(Terms):
+    def terms(self):
+        return {name: value * (1.0 if name == "distance" else 1e-4) for name, value in super().terms().items()}
+
+
+class SparseTerm(Terms):
+    """A term that is 0 in all that is tried may be a bonus for what was not found."""
+
+    def terms(self):
+        return {"distance": -float(np.linalg.norm(self.position)), "far": float(self.position[0] > 4.9)}
+
+
+class WrongSlice(Terms):
+    """The effort is computed from something that never changes."""
+
+    def effort(self):
+        return -0.05 * self.size
+
+
+class TimePenalty(Terms):
+    def terms(self):
+        return {**super().terms(), "time": -0.01}
+
+
+class AliveBonus(Terms):
+    """A bonus per step beside a term for speed that can hardly be had, and a cost of moving."""
+
+    def terms(self):
+        return {"alive": 1.0, "speed": 0.02 * float(np.abs(self.action).sum()), "effort": 5 * self.effort()}
+
+
+class AliveUntold(AliveBonus):
+    def info(self):
+        return Clean.info(self)
+
+
+class Paid(AliveBonus):
+    """A speed that pays more than the bonus."""
+
+    def terms(self):
+        return {**super().terms(), "speed": float(np.abs(self.action).sum())}
+
+
+class SuccessUntold(Clean):
+    def info(self):
+        return {}
+
+
+class SuccessMisnamed(Clean):
+    def info(self):
+        return {"success": bool(np.linalg.norm(self.position) < 0.1)}
+
+
+class SuccessArray(Clean):
+    """An array without axes is a number too."""
+
+    def info(self):
+        return {"is_success": np.array(np.linalg.norm(self.position) < 0.1)}
+
+
+class SuccessAtStart(Clean):
+    def info(self):
+        return {"is_success": bool(np.linalg.norm(self.position) < 1.0)}
+
+
+class SuccessNever(Clean):
+    """Success is a reward that cannot be reached."""
+
+    def info(self):
+        return {"is_success": self.reward() > 0.1}

@@ -1,0 +1,43 @@
+"""Spaces that learners treat otherwise than was meant."""
+
+import numpy as np
+from broken_envs import Clean
+from gymnasium import spaces
+
+
+class Asymmetric(Clean):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Box(np.float32([-1.0, 0.0]), np.float32([1.0, 1.0]))
+
+    def move(self, action):
+        super().move(np.clip(action, self.action_space.low, self.action_space.high))
+
+
+class Seen(Clean):
+    """The point in a picture: nothing is wrong with it."""
+
+    shape, dtype, low, high = (48, 48, 1), np.uint8, 0, 255
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Box(self.low, self.high, self.shape, self.dtype)
+
+    def observe(self):
+        picture = np.zeros((48, 48), self.dtype)
+        x, y = np.clip((self.position + 5) * 4.6, 0, 45).astype(int)
+        picture[x : x + 3, y : y + 3] = self.high
+        return picture.reshape(self.shape)
+
+
+class FloatPicture(Seen):
+    dtype, high = np.float32, 1
+
+
+class TwoAxes(Seen):
+    shape = (48, 48)
+
+
+class Dark(Seen):
+    def observe(self):
+        return super().observe() // 255

@@ -1,0 +1,89 @@
+"""Actions that do nothing, saturate, act out of range, or are NaN."""
+
+from pathlib import Path
+
+import pytest
+
+from rlctl.check_env.check import check
+from rlctl.check_env.rules import RULES
+from rlctl.env_spec import EnvSpec
+from tests.check_env.judging import case, check_case
+from tests.check_env.some_studies import findings, verdict_by
+
+FILE = "broken_actions.py"
+CASES = [
+    case(f"{FILE}:DeadAction", ("RL701", "warning"), twin=f"{FILE}:LateAction"),
+    case(f"{FILE}:NoAction", ("RL701", "error")),
+    case(f"{FILE}:DeadChoice", ("RL701", "error"), twin=f"{FILE}:Choice"),
+    case(f"{FILE}:CostlyAction", ("RL701", "warning"), twin=f"{FILE}:HiddenAction"),
+    case(f"{FILE}:CopiedAction", ("RL701", "info")),
+    case(f"{FILE}:Saturated", ("RL702", "warning"), twin=f"{FILE}:OneWay"),
+    case(f"{FILE}:Switch", ("RL702", "info")),
+    case(f"{FILE}:Unclipped", ("RL703", "info")),
+    case(f"{FILE}:UnclippedCost", ("RL703", "info")),
+    case(f"{FILE}:SwallowsNan", ("RL704", "warning")),
+    case(f"{FILE}:SpreadsNan", ("RL704", "info")),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+def the_finding(name, rule, study="action effects"):
+    (finding,) = findings(f"{FILE}:{name}", rule, study)
+    return finding
+
+
+def test_dead_actions_are_named():
+    finding = the_finding("DeadAction", "RL701")
+    assert finding.message == (
+        "action[1] without any effect: at its lowest and highest value, over 60 steps from two seeds, no observation, "
+        "reward or end changes"
+    )
+    assert finding.evidence == {
+        "value": ["action[1]"],
+        "seed": 1000,
+        "seeds": [1000, 1001],
+        "steps": 60,
+        "dimensions_tried": 2,
+        "dimensions": 2,
+    }
+    assert the_finding("NoAction", "RL701").message.startswith("no action has any effect: at its lowest")
+
+
+def test_a_first_episode_unlike_the_others_hides_nothing():
+    assert the_finding("DeadLater", "RL701").evidence["value"] == ["action[1]"]
+
+
+def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
+    finding = the_finding("Watched", "RL701")
+    assert finding.message.startswith("action[0], action[1] changes nothing but its own step's reward")
+    assert finding.severity == "info"
+
+
+def test_out_of_range_is_placed():
+    finding = the_finding("UnclippedCost", "RL703", "out of range")
+    # The corner (+-1, +-1) costs 0.1 * 2 = 0.2, twice the corner 0.1 * 8 = 0.8.
+    assert finding.evidence["step"] == 1
+    assert finding.evidence["expected"] - finding.evidence["value"] == pytest.approx(0.6)
+
+
+def test_what_is_not_repeatable_is_not_judged():
+    for rule, study in (("RL701", "action effects"), ("RL702", "action effects"), ("RL703", "out of range")):
+        verdict = verdict_by("broken_envs.py:NoisyStep", rule, study)
+        assert verdict.not_judged[rule] == "equal seeds and actions give unequal episodes (RL3)"
+
+
+def test_discrete_actions_have_no_range():
+    verdict = verdict_by(f"{FILE}:Choice", "RL703", "out of range")
+    assert verdict.not_applicable == {"RL703": "no continuous action with finite bounds"}
+
+
+def test_a_process_that_a_nan_ends_is_an_error():
+    rules = [rule for rule in RULES if rule.id in ("RL208", "RL704")]
+    task = str(Path(__file__).parent / "broken_actions.py") + ":DiesOfNan"
+    (finding,) = check(EnvSpec(task), env_timeout_s=10, rules=rules).verdict.findings
+    assert (finding.rule, finding.severity) == ("RL704", "error")
+    assert "ended with exit code 9" in finding.message

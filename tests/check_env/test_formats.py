@@ -1,0 +1,259 @@
+"""What comes out: text, JSON, SARIF and annotations, and what can be chosen: rules, waivers, strictness."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pydantic
+import pytest
+import sarif_pydantic
+
+from rlctl.check_env.check import Report
+from rlctl.check_env.evidence import Evidence
+from rlctl.check_env.formats import FORMATS, choose, github, plain, sarif, structured
+from rlctl.check_env.judge import Verdict, judge
+from rlctl.check_env.rules import FAMILIES, RULES
+from rlctl.check_env.rules.selection import chosen, find
+from rlctl.errors import UsageError
+from tests.check_env.judging import evidence_of
+
+ROOT = Path(__file__).parent.parent.parent
+HERE = "tests/check_env"
+
+
+def report_of(task, rules=RULES, parts=("probe",), **settings):
+    evidence = evidence_of(task, parts)
+    return Report(task, judge(evidence, rules), evidence, 1.0, 20.0, **settings)
+
+
+def rlctl(*arguments, folder=ROOT, **environment):
+    command = [sys.executable, "-m", "rlctl", "check-env", *arguments]
+    variables = {**os.environ, **environment}
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, check=False, env=variables)
+
+
+@pytest.fixture(scope="module")
+def broken():
+    return report_of("broken_envs.py:NanReward")
+
+
+@pytest.fixture(scope="module")
+def unbuilt():
+    return report_of("broken_loading.py:NoFile")
+
+
+@pytest.fixture(scope="module")
+def waiving():
+    return report_of("broken_waivers.py:Wide")
+
+
+@pytest.fixture(scope="module")
+def crashed():
+    return Report("any", Verdict(crashed={"RL999": "Traceback ..."}), Evidence("any"), 1.0, 20.0)
+
+
+@pytest.fixture(params=["broken", "unbuilt", "waiving", "crashed"])
+def report(request):
+    return request.getfixturevalue(request.param)
+
+
+def test_every_report_fits_the_schema(report):
+    schema = json.loads(structured.SCHEMA.read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(json.loads(structured.text(report)), schema)
+
+
+def test_the_schema_refuses_what_is_no_report(broken):
+    schema = json.loads(structured.SCHEMA.read_text())
+    for change in ({"exit_code": 2}, {"extra": 1}, {"findings": [{"rule": "RL1"}]}, {"speed": {}}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate({**structured.content(broken), **change}, schema)
+
+
+NOT_IN_THE_VALIDATOR = {"exitCode", "suppressions", "toolExecutionNotifications"}
+"""Keys of SARIF 2.1.0 (its sections 3.20.7, 3.27.23 and 3.20.21) that the validator's models lack."""
+
+
+def extras(model):
+    """Every key that SARIF does not have, which the validator lets pass."""
+    if isinstance(model, pydantic.BaseModel):
+        found = set(model.model_extra or {})
+        return found.union(*(extras(value) for _, value in model))
+    if isinstance(model, (list, dict)):
+        return set().union(*(extras(each) for each in (model.values() if isinstance(model, dict) else model)))
+    return set()
+
+
+def test_every_report_is_valid_sarif(report):
+    log = sarif_pydantic.Sarif.model_validate_json(sarif.text(report))
+    assert extras(log) <= NOT_IN_THE_VALIDATOR
+    assert log.version == "2.1.0"
+    (run,) = log.runs
+    assert [result.rule_id for result in run.results or []] == [
+        each.rule for each in (*report.verdict.findings, *report.verdict.waived)
+    ]
+    for result in run.results or []:
+        assert run.tool.driver.rules[result.rule_index].id == result.rule_id
+    assert run.invocations[0].execution_successful is (not report.verdict.crashed)
+
+
+def test_sarif_places_a_finding_at_the_class(broken):
+    result = json.loads(sarif.text(broken))["runs"][0]["results"][0]
+    place = result["locations"][0]["physicalLocation"]
+    file = ROOT / HERE / "broken_envs.py"
+    assert file.as_uri().endswith(place["artifactLocation"]["uri"])
+    assert file.read_text().splitlines()[place["region"]["startLine"] - 1] == "class NanReward(Clean):"
+    assert result["level"] == "error"
+
+
+def test_sarif_tells_what_is_waived_and_why(waiving):
+    (result,) = json.loads(sarif.text(waiving))["runs"][0]["results"]
+    assert result["suppressions"] == [
+        {"kind": "inSource", "justification": "the actions are Newtons, as the real motor has them"}
+    ]
+
+
+def test_annotations_point_at_the_class(broken, monkeypatch):
+    monkeypatch.setenv("GITHUB_WORKSPACE", str(ROOT))
+    line, last = github.text(broken).splitlines()
+    assert re.match(
+        r"::error file=tests/check_env/broken_envs.py,line=\d+,title=RL601 reward not finite::"
+        r"the reward is nan at step 13%0Afix: ",
+        line,
+    )
+    assert last.startswith("broken_envs.py:NanReward: 1 error; ") or "NanReward: 1 error" in last
+
+
+def test_annotations_escape_what_would_end_them(broken):
+    assert github._property("50 %: a, b\n") == "50 %25%3A a%2C b%0A"
+    assert github._data("50 %: a, b\n") == "50 %25: a, b%0A"
+
+
+def test_outside_the_repository_there_is_no_place_to_annotate(broken, monkeypatch, tmp_path):
+    monkeypatch.setenv("GITHUB_WORKSPACE", str(tmp_path))
+    assert github.text(broken).startswith("::error title=RL601")
+
+
+def test_text_has_the_finding_its_numbers_and_its_fix(broken):
+    text = plain.text(broken)
+    assert text.startswith("error RL601  reward not finite\n  the reward is nan at step 13\n  seed 1000, episode 0, ")
+    assert "\n  fix: Find the division, logarithm or diverging simulation behind it.\n" in text
+    assert "\x1b" not in text
+
+
+def test_a_clean_environment_fits_on_a_screen():
+    report = report_of("reach", parts=("probe", "instances"))
+    lines = plain.text(report).splitlines()
+    assert len(lines) <= 24
+    text = "\n".join(lines)
+    for expected in ("joint_positions (7)", "hand (3)", "seen", "action Box(-1.0, 1.0, (7,), float32)", "steps/s"):
+        assert expected in text
+
+
+def test_waived_findings_are_listed_with_the_reason_and_do_not_count(waiving):
+    assert waiving.verdict.findings == []
+    assert [finding.rule for finding in waiving.verdict.waived] == ["RL107"]
+    assert "waived RL107 (actions are in [-2, 2], not in [-1, 1]): the actions are Newtons" in plain.text(waiving)
+    assert ", 1 waived; " in plain.summary(waiving)
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("NoReason", "RL107 is waived without a reason"),
+        ("NoSuchRule", r"no rule 'RL1007'. Did you mean 'RL107'\?"),
+        ("NoDictionary", r"no rule \"\('RL107',\)\""),
+    ],
+)
+def test_a_waiver_that_is_none_is_refused(task, message):
+    with pytest.raises(UsageError, match=message):
+        report_of(f"broken_waivers.py:{task}")
+
+
+def test_strict_counts_warnings():
+    task = "broken_envs.py:Float32Reward"
+    assert report_of(task).exit_code == 0
+    assert report_of(task, strict=True).exit_code == 1
+
+
+def test_a_crash_wins(crashed):
+    assert crashed.exit_code == 70
+
+
+def test_rules_are_chosen_by_family_and_id():
+    assert {rule.id[:3] for rule in chosen(["RL3"])} == {"RL3"}
+    assert [rule.id for rule in chosen(["rl301,RL501"])] == ["RL301", "RL501"]
+    assert "RL107" not in [rule.id for rule in chosen([], ["RL107"])]
+    assert chosen() == list(RULES)
+    with pytest.raises(UsageError, match=r"--select RL35: no such rule. Did you mean 'RL3"):
+        chosen(["RL35"])
+    with pytest.raises(UsageError, match="leave no rule"):
+        chosen(["RL301"], ["RL3"])
+
+
+def test_unchosen_rules_cost_nothing_and_say_nothing():
+    report = report_of("broken_envs.py:NanReward", chosen(["RL3"]))
+    assert report.verdict.findings == []
+    assert {*report.verdict.judged, *report.verdict.not_judged} >= {rule.id for rule in chosen(["RL3"])}
+    assert not any(rule.startswith("RL6") for rule in report.verdict.judged)
+
+
+def test_rules_are_found_by_id_in_any_case():
+    assert find("rl304").id == "RL304"
+    with pytest.raises(UsageError, match=r"no rule 'RL3'. The family has: RL301, "):
+        find("RL3")
+
+
+def test_formats_that_do_not_go_together():
+    assert choose(None, None, None) == ("text", None)
+    assert choose(None, None, "-") == ("json", "-")
+    assert choose("sarif", "x.sarif", None) == ("sarif", "x.sarif")
+    assert set(FORMATS) == {"text", "json", "sarif", "github"}
+    with pytest.raises(UsageError, match="--json FILE is --format json"):
+        choose("sarif", None, "-")
+    with pytest.raises(UsageError, match=r"Did you mean 'sarif'"):
+        choose("sariff", None, None)
+
+
+def test_command_lists_rules_without_a_task():
+    run = rlctl("--list")
+    assert run.returncode == 0
+    for rule in RULES:
+        assert f"{rule.id}  {rule.severity}" in run.stdout
+    for title in FAMILIES.values():
+        assert title in run.stdout
+
+
+def test_command_explains_a_rule_without_a_task():
+    run = rlctl("--explain", "RL304")
+    assert run.returncode == 0
+    assert run.stdout.startswith("RL304  a new instance differs\nerror, determinism\n")
+    assert "fix: " in run.stdout
+    assert rlctl("--explain", "RL9999").returncode == 2
+    assert rlctl().returncode == 2
+
+
+def test_command_writes_a_file_whole_and_says_so(tmp_path):
+    file = tmp_path / "report.sarif"
+    run = rlctl(f"{HERE}/broken_envs.py:NanReward", "--select", "RL6", "--format", "sarif", "-o", str(file))
+    assert (run.returncode, run.stdout) == (1, "")
+    assert run.stderr.rstrip().endswith(f"written to {file}")
+    assert sarif_pydantic.Sarif.model_validate_json(file.read_text()).runs[0].results[0].rule_id == "RL601"
+
+
+@pytest.mark.parametrize("form", sorted(FORMATS))
+def test_command_tells_in_every_format_why_nothing_could_be_built(form):
+    run = rlctl(f"{HERE}/broken_loading.py:NoFile", "--format", form)
+    assert run.returncode == 3
+    assert "RL007" in run.stdout
+    assert "gains.yaml" in run.stdout
+
+
+def test_command_refuses_a_waiver_without_a_reason():
+    run = rlctl(f"{HERE}/broken_waivers.py:NoReason", "--select", "RL107")
+    assert (run.returncode, run.stdout) == (2, "")
+    assert "RL107 is waived without a reason" in run.stderr

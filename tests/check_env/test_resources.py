@@ -1,0 +1,102 @@
+"""What an instance takes and does not give back, what instances share, and building in a worker process."""
+
+import pytest
+
+from rlctl.check_env.evidence import Evidence
+from rlctl.check_env.finding import NotJudged
+from rlctl.check_env.results import Leaks
+from rlctl.check_env.rules import resources
+from rlctl.check_env.studies import worker_build
+from tests.check_env.judging import case, check_case
+from tests.check_env.some_studies import findings
+
+FILE = "broken_resources.py"
+CASES = [
+    case(f"{FILE}:LeavesBodies", ("RL405", "error"), twin="broken_envs.py:OwnWorld"),
+    case(f"{FILE}:KeepsFiles", ("RL405", "warning")),
+    case(f"{FILE}:KeepsThreads", ("RL405", "warning")),
+    case(f"{FILE}:KeepsMemory", ("RL405", "warning"), twin=f"{FILE}:Caches"),
+    case(f"{FILE}:ClassSpaces", ("RL404", "warning")),
+    case(f"{FILE}:ClassObservations", ("RL404", "info")),
+    case(f"{FILE}:SharedGenerator", ("RL404", "warning")),
+    case(f"{FILE}:StartsProcess", ("RL406", "error")),
+    case(f"{FILE}:ExitsInWorker", ("RL406", "error")),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+def the_finding(name, rule, *studies):
+    (finding,) = findings(f"{FILE}:{name}", rule, *studies)
+    return finding
+
+
+def test_each_reset_leaves_a_client():
+    (finding,) = findings(f"{FILE}:Reconnects", "RL405", "leaks", seconds=2.0)
+    assert finding.severity == "error"
+    assert finding.evidence["per_reset"] == 1.0
+    assert finding.evidence["value"] - finding.evidence["expected"] == finding.evidence["resets"] >= 7
+    assert finding.message.startswith("PyBullet clients grow with every reset: from ")
+    assert findings(f"{FILE}:ReconnectsProperly", "RL405", "leaks", seconds=2.0) == []
+
+
+def test_memory_is_counted():
+    finding = the_finding("KeepsMemory", "RL405", "leaks")
+    # 50,000 numbers of 8 bytes.
+    assert finding.evidence["per_reset"] == pytest.approx(400_000, rel=0.1)
+    assert finding.evidence["resets"] == 90
+
+
+def of_counts(**counts):
+    evidence = Evidence("any")
+    empty = {"clients": [], "bodies": [], "descriptors": [], "threads": [], "memory": [], "measured": []}
+    evidence.results["Leaks"] = Leaks(**{**empty, **counts})
+    return evidence
+
+
+def found_in(**counts):
+    return [seen.message for seen in resources.leaks.check(of_counts(**counts))]
+
+
+def test_what_changes_or_fills_once_is_no_leak():
+    assert found_in(clients=[1] * 20, bodies=[3, 7, 5, 9, 4] * 4) == []
+    assert found_in(clients=[1] * 20, bodies=[*range(10), *[10] * 10]) == []
+    assert found_in(clients=[1] * 20, bodies=[5] * 19 + [6]) == []
+    (message,) = found_in(clients=[1] * 20, bodies=list(range(20)))
+    assert message == "bodies in the PyBullet world grow with every reset: from 2 to 19 in 17 resets"
+
+
+def test_memory_needs_resets_and_a_second_half():
+    mib = 2**20
+    grows = [100 * mib, 105 * mib, 110 * mib]
+    assert found_in(clients=[1] * 40, memory=grows, measured=[10, 25, 40])
+    assert not found_in(clients=[1] * 20, memory=grows, measured=[10, 15, 20])
+    assert not found_in(clients=[1] * 40, memory=[100 * mib, 108 * mib, 110 * mib], measured=[10, 25, 40])
+    assert not found_in(clients=[1] * 40, memory=[100 * mib, 103 * mib, 107 * mib], measured=[10, 25, 40])
+
+
+def test_too_few_resets_are_not_judged():
+    with pytest.raises(NotJudged, match="there was time for only 4 resets"):
+        found_in(clients=[1, 2, 3, 4])
+
+
+def test_the_worker_says_what_it_raised():
+    finding = the_finding("StartsProcess", "RL406", "worker build")
+    assert finding.message.startswith("in a spawned, daemonic worker build raises task ")
+    assert "AssertionError: daemonic processes are not allowed to have children" in finding.message
+    assert finding.evidence["call"] == "build"
+    finding = the_finding("ExitsInWorker", "RL406", "worker build")
+    assert finding.message == "in a spawned, daemonic worker reset ended with exit code 3"
+
+
+def test_a_worker_that_hangs_is_a_finding(monkeypatch):
+    monkeypatch.setattr(worker_build, "HANG_S", 0.3)
+    finding = the_finding("SlowInWorker", "RL406", "worker build")
+    assert finding.message == "in a spawned, daemonic worker build did not come back in 0.3 s"
+
+
+def test_the_path_reaches_the_worker():
+    assert findings(f"{FILE}:NeedsPath", "RL406", "worker build") == []

@@ -1,0 +1,150 @@
+"""The reward: its size, its terms, what it makes worth doing, and success; and the search that they need."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from rlctl.check_env.rules import reward_incentives
+from rlctl.check_env.rules.tried import discounted, worth_of
+from rlctl.check_env.studies.search import action_of
+from tests.check_env.judging import case, check_case, evidence_of, found, verdict_of
+
+BROKEN = "broken_rewards.py"
+
+
+def broken(name, *expected, twin=None):
+    return case(f"{BROKEN}:{name}", *expected, twin=f"{BROKEN}:{twin}" if twin else "broken_envs.py:Clean")
+
+
+CASES = [
+    broken("ConstantReward", ("RL602", "warning")),
+    broken("SparseNeverFound", ("RL602", "info"), ("RL611", "info")),
+    broken("LargeReward", ("RL603", "warning"), twin="FinalBonus"),
+    broken("HugeOnce", ("RL603", "warning"), twin="FinalBonus"),
+    broken("Falls", ("RL604", "warning"), twin="FallsBadly"),
+    broken("FallsUntold", ("RL604", "warning"), ("RL609", "info"), twin="FallsBadly"),
+    broken("Hovering", ("RL605", "warning"), twin="FinishingPays"),
+    broken("HoveringUntold", ("RL605", "warning"), ("RL609", "info"), twin="PaysProgress"),
+    broken("AliveBonus", ("RL606", "warning"), twin="Paid"),
+    broken("AliveUntold", ("RL606", "info"), twin="Paid"),
+    broken("TermLeftOut", ("RL607", "warning"), twin="Float32Terms"),
+    broken("OneTerm", ("RL608", "info"), twin="SparseTerm"),
+    broken("SuccessUntold", ("RL609", "info"), twin="SuccessArray"),
+    broken("SuccessMisnamed", ("RL609", "info")),
+    broken("SuccessAtStart", ("RL610", "warning")),
+    broken("SuccessNever", ("RL611", "info")),
+    broken("WrongSlice", ("RL612", "warning"), twin="TimePenalty"),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["FinalBonus", "FallsBadly", "FinishingPays", "PaysProgress", "Terms", "Float32Terms", "SparseTerm", "TimePenalty",
+     "Paid", "SuccessArray"],
+)  # fmt: skip
+def test_clean_is_clean(name):
+    assert found(f"{BROKEN}:{name}") == set()
+
+
+def test_goal_that_ends_the_episode_is_no_failure():
+    assert found(f"{BROKEN}:EndsAtUntoldGoal") == {("RL609", "info")}
+
+
+def finding_of(name):
+    (finding,) = verdict_of(f"{BROKEN}:{name}", ("probe",)).findings
+    return finding
+
+
+def test_worth_is_discounted():
+    # 1 + 0.99 * 2 + 0.9801 * 3 = 5.9203; -(1 + 0.99 + 0.9801) = -2.9701
+    assert discounted(np.array([1.0, 2.0, 3.0])) == pytest.approx(5.9203)
+    assert worth_of(-1.0, 3) == pytest.approx(-2.9701)
+
+
+def test_falling_is_compared_with_going_on():
+    evidence = finding_of("Falls").evidence
+    mean, last, steps = evidence["mean_reward"], evidence["value"], evidence["step"]
+    # The fall is beyond 1.5 m in one direction, so at least that far from the middle.
+    assert -2.2 < last <= -1.5
+    # It costs more than a usual step, and saves the 50 - steps that are left.
+    saved = last - mean - 0.99 * mean * (1 - 0.99 ** (50 - steps)) / 0.01
+    assert 0 < evidence["gain"] <= saved
+
+
+def test_hovering_is_compared_from_where_two_lives_part():
+    life = evidence_of("broken_envs.py:Clean", ("probe",)).role("search")[0]
+    actions = np.zeros((4, 2))
+    actions[2:] = 1.0
+    finished = dataclasses.replace(life, rewards=np.array([0.0, 0.0, 9.0]), action_values=np.zeros((3, 2)))
+    hovered = dataclasses.replace(life, rewards=np.array([0.0, 0.0, 5.0, 5.0]), action_values=actions, ended="steps")
+    pair = reward_incentives._pair(finished, hovered, longest=6)
+    # From the third step on: 9, against 5 for each of the steps 3 to 6, the last two of them not lived.
+    assert pair.step == 2
+    assert pair.per_step == 5.0
+    assert pair.worth == pytest.approx((9.0, 5 * (1 + 0.99 + 0.9801 + 0.970299)))
+    ended = dataclasses.replace(hovered, ended="truncated")
+    assert reward_incentives._pair(finished, ended, longest=6).worth == pytest.approx((9.0, 5 * 1.99))
+    elsewhere = dataclasses.replace(hovered, seed=life.seed + 1)
+    assert reward_incentives._pair(finished, elsewhere, longest=6) is None
+
+
+def test_hovering_is_found_and_placed():
+    finding = finding_of("Hovering")
+    # Between 9.6 (0.4 from the goal) and 9.9 (0.1 from it) per step.
+    assert 9.6 < finding.evidence["per_step"] < 9.9
+    assert finding.message.startswith("finishing at step ")
+    assert f" from step {finding.evidence['step']} on; " in finding.message
+
+
+def test_doing_nothing_earns_the_bonus():
+    evidence = finding_of("AliveBonus").evidence
+    # 50 steps of 1: (1 - 0.99^50) / 0.01 = 39.4994
+    assert evidence["value"] == pytest.approx(39.4994, abs=1e-4)
+    assert (evidence["term"], evidence["share"]) == ("alive", 1.0)
+
+
+def test_what_is_left_out_of_the_terms_shows():
+    evidence = finding_of("TermLeftOut").evidence
+    # The effort of a corner action: -0.05 * (1 + 1) = -0.1
+    assert evidence["expected"] - evidence["value"] == pytest.approx(-0.1)
+    assert sum(evidence["terms"].values()) == pytest.approx(evidence["value"])
+
+
+def test_constant_penalty_is_named():
+    evidence = finding_of("WrongSlice").evidence
+    # -0.05 * 5
+    assert (evidence["term"], evidence["value"]) == ("effort", -0.25)
+
+
+def test_numbers_become_actions_of_every_kind():
+    space = spaces.Dict(
+        {
+            "arm": spaces.Box(np.array([-1.0, 0.0], np.float32), np.array([1.0, np.inf], np.float32)),
+            "gear": spaces.Discrete(3, start=1),
+            "more": spaces.Tuple([spaces.MultiDiscrete([2, 4]), spaces.MultiBinary(2)]),
+        }
+    )
+    for numbers, arm, gear, more in [
+        (np.zeros(7), [-1.0, 0.0], 1, ([0, 0], [0, 0])),
+        (np.full(7, 0.5), [0.0, 0.5], 2, ([1, 2], [1, 1])),
+        (np.ones(7), [1.0, 1.0], 3, ([1, 3], [1, 1])),
+    ]:
+        action = action_of(space, numbers)
+        assert space.contains(action)
+        assert action["arm"].tolist() == arm
+        assert action["gear"] == gear
+        assert tuple(part.tolist() for part in action["more"]) == more
+
+
+def test_search_finds_what_chance_does_not():
+    lives = evidence_of("reach", ("probe",)).role("search")
+    assert any(life.infos["is_success"].values.any() for life in lives if life.actions == "searched")
+    assert len({life.seed for life in lives if life.actions == "searched"}) == 1
+    assert sum(life.steps for life in lives) <= 6200

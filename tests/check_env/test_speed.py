@@ -1,0 +1,234 @@
+"""The family RL9: what is slow is measured, and named."""
+
+import dataclasses
+import functools
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+from rlctl.check_env.child_process import run_part
+from rlctl.check_env.evidence import Evidence
+from rlctl.check_env.judge import judge
+from rlctl.check_env.results import Speed, TimedCall
+from rlctl.check_env.rules import speed as rules
+from rlctl.check_env.rules.selection import chosen
+from rlctl.check_env.stopwatch import CallWatch, Stopwatch
+from rlctl.check_env.studies.speed import kind_of, typical
+from rlctl.env_spec import EnvSpec
+from tests.check_env.judging import FOLDER, case, check_case
+
+CASES = [
+    case("broken_speed.py:SlowStep", ("RL901", "warning")),
+    case("broken_speed.py:SlowReset", ("RL902", "warning")),
+    case("broken_speed.py:Sleeps", ("RL903", "warning")),
+    case("broken_speed.py:Renders", ("RL903", "warning"), twin="broken_speed.py:Sees"),
+    case("broken_speed.py:ReadsFile", ("RL904", "warning")),
+    case("broken_speed.py:Reconnects", ("RL904", "warning"), twin="broken_speed.py:World"),
+]
+STEP = TimedCall("pybullet.stepSimulation", "world.py:10", 0.61, 4.0)
+NOTHING = Speed(66e-6, 52e-6, 200, 5, [STEP], [], [], [], False)
+
+
+@functools.cache
+def measured(task):
+    """What only the studies that this family reads find out."""
+    task = f"{FOLDER}/{task}" if ".py:" in task else task
+    evidence = Evidence(task)
+    for header, arrays in run_part("probe", EnvSpec(task), ["episodes", "speed"]):
+        evidence.add(header, arrays)
+    return evidence
+
+
+def with_speed(**changes):
+    """`Clean`, whose episodes have 50 steps, with another speed."""
+    result = dataclasses.replace(NOTHING, **changes)
+    return dataclasses.replace(measured("broken_envs.py:Clean"), results={"Speed": result})
+
+
+def findings(evidence):
+    verdict = judge(evidence, chosen(["RL9"]))
+    assert (verdict.crashed, verdict.not_judged) == ({}, {})
+    return verdict.findings
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+@pytest.mark.parametrize(
+    "task",
+    ["reach", "CartPole-v1", "Pendulum-v1", "broken_envs.py:Clean", "broken_envs.py:OwnWorld", "broken_speed.py:World",
+     "broken_speed.py:Sees", "broken_speed.py:RendersNothing", "broken_speed.py:KeepsPartials"],
+)  # fmt: skip
+def test_what_is_fast_has_no_finding(task):
+    assert findings(measured(task)) == []
+    assert "steps/s: a million steps take " in rules.speed_line(measured(task))
+
+
+def test_slow_has_hours_and_the_slowest_calls():
+    # 36 ms a step: 27.8 steps/s; 1e6 * 0.036 s = 36,000 s = 10 hours.
+    calls = [STEP, TimedCall("Ant.observe", "ant.py:50", 0.2, 1.0), TimedCall("numpy.dot", "", 0.004, 1.0)]
+    (finding,) = findings(with_speed(step_s=0.036, slowest_in_step=calls))
+    assert (finding.rule, finding.severity) == ("RL901", "warning")
+    assert finding.message == (
+        "27.8 steps/s: a million steps take 10 hours per process on this machine; "
+        "slowest: pybullet.stepSimulation 61% (world.py:10), Ant.observe 20% (ant.py:50)"
+    )
+    assert finding.evidence == {"value": 1 / 0.036, "expected": 100.0, "step_ms": 36.0, "steps": 200}
+
+
+def test_just_fast_enough_is_no_finding():
+    assert findings(with_speed(step_s=0.0099)) == []
+
+
+def test_slow_for_what_another_rule_names_is_said_once():
+    camera = TimedCall("pybullet.getCameraImage", "world.py:9", 0.8, 1.0, "rendering")
+    (finding,) = findings(with_speed(step_s=0.036, suspicious_in_step=[camera]))
+    # 80 % of 36 ms; the 7.2 ms that are left are fast enough.
+    assert (finding.rule, finding.message) == (
+        "RL903",
+        "step calls pybullet.getCameraImage (world.py:9): 28.8 ms per step, 80% of its time",
+    )
+
+
+def test_reset_is_measured_against_an_episode():
+    # 50 steps of 200 us are 10 ms, reset is 30 ms: 30 of 40 ms.
+    build = TimedCall("Maze.build", "maze.py:7", 0.9, 1.0)
+    (finding,) = findings(with_speed(step_s=200e-6, reset_s=0.03, slowest_in_reset=[build]))
+    assert (finding.rule, finding.severity) == ("RL902", "warning")
+    assert finding.message == (
+        "reset takes 30 ms, 75% of an episode of 50 steps of 200 us each; slowest: Maze.build 90% (maze.py:7)"
+    )
+    assert finding.evidence["value"] == pytest.approx(0.75)
+    assert findings(with_speed(step_s=700e-6, reset_s=0.03)) == []  # 30 of 65 ms
+    assert findings(with_speed(step_s=1e-6, reset_s=0.0049)) == []  # much, but of nothing
+
+
+def test_loading_in_reset_is_said_once_and_by_its_weight():
+    load = TimedCall("pybullet.loadURDF", "maze.py:9", 0.9, 3.0, "loading")
+    (finding,) = findings(with_speed(step_s=200e-6, reset_s=0.03, suspicious_in_reset=[load]))
+    assert (finding.rule, finding.severity) == ("RL904", "warning")
+    # 27 of 40 ms.
+    assert finding.message == "reset calls pybullet.loadURDF 3 times (maze.py:9): 27 ms per reset, 68% of an episode"
+    # 27 ms of 30 + 50 * 20 ms.
+    (finding,) = findings(with_speed(step_s=0.0099, reset_s=0.02, suspicious_in_reset=[load]))
+    assert (finding.rule, finding.severity) == ("RL904", "info")
+    assert findings(with_speed(step_s=200e-6, reset_s=0.005, suspicious_in_reset=[load])) == []
+
+
+def test_connecting_in_reset_is_named_however_fast_it_is():
+    connect = TimedCall("pybullet.connect", "maze.py:9", 0.01, 1.0, "connecting")
+    (finding,) = findings(with_speed(suspicious_in_reset=[connect]))
+    assert (finding.rule, finding.severity) == ("RL904", "warning")
+
+
+def test_a_task_that_says_that_it_reloads_is_only_told_the_price():
+    evidence = measured("broken_speed.py:ReloadingTask")
+    assert evidence.results["Speed"].rebuilds
+    (finding,) = findings(evidence)
+    assert (finding.rule, finding.severity) == ("RL902", "info")
+    assert "pybullet.loadURDF" in finding.message
+    assert "fast_reset = True" in finding.fix
+
+
+def test_calls_through_a_bullet_client_are_seen():
+    finding, *more = findings(measured("broken_speed.py:CameraAtEveryStep"))
+    assert (finding.rule, more) == ("RL903", [])
+    assert finding.message.startswith("step calls pybullet.getCameraImage (broken_speed.py:")
+    assert finding.evidence["share"] > 0.5
+    assert finding.evidence["calls"] == 1
+
+
+def test_rebuilding_is_named_with_its_calls():
+    (finding,) = findings(measured("broken_speed.py:Rebuilds"))
+    assert (finding.rule, finding.severity) == ("RL904", "warning")
+    assert "pybullet.loadURDF 2 times (broken_speed.py:" in finding.message
+    assert "pybullet.resetSimulation (broken_speed.py:" in finding.message
+
+
+def test_waiting_in_reset_is_said_once():
+    (finding,) = findings(measured("broken_speed.py:SleepsInReset"))
+    assert (finding.rule, finding.evidence["value"]) == ("RL903", "time.sleep")
+
+
+def test_line_for_the_report():
+    # 50 steps of 66 us and a reset of 52 us: 3.352 ms, of which the reset is 1.6 %; 14,916 steps/s, 67 s.
+    assert rules.speed_line(with_speed()) == (
+        "step 66 us, reset 52 us (1.6% of an episode), 15,000 steps/s: a million steps take 1.1 minutes; "
+        "slowest: pybullet.stepSimulation 61% (world.py:10)"
+    )
+    assert rules.speed_line(Evidence("any")) == ""
+
+
+def test_a_step_that_takes_longer_now_and_then_counts_and_a_disturbance_does_not():
+    # Batches of 5: four steps of 1 s and one of 6 s, 2 s on average. In one batch something else ran for 1000 s.
+    batches = [[1, 1, 1, 1, 6], [1, 1, 1, 1, 1006], [1, 1, 1, 1, 6], [1, 1]]
+    assert typical([each for batch in batches for each in batch], 5) == 2
+    assert typical([3, 5], 5) == 4
+    assert typical([], 5) is None
+
+
+def pause():
+    time.sleep(0.02)
+
+
+def twice():
+    pause()
+    sorted([2, 1], key=lambda each: time.sleep(0.01) or each)
+
+
+def test_time_is_booked_on_who_takes_it():
+    watch = CallWatch(lambda file: file == __file__, kind_of)
+    watch(twice)
+    (sleep,) = watch.suspicious()
+    # 20 ms once and 10 ms twice.
+    assert (sleep.name, sleep.kind, sleep.whole_count) == ("time.sleep", "sleeping", 3)
+    assert 0.04 <= sleep.own_s <= watch.seconds
+    assert sleep.own_s / watch.seconds > 0.8
+    assert sleep.file == __file__
+
+
+def test_an_exception_ends_the_watch_and_reaches_the_caller():
+    import sys
+
+    def fails():
+        pause()
+        [].index(1)
+
+    watch = CallWatch(lambda file: True, kind_of)
+    before = sys.getprofile()
+    with pytest.raises(ValueError, match="not in list"):
+        watch(fails)
+    assert sys.getprofile() is before
+    assert watch.error is None
+
+
+def test_waiting_for_a_processor_does_not_count():
+    """Three busy processes share one processor with this one, for half a second."""
+    processor = min(os.sched_getaffinity(0))
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {processor})
+    others = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(3)]
+    try:
+        time.sleep(0.2)
+        watch = Stopwatch()
+        watch(work, 0.1)
+    finally:
+        os.sched_setaffinity(0, before)
+        for other in others:
+            other.kill()
+            other.wait()
+    assert watch.seconds[0] == pytest.approx(0.1, rel=0.1)
+
+
+BUSY = "import time\nend = time.monotonic() + 5\nwhile time.monotonic() < end: pass"
+
+
+def work(seconds):
+    until = time.thread_time() + seconds
+    while time.thread_time() < until:
+        pass

@@ -1,0 +1,36 @@
+"""The check before training: errors refuse, warnings are told, everything else goes on."""
+
+import pytest
+
+from rlctl.errors import AnswerIsNo, TaskError
+
+
+@pytest.fixture
+def runs(tmp_path):
+    return lambda: [path for path in (tmp_path / "runs").glob("[!l]*/*") if path.is_dir()]
+
+
+def test_an_error_refuses_before_a_run_begins(train, runs, small_ppo):
+    with pytest.raises(AnswerIsNo) as refused:
+        train("Unseeded", small_ppo, check=True)
+    first, second = str(refused.value).splitlines()
+    assert first.startswith("the check before training found 1 error: RL302 trajectory not repeatable (lived twice by")
+    assert second.startswith("rlctl check-env ")
+    assert second.endswith("--no-check trains anyway.")
+    assert runs() == []
+
+
+def test_without_the_check_it_trains(train, runs, small_ppo):
+    assert train("Unseeded", small_ppo, check=False).steps == 256
+    assert len(runs()) == 1
+
+
+def test_warnings_are_told_and_training_goes_on(train, small_ppo, capsys):
+    assert train("FixedStart", small_ppo, check=True).steps == 256
+    told = capsys.readouterr().err
+    assert "check before training: warnings RL306" in told
+
+
+def test_an_environment_that_cannot_be_built_is_the_workers_matter(train, small_ppo):
+    with pytest.raises(TaskError, match="no licence"):
+        train("Unbuilt", small_ppo, check=True)
