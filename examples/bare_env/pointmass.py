@@ -33,6 +33,8 @@ class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> Any:
+        if not np.isfinite(action).all():
+            raise ValueError(f"action {action}: a policy that diverged must not go unnoticed")
         acceleration = MAX_ACCELERATION * np.clip(action, -1.0, 1.0)
         self.velocity = np.clip(self.velocity + acceleration * DT, -MAX_SPEED, MAX_SPEED)
         self.position = np.clip(self.position + self.velocity * DT, -1.0, 1.0)

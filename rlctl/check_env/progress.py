@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.check_env import studies
 
-CALLS = ("", "load", "build", "reset", "step", "close", "sample", "check", "render")
+CALLS = ("", "load", "build", "reset", "step", "close", "sample", "check", "render", "compute_reward")
 PHASES = (
     "build",
     *studies.names(),

@@ -158,6 +158,21 @@ class CloseTwice:
 
 
 @dataclasses.dataclass(frozen=True)
+class Hindsight:
+    """What `compute_reward` says of steps that were rewarded already."""
+
+    defined: bool
+    """Whether the environment has it, and the goals it is about; nothing else is known if not."""
+    steps: int
+    worst: int | None
+    """The step whose reward differs most; None where none could be computed."""
+    rewards: list[float] | None
+    """The reward of that step, and what `compute_reward` says."""
+    wrong: str | None
+    """What else is wrong with what it returns."""
+
+
+@dataclasses.dataclass(frozen=True)
 class AfterEnd:
     """Steps after the end of an episode."""
 

@@ -10,6 +10,13 @@ class OwnSeed(Clean):
         return [seed]
 
 
+class RewardOfNoGoal(Clean):
+    """What Stable-Baselines3 takes for a goal environment."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return 0.0
+
+
 class Goal(Clean):
     """The point has to go to a place that is drawn: nothing is wrong with it."""
 
@@ -48,3 +55,17 @@ class OtherReward(Goal):
 
     def info(self):
         return {"is_success": self.reward() > -0.6}
+
+
+class OneByOne(Goal):
+    """Cannot compute the rewards of many goals at once."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -float(np.linalg.norm(achieved_goal - desired_goal))
+
+
+class RoundedReward(Goal):
+    """Differs by rounding to float32: nothing is wrong with it."""
+
+    def reward(self):
+        return float(np.float32(super().reward()))

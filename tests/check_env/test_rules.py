@@ -55,7 +55,9 @@ CASES = [
     case("broken_envs.py:EndsAtOnce", ("RL504", "warning")),
     case("broken_envs.py:NanReward", ("RL601", "error")),
     case("broken_checkers.py:OwnSeed", ("RL290", "warning")),
-    case("broken_checkers.py:OtherReward", ("RL291", "error"), twin="broken_checkers.py:Goal"),
+    case("broken_checkers.py:RewardOfNoGoal", ("RL291", "error")),
+    case("broken_checkers.py:OtherReward", ("RL614", "error"), twin="broken_checkers.py:Goal"),
+    case("broken_checkers.py:OneByOne", ("RL614", "error"), twin="broken_checkers.py:RoundedReward"),
 ]
 
 
@@ -88,6 +90,12 @@ def test_clean_is_clean(name):
 )  # fmt: skip
 def test_gymnasiums_own_environments_have_no_errors(task):
     assert not {severity for _, severity in found(task)} & {"error"}
+
+
+def test_hindsight_rewards_are_compared():
+    (finding,) = verdict_of("broken_checkers.py:OtherReward", ("probe",)).findings
+    # Each reward is 0.5 below what compute_reward says.
+    assert finding.evidence["value"] - finding.evidence["expected"] == pytest.approx(0.5)
 
 
 def test_out_of_range_is_placed():

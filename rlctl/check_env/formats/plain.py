@@ -12,7 +12,7 @@ from rlctl import output
 from rlctl.check_env.check import Report
 from rlctl.check_env.finding import Finding, Severity
 from rlctl.check_env.formats.ranges import Row, action_rows, observation_rows
-from rlctl.check_env.rules import FAMILIES
+from rlctl.check_env.rules import FAMILIES, RULES
 from rlctl.check_env.rules.speed import speed_line
 
 if TYPE_CHECKING:
@@ -120,17 +120,24 @@ def _facts(report: Report) -> Iterator[str]:
     if built is None:
         yield "not judged: everything else, because no instance could be built"
         return
-    yield f"judged {_by_family(verdict.judged)}"
+    if verdict.judged:
+        yield f"judged {_by_family(verdict.judged)}"
     for kind, unjudged in (("does not apply", verdict.not_applicable), ("not judged", verdict.not_judged)):
         reasons: dict[str, list[str]] = {}
         for name, reason in unjudged.items():
             reasons.setdefault(reason, []).append(name)
-        yield from (f"{kind}: {', '.join(names)}: {reason}" for reason, names in reasons.items())
+        yield from (f"{kind}: {', '.join(_families(names))}: {reason}" for reason, names in reasons.items())
 
 
 def _by_family(judged: Iterable[str]) -> str:
     counts = Counter(rule[:3] for rule in judged)
     return ", ".join(f"{FAMILIES[family]} {count}" for family, count in counts.items())
+
+
+def _families(names: list[str]) -> list[str]:
+    """Shorten ids: a whole family by its name."""
+    whole = [f for f in FAMILIES if {rule.id for rule in RULES if rule.id.startswith(f)} <= set(names)]
+    return [f"{family} {FAMILIES[family]}" for family in whole] + [n for n in names if not n.startswith(tuple(whole))]
 
 
 def _table(rows: list[Row]) -> Iterator[str]:

@@ -49,6 +49,7 @@ STUDIES = (
     Study("starts", "probe", 1.0, "starts:starts"),
     Study("speed", "probe", 1.5, "speed:speed"),
     Study("search", "probe", 3.0, "search:search"),
+    Study("hindsight", "probe", 0.3, "hindsight:hindsight"),
     Study("source", "probe", 0.2, "source:source"),
     Study("leaks", "probe", 3.0, "leaks:leaks"),
     Study("after the end", "probe", 0.5, "misuse:after_end", provokes=True),
