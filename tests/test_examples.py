@@ -27,6 +27,28 @@ def run(*arguments: str, cwd: Path, path: Path | None = None) -> str:
     return done.stdout
 
 
+def findings(task: str, cwd: Path) -> set[str]:
+    command = [sys.executable, "-m", "rlctl", "check-env", task, "--json", "-"]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    return {finding["rule"] for finding in json.loads(done.stdout)["findings"]}
+
+
+def test_broken_env_has_the_mistakes_that_its_text_tells(tmp_path: Path) -> None:
+    source = (EXAMPLES / "broken_env/pushed_ball.py").read_text()
+    first = {"RL009", "RL204", "RL210", "RL301", "RL309", "RL501", "RL609", "RL704", "RL808"}
+    assert findings(f"{EXAMPLES}/broken_env/pushed_ball.py:PushedBall", tmp_path) == first
+    drawn = "np.random.uniform(-0.5, 0.5, 2)  # noqa: NPY002"
+    assert drawn in source
+    (tmp_path / "seeded.py").write_text(
+        source.replace(f"place = {drawn}", "super().reset(seed=seed); place = self.np_random.uniform(-0.5, 0.5, 2)")
+    )
+    assert findings("seeded.py:PushedBall", tmp_path) == first - {"RL210", "RL301", "RL309"} | {"RL401", "RL605"}
+
+
+def test_bare_env_is_clean(tmp_path: Path) -> None:
+    assert findings(f"{EXAMPLES}/bare_env/pointmass.py:PointMass", tmp_path) == set()
+
+
 def test_bare_env_trains_by_path(tmp_path: Path) -> None:
     small = ["--set", "algo_kwargs.n_steps=25", "--set", "algo_kwargs.batch_size=100", "--set", "eval.episodes=4"]
     task = f"{EXAMPLES}/bare_env/pointmass.py:PointMass"

@@ -24,6 +24,8 @@ LONG = ("traceback", "last_output")
 """Evidence that is text of several lines; JSON has it whole."""
 SHOWN_LINES = 3
 """How much of what a dying process printed is shown; a traceback's place is in the message."""
+SHOWN_ITEMS = 4
+"""How much of a list in the evidence is shown; JSON has it whole."""
 SHOWN_ROWS = 16
 """How many parts of the observation are shown."""
 
@@ -97,7 +99,8 @@ def _short(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
-        return f"[{', '.join(_short(each) for each in value)}]"
+        more = f" and {len(value) - SHOWN_ITEMS} more" if len(value) > SHOWN_ITEMS else ""
+        return f"[{', '.join(_short(each) for each in value[:SHOWN_ITEMS])}{more}]"
     if isinstance(value, dict):
         return ", ".join(f"{key} {_short(each)}" for key, each in value.items())
     return str(value)

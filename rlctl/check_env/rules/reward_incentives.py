@@ -9,6 +9,7 @@ import numpy as np
 
 from rlctl.check_env.evidence import Evidence, Trajectory
 from rlctl.check_env.finding import NotApplicable, NotJudged, Seen, Severity, rule
+from rlctl.check_env.rules.determinism import compared
 from rlctl.check_env.rules.reward_terms import constants
 from rlctl.check_env.rules.tried import (
     DISCOUNT,
@@ -125,6 +126,8 @@ def hovering(evidence: Evidence) -> Iterator[Seen]:
         raise NotApplicable("nothing that was tried ended an episode at a goal")
     if max(float(life.rewards[:-1].max(initial=0.0)) for life in lives) <= 0:
         return  # there is nothing to be earned by staying
+    if compared(evidence, "alone", "reused")[1] is not None:
+        raise NotJudged("equal seeds and actions give unequal episodes (RL301, RL302)")
     others = [life for life in evidence.role("search") if life.steps and not _finishes(life, reports_success(lives))]
     longest = limit(evidence, lives)
     pairs = [pair for one in finished for two in others if (pair := _pair(one, two, longest)) is not None]
