@@ -81,19 +81,17 @@ def _part(part: str, context: Context, chosen: list[studies.Study], seconds: flo
 
 
 def _studies(context: Context, chosen: list[studies.Study], seconds: float) -> Iterator[Message]:
-    """Run the studies; each has its share of the time, and what those before it left."""
-    started = time.monotonic()
+    """Run the studies; each has its share of the time that those before it have left."""
+    end = time.monotonic() + seconds
     shares = sum(study.share for study in chosen)
-    share = 0.0
     for study in chosen:
-        share += study.share
-        deadline = started + seconds * share / shares
         begun = time.monotonic()
-        if begun > deadline:
+        if begun > end:
             yield skip(study.name, f"the studies before it took the {seconds:g} s there are")
             continue
         context.progress.phase(study.name)
-        context.budget = Budget(deadline)
+        context.budget = Budget(begun + (end - begun) * study.share / shares)
+        shares -= study.share
         try:
             yield from study.run(context)
         except EnvironmentRaised as error:

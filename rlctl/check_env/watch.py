@@ -14,7 +14,7 @@ from rlctl.env_spec import EnvSpec
 
 AT_ONCE = 2
 """The libraries' checkers bring torch, with as much memory as everything else: they wait for a place."""
-TOTAL_S = 28.0
+TOTAL_S = 26.0
 """What is left of this is for the libraries' checkers, the last to start [s]."""
 LEAST_CHECKERS_S = 8.0
 """They get this much in any case: loading torch is part of it [s]."""

@@ -156,11 +156,11 @@ def speed_line(evidence: Evidence) -> str:
     speed, steps = evidence.results.get(Speed.__name__), episode_steps(evidence)
     if not isinstance(speed, Speed) or not speed.step_s or speed.reset_s is None or steps is None:
         return ""
-    per_s = steps / (speed.reset_s + steps * speed.step_s)
+    per_s = float(f"{steps / (speed.reset_s + steps * speed.step_s):.2g}")
     calls = f"; slowest: {_slowest(speed.slowest_in_step)}" if speed.slowest_in_step else ""
     return (
         f"step {_time(speed.step_s)}, reset {_time(speed.reset_s)} ({_reset_share(speed, steps):.1%} of an episode), "
-        f"{float(f'{per_s:.2g}'):,.0f} steps/s: a million steps take {_duration(MILLION / per_s)}{calls}"
+        f"{per_s:,.{0 if per_s >= 10 else 1}f} steps/s: a million steps take {_duration(MILLION / per_s)}{calls}"
     )
 
 

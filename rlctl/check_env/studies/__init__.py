@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 PARTS = {"probe": 0, "instances": 1, "checkers": 0}
 """The child processes and their hash seeds: that of `instances` is another, so that hash order shows."""
-PART_S = 20.0
+PART_S = 18.0
 """How long the studies of one process may take together [s]; importing and building comes on top."""
 
 
@@ -45,9 +45,9 @@ class Study:
 STUDIES = (
     Study("comparisons", "probe", 6.0, "lives:comparisons"),
     Study("global random", "probe", 0.5, "global_random:global_random"),
+    Study("speed", "probe", 1.5, "speed:speed"),
     Study("episodes", "probe", 6.0, "lives:episodes"),
     Study("starts", "probe", 1.0, "starts:starts"),
-    Study("speed", "probe", 1.5, "speed:speed"),
     Study("search", "probe", 3.0, "search:search"),
     Study("hindsight", "probe", 0.3, "hindsight:hindsight"),
     Study("source", "probe", 0.2, "source:source"),

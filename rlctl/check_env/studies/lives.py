@@ -52,6 +52,9 @@ def comparisons(context: Context) -> Iterator[Message]:
         yield from recording.run()
         steps = min(steps, recording.steps)
     for number, role in enumerate(("unseeded", "unseeded again")):
+        if budget.seconds_left < 0:
+            yield skip(role, "the first comparisons took all the time there is for them")
+            continue
         plan = Plan(role, number, FIRST_SEED, max_steps=0, then_unseeded=True)
         yield from Recording(instance, plan, budget).run()
 
