@@ -43,7 +43,7 @@ class PushedBall(gymnasium.Env):
         reward = float(-distance)
         if distance < 0.05:
             reward += 10.0
-        terminated = distance < 0.02 or self.steps >= MAX_STEPS
+        terminated = (distance < 0.02) | (self.steps >= MAX_STEPS)
         return observation, reward, terminated, False, {}
 
     def _observation(self):
