@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.task import Box, Sim, Task, rewards
+from rlctl.task import Box, Event, Sim, Task, events, rewards
 
 HOME = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])  # [rad], elbow bent
 SPEED_LIMIT = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
@@ -29,6 +29,16 @@ class Reach(Task):
     action_meaning = "joint steps; 1 moves a joint at its top speed"
     observation_units = {"joint_positions": "rad", "joint_velocities": "rad/s", "hand": "m", "hand_to_goal": "m"}
     reward_weights = {"distance": -1.0, "reached": 1.0, "action": -0.05, "smoothness": -0.05}
+    events = {  # what a real arm may differ by; acts with `randomize: true`
+        "mass": Event("reset", events.scale_mass, body="arm", factor=(0.8, 1.2)),
+        "joint_damping": Event("reset", events.scale_joint_damping, body="arm", factor=(0.5, 1.5)),
+        "motor_strength": Event("reset", events.scale_motor_strength, body="arm", factor=(0.8, 1.0)),
+        "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.002)),  # [rad]
+        "velocity_noise": Event("observation", events.noise, of="joint_velocities", std=(0.0, 0.05)),  # [rad/s]
+        "goal_noise": Event("observation", events.noise, of="hand_to_goal", std=(0.0, 0.005)),  # [m], of a camera
+        "action_noise": Event("action", events.noise, std=(0.0, 0.05)),
+        "action_delay": Event("action", events.delay, steps=(0, 2)),  # of 17 ms
+    }
 
     def build(self, sim: Sim) -> None:
         sim.load("plane", "plane.urdf", fixed=True)

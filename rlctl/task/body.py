@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, did_you_mean
 from rlctl.task.bullet import pybullet
+from rlctl.task.properties import Properties
 
 Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
 
 
-class Body:
+class MassState(NamedTuple):
+    """The centre of mass of a link, world frame. Plain floats, which are faster than arrays where one is read."""
+
+    position: Vector
+    """[m]"""
+    orientation: tuple[float, float, float, float]
+    """Quaternion (x, y, z, w) of the inertial frame."""
+    velocity: Vector
+    """[m/s]"""
+    angular_velocity: Vector
+    """[rad/s]"""
+
+    @property
+    def roll_pitch_yaw(self) -> Vector:
+        """The orientation as angles about x, y, z [rad]."""
+        return pybullet.getEulerFromQuaternion(self.orientation)  # type: ignore[no-any-return]
+
+
+class Body(Properties):
     """A body of the world. Joint arrays have one element per movable joint, in `joint_names` order."""
 
     def __init__(self, client: int, substeps: int, name: str, body_id: int, file: Path, fixed: bool) -> None:
+        super().__init__()
         self.name = name
         self.id = body_id
         self.file = file
@@ -28,13 +47,15 @@ class Body:
         self._substeps = substeps
         self._motor_limits: tuple[Sequence[float], Sequence[float], float] | None = None
         self._cache: dict[Any, Any] = {}
-        self._changed = False
         infos = [
             pybullet.getJointInfo(body_id, index, physicsClientId=client)
             for index in range(pybullet.getNumJoints(body_id, physicsClientId=client))
         ]
         self.all_joint_names = [info[1].decode() for info in infos]
         self._links = {info[12].decode(): index for index, info in enumerate(infos)}
+        self.base_name: str = pybullet.getBodyInfo(body_id, physicsClientId=client)[0].decode()
+        self._link_numbers = list(self._links.values())
+        self._all_names = [*self._links, self.base_name]
         movable = [info for info in infos if info[2] in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)]
         self.joint_names = [info[1].decode() for info in movable]
         self.joint_indices = [int(info[0]) for info in movable]
@@ -48,13 +69,9 @@ class Body:
     def link_names(self) -> list[str]:
         return list(self._links)
 
-    def _link_index(self, link: str) -> int:
-        if link not in self._links:
-            raise TaskError(
-                f"{self.file.name} has no link {link!r}.{did_you_mean(link, self._links)} "
-                f"It has: {', '.join(self._links)}."
-            )
-        return self._links[link]
+    def joint_places(self, joints: Iterable[str]) -> list[int]:
+        """Return where joints stand in joint arrays; raises `TaskError` for a name that the file does not have."""
+        return self._joint_places(list(joints))
 
     def _joint_states(self) -> tuple[Array, Array]:
         state = self._cache.get("joints")
@@ -94,6 +111,47 @@ class Body:
         """Orientation of the link frame, quaternion (x, y, z, w), world frame, shape (4,)."""
         return self._link_state(link)[1]
 
+    def mass_state(self, link: str) -> MassState:
+        """Return where the centre of mass of a link, or of the base, is and how it moves.
+
+        A link's position and orientation are those at the beginning of the last physics step (substep), as PyBullet
+        gives them without `computeForwardKinematics`; velocities, and all of the base, are those at its end.
+        """
+        state = self._cache.get(("mass", link))
+        if state is None:
+            state = self._cache["mass", link] = self._read_mass_state(link)
+        return state
+
+    def _read_mass_state(self, link: str) -> MassState:
+        if link in self._links:
+            raw = pybullet.getLinkState(self.id, self._links[link], computeLinkVelocity=1, physicsClientId=self.client)
+            return MassState(raw[0], raw[1], raw[6], raw[7])
+        if link != self.base_name:
+            self._link_index(link)
+        pose = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+        return MassState(*pose, *pybullet.getBaseVelocity(self.id, physicsClientId=self.client))
+
+    @property
+    def mass_positions(self) -> list[Vector]:
+        """Positions of the centres of mass [m], world frame: of the base, then of `link_names`; see `mass_state`."""
+        positions: list[Vector] | None = self._cache.get("masses")
+        if positions is None:
+            base, _ = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+            links = pybullet.getLinkStates(self.id, self._link_numbers, physicsClientId=self.client) or ()
+            positions = self._cache["masses"] = [base, *[link[0] for link in links]]
+        return positions
+
+    def links_touching(self, other: Body) -> set[str]:
+        """Return the links, or the base, in contact with `other`, which may be the body itself, at the last step."""
+        points = self._cache.get("contacts")
+        if points is None:
+            points = self._cache["contacts"] = pybullet.getContactPoints(self.id, physicsClientId=self.client)
+        # A point has this body first; where it touches itself, it is there once for both links.
+        numbers = {point[3] for point in points if point[2] == other.id}
+        if other is self:
+            numbers |= {point[4] for point in points if point[2] == self.id}
+        return {self._all_names[number] for number in numbers}  # -1, the base, is the last
+
     def _base_state(self) -> tuple[Array, Array]:
         state = self._cache.get("base")
         if state is None:
@@ -115,6 +173,12 @@ class Body:
     def set_base(self, position: Sequence[float], orientation: Sequence[float] = (0, 0, 0, 1)) -> None:
         """Place the base at rest."""
         pybullet.resetBasePositionAndOrientation(self.id, position, orientation, physicsClientId=self.client)
+        self._cache.clear()
+
+    def add_velocity(self, velocity: Sequence[float]) -> None:
+        """Add to the velocity of the base [m/s], world frame; its joints move along."""
+        linear, angular = pybullet.getBaseVelocity(self.id, physicsClientId=self.client)
+        pybullet.resetBaseVelocity(self.id, np.add(linear, velocity).tolist(), angular, physicsClientId=self.client)
         self._cache.clear()
 
     def set_joints(self, positions: Array, velocities: Array | None = None) -> None:
@@ -144,7 +208,7 @@ class Body:
             self.joint_indices,
             pybullet.POSITION_CONTROL,
             targetPositions=positions.tolist(),  # half the time of an array
-            forces=self._motor_impulses,
+            forces=self._weakened(self._motor_impulses),
             positionGains=self._motor_gains,
             physicsClientId=self.client,
         )
@@ -159,51 +223,32 @@ class Body:
                 self.id, index, pybullet.POSITION_CONTROL, maxVelocity=speed, physicsClientId=self.client
             )
 
+    def disable_motors(self) -> None:
+        """Take the force from the motors that PyBullet gives every joint, so that only `set_torques` moves it."""
+        count = len(self.joint_indices)
+        pybullet.setJointMotorControlArray(
+            self.id,
+            self.joint_indices,
+            pybullet.POSITION_CONTROL,
+            forces=[0.0] * count,
+            positionGains=[0.1] * count,
+            velocityGains=[0.1] * count,
+            physicsClientId=self.client,
+        )
+
+    def set_torques(self, torques: Array) -> None:
+        """Turn or push the joints with `torques` [N m or N], shape (joints,), in all substeps of the next step.
+
+        For a body whose motors are disabled: see `disable_motors`.
+        """
+        pybullet.setJointMotorControlArray(
+            self.id,
+            self.joint_indices,
+            pybullet.TORQUE_CONTROL,
+            forces=self._weakened(torques.tolist()),
+            physicsClientId=self.client,
+        )
+
     def cap_joint_speed(self, speed: float) -> None:
         """Never let a joint, whatever pushes it, turn or slide faster than `speed` [rad/s or m/s]."""
         pybullet.changeDynamics(self.id, -1, maxJointVelocity=speed, physicsClientId=self.client)
-
-    @cached_property
-    def _nominal(self) -> list[tuple[int, float, float, tuple[float, float, float]]]:
-        links = range(-1, len(self._links))
-        infos = [pybullet.getDynamicsInfo(self.id, link, physicsClientId=self.client) for link in links]
-        return [(link, info[0], info[1], info[2]) for link, info in zip(links, infos, strict=True)]
-
-    def _save_nominal(self) -> None:
-        self._changed = False
-        self.__dict__.pop("_nominal", None)  # read again when needed: `build` may have set other values
-
-    def _restore_nominal(self) -> None:
-        # PyBullet's saved states have positions and velocities, but neither masses nor friction.
-        if not self._changed:
-            return
-        self._changed = False
-        for link, mass, friction, inertia in self._nominal:
-            pybullet.changeDynamics(
-                self.id,
-                link,
-                mass=mass,
-                lateralFriction=friction,
-                localInertiaDiagonal=inertia,
-                physicsClientId=self.client,
-            )
-
-    def scale_mass(self, factor: float) -> None:
-        """Set mass and inertia of every link to `factor` times the built world's value, until the next reset."""
-        nominal = self._nominal
-        self._changed = True
-        for link, mass, _, inertia in nominal:
-            pybullet.changeDynamics(
-                self.id,
-                link,
-                mass=mass * factor,
-                localInertiaDiagonal=[element * factor for element in inertia],
-                physicsClientId=self.client,
-            )
-
-    def set_friction(self, friction: float) -> None:
-        """Set the lateral friction of every link, until the next reset."""
-        nominal = self._nominal
-        self._changed = True
-        for link, *_ in nominal:
-            pybullet.changeDynamics(self.id, link, lateralFriction=friction, physicsClientId=self.client)

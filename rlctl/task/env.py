@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, TaskError, did_you_mean
 from rlctl.task.events import EventSettings
+from rlctl.task.events.acting import ActingEvents, Signals
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, has_success
 
@@ -48,11 +49,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.max_steps = task.max_steps
         # A space holds a random generator: one on the class would be shared by every instance.
         self.action_space = copy.deepcopy(task.action_space)
-        self._interval_events = {
-            name: (event, max(1, round(event.every_s / task.control_dt)))
-            for name, event in self.events.items()
-            if event.when == "interval"
-        }
+        self._acting = ActingEvents(self.events, task.control_dt)
+        self.level = self._episode_level = 1.0
         self.sim = Sim(
             control_dt=task.control_dt,
             substeps=task.substeps,
@@ -64,19 +62,30 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._markers: dict[str, int] = {}
         try:
             self._build()
+            self._acting.rehearse(["reset"], self.sim)
             task.reset(np.random.default_rng(0))
+            self._acting.rehearse(["start", "interval"], self.sim)
             first = task.observe()
-            if render_mode is not None:
-                # A task knows its markers once an episode has begun; they join the world as it was built.
-                names = list(task.markers())
+            self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
+            self._signals.rehearse()
+            # A task knows its markers once an episode has begun; they join the world as it was built.
+            markers = list(task.markers()) if render_mode is not None else []
+            if self.events or render_mode is not None:
                 self.sim.restore()
-                self._add_markers(names)
+            if render_mode is not None:
+                self._add_markers(markers)
         except BaseException:
             self.sim.close()
             raise
         self.observation_sizes = {name: int(np.size(value)) for name, value in first.items()}
         self._shapes = {name: np.shape(value) for name, value in first.items()}
         self.observation_space = self._make_observation_space()
+
+    def set_level(self, level: float) -> None:
+        """Set how far ranges written `{from: ..., to: ...}` have widened, in [0, 1], from the next reset on."""
+        if not 0.0 <= level <= 1.0:
+            raise RecipeError(f"level: {level!r} is not in [0, 1]")
+        self.level = float(level)
 
     def _build(self) -> None:
         self.task.sim = self.sim
@@ -121,12 +130,16 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self._build()
             if self._markers:
                 self._add_markers(list(self._markers))
-        drawn = {name: event(self.sim, self.np_random) for name, event in self.events.items() if event.when == "reset"}
+        self._episode_level = self.level
+        drawn = self._acting.run("reset", self.sim, self.np_random, self.level)
         self.task.reset(self.np_random)
+        drawn |= self._acting.run("start", self.sim, self.np_random, self.level)
+        self._signals.begin(self.np_random, self.level)
         self._step = 0
         self._running = True
-        info: dict[str, Any] = {"events": drawn} if drawn else {}
         observation = self._observe()
+        drawn |= self._signals.drawn
+        info: dict[str, Any] = {"events": drawn} if drawn else {}
         if self.render_mode == "human":
             self._move_markers()
         return observation, info
@@ -137,7 +150,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise TaskError(f"{self.name}: step() before reset(), or after the episode's end")
         task = self.task
         action = self._checked(action)
-        task.act(action)
+        task.act(self._signals.act(action))
         self.sim.step()
         self._step += 1
         terminated = bool(task.is_terminated())
@@ -154,8 +167,9 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
                 raise TaskError(f"{self.name}: the weighted reward terms overflow at step {self._step}: {terms}")
             raise TaskError(f"{self.name}: reward term {bad!r} is {raw[bad]} at step {self._step}")
         info: dict[str, Any] = {"reward_terms": terms, "metrics": {name: raw[name] for name in weights}}
-        if self._interval_events:
-            self._run_interval_events(info)
+        if self._acting.has_intervals:
+            drawn = self._acting.run_due(self._step, self.sim, self.np_random, self._episode_level)
+            info.update({"events": drawn} if drawn else {})
         if self.has_success:
             info["is_success"] = bool(task.is_success())
         self._running = not (terminated or truncated)
@@ -178,13 +192,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise TaskError(f"{self.name}: action is not finite at step {self._step + 1}")
         return action
 
-    def _run_interval_events(self, info: dict[str, Any]) -> None:
-        for name, (event, period) in self._interval_events.items():
-            if self._step % period == 0:
-                info.setdefault("events", {})[name] = event(self.sim, self.np_random)
-
     def _observe(self) -> Observation:
-        parts = self.task.observe()
+        parts = self._signals.observe(self.task.observe())
         if self.task.observation_layout == "dict":
             dictionary = {name: np.array(value, np.float32) for name, value in parts.items()}
             if {name: value.shape for name, value in dictionary.items()} != self._shapes:

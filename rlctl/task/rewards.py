@@ -1,11 +1,30 @@
-"""Reward terms that tasks share: pure functions of numbers, without weights."""
+"""Reward terms that tasks share: pure functions of numbers, without weights.
+
+A term is large where its name holds, whether that is good or bad: the sign is the weight's.
+
+| what is judged                    | term                                                        |
+|-----------------------------------|-------------------------------------------------------------|
+| a goal                            | `distance`, `closeness`, `arrival`, `tolerance`             |
+| effort and smoothness             | `squared` (of actions, joint velocities), `power`, `change` |
+| moving on                         | `forward_velocity`, `forward_while_alive`, `alive`          |
+| an upright body                   | `posture`, `fallen`, `speed` (of an angular velocity)       |
+| a grasp                           | `grasp`                                                     |
+| time                              | `time_spent`                                                |
+| states a robot should not be in   | `near_limits`, `excess_force`, `penetration`                |
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
+
+from rlctl.errors import TaskError
+
+Array = NDArray[np.floating]
 
 
 def distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
@@ -19,6 +38,150 @@ def closeness(distance: float, scale: float) -> float:
     return math.exp(-((distance / scale) ** 2))
 
 
+def arrival(distance: float, tolerance: float) -> float:
+    """Return 1 where the distance is below `tolerance`, in the same unit, else 0."""
+    return float(distance < tolerance)
+
+
 def squared(x: NDArray[np.floating]) -> float:
     """Return the mean of the squared elements: in [0, 1] for an action in [-1, 1], whatever its size."""
     return float(x.dot(x)) / x.size
+
+
+def change(x: Array, last: Array) -> float:
+    """Return the mean of the squared differences between two vectors, such as an action and the one before it."""
+    return squared(x - last)
+
+
+def power(torques: Array, velocities: Array) -> float:
+    """Return the power that the joints' motors turn over [W]: the sum of |torque [N m] x velocity [rad/s]|."""
+    return float(np.abs(torques * velocities).sum())
+
+
+def forward_velocity(velocity: Array, heading: Array) -> float:
+    """Return the part of a velocity [m/s] along `heading`, a direction of any length but 0; both of shape (3,)."""
+    return float(np.dot(velocity, heading) / math.sqrt(np.dot(heading, heading)))
+
+
+def forward_while_alive(velocity: Array, heading: Array, alive: bool) -> float:
+    """Return `forward_velocity` [m/s] while `alive`, else 0: falling or jumping forward earns nothing."""
+    return forward_velocity(velocity, heading) if alive else 0.0
+
+
+def alive(terminated: bool) -> float:
+    """Return 1 in every step that does not end the episode, else 0."""
+    return 0.0 if terminated else 1.0
+
+
+def posture(orientation: Array) -> float:
+    """Return roll^2 + pitch^2 [rad^2] of a quaternion (x, y, z, w): 0 upright, whatever the heading.
+
+    With the z-y-x (yaw, pitch, roll) angles of a unit quaternion: roll = atan2(2 (w x + y z), 1 - 2 (x^2 + y^2)),
+    pitch = asin(2 (w y - z x)). Where the pitch is a right angle no roll can be told, and it counts as 0.
+    """
+    x, y, z, w = orientation.tolist()
+    sine = 2 * (w * y - z * x)
+    if abs(sine) > 0.99999:
+        return (math.pi / 2) ** 2
+    return math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) ** 2 + math.asin(sine) ** 2
+
+
+def fallen(height: float, lowest: float) -> float:
+    """Return 1 where a height is below the lowest that counts as standing, both [m], else 0."""
+    return float(height < lowest)
+
+
+def speed(velocity: Array) -> float:
+    """Return the length of a velocity: an angular one of shape (3,) [rad/s], or a linear one [m/s]."""
+    return math.sqrt(np.dot(velocity, velocity))
+
+
+def grasp(distance: float, scale: float, held: bool) -> float:
+    """Return half for nearness to the object (`closeness`), and half for holding it: in [0, 1]."""
+    return 0.5 * closeness(distance, scale) + (0.5 if held else 0.0)
+
+
+def time_spent(control_dt: float) -> float:
+    """Return the time of one step [s], so that its weight is a cost per second whatever the control rate."""
+    return control_dt
+
+
+def near_limits(positions: Array, low: Array, high: Array, margin: float) -> float:
+    """Return how far joints are into the last `margin` before a limit: the mean, 0 outside it and 1 at a limit.
+
+    Everything in [rad] or [m], arrays of shape (joints,); beyond a limit it goes on rising. A joint whose lower limit
+    is not below its upper one has no limits.
+    """
+    room = np.minimum(positions - low, high - positions)
+    inside = np.maximum(0.0, 1.0 - room / margin)
+    return float(np.where(low < high, inside, 0.0).mean())
+
+
+def excess_force(forces: Array, limit: float) -> float:
+    """Return by how much contact forces exceed `limit`, added up [N]; no contact, of shape (0,), gives 0."""
+    return float(np.maximum(0.0, forces - limit).sum())
+
+
+def penetration(distances: Array) -> float:
+    """Return the depth of the deepest contact [m] of contact distances, negative where bodies overlap; 0 for none."""
+    return float(np.maximum(0.0, -distances).max()) if distances.size else 0.0
+
+
+Falloff = Literal["gaussian", "linear", "long_tail"]
+
+
+@overload
+def tolerance(
+    x: float, bounds: tuple[float, float] = ..., margin: float = ..., falloff: Falloff = ..., at_margin: float = ...
+) -> float: ...
+
+
+@overload
+def tolerance(
+    x: Array, bounds: tuple[float, float] = ..., margin: float = ..., falloff: Falloff = ..., at_margin: float = ...
+) -> NDArray[np.float64]: ...
+
+
+def tolerance(
+    x: float | Array,
+    bounds: tuple[float, float] = (0.0, 0.0),
+    margin: float = 0.0,
+    falloff: Falloff = "gaussian",
+    at_margin: float = 0.1,
+) -> float | NDArray[np.float64]:
+    """Return 1 where x is inside `bounds`, falling to `at_margin` at a distance of `margin` outside them.
+
+    With v = `at_margin` and d = distance / margin, outside the bounds the value is
+    - gaussian: v^(d^2)
+    - linear: 1 - (1 - v) d, not below 0
+    - long_tail: 1 / (1 + (1/v - 1) d^2)
+
+    and 0 with a margin of 0. x, `bounds` and `margin` have one unit; an array gives one value per element. Raises
+    `TaskError` for reversed bounds, a negative margin and `at_margin` outside (0, 1). The idea and the shapes are
+    those of `tolerance` in the DeepMind Control Suite, Tassa et al. 2018, arXiv:1801.00690, section 2.
+    """
+    low, high = bounds
+    if low > high:
+        raise TaskError(f"tolerance: bounds ({low:g}, {high:g}) are reversed")
+    if margin < 0:
+        raise TaskError(f"tolerance: margin {margin:g} is negative")
+    if not 0 < at_margin < 1:
+        raise TaskError(f"tolerance: at_margin {at_margin:g} is not between 0 and 1")
+    if falloff not in _FALLOFFS:
+        raise TaskError(f"tolerance: no falloff {falloff!r}. There are: {', '.join(_FALLOFFS)}")
+    if isinstance(x, np.ndarray):
+        values = [tolerance(each, bounds, margin, falloff, at_margin) for each in x.ravel().tolist()]
+        return np.array(values, np.float64).reshape(x.shape)
+    outside = max(low - x, x - high)
+    if outside <= 0:
+        return 1.0
+    if math.isnan(outside):
+        return math.nan
+    return _FALLOFFS[falloff](outside / margin, at_margin) if margin else 0.0
+
+
+_FALLOFFS: dict[str, Callable[[float, float], float]] = {
+    "gaussian": lambda d, v: math.pow(v, d * d),
+    "linear": lambda d, v: max(0.0, 1 - (1 - v) * d),
+    "long_tail": lambda d, v: 1 / (1 + (1 / v - 1) * d * d),
+}

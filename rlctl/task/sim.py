@@ -6,8 +6,10 @@ read at most once per control step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,14 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError, did_you_mean
 from rlctl.task.body import Array, Body
 from rlctl.task.bullet import pybullet, pybullet_data
+
+
+@dataclasses.dataclass
+class _Push:
+    body: Body
+    link: int
+    force: Sequence[float]  # [N], world frame
+    steps: int  # control steps that it still acts
 
 
 class Sim:
@@ -36,12 +46,24 @@ class Sim:
             "deterministicOverlappingPairs": 1,
         }
         self._saved: int | None = None
+        self._built_gravity: tuple[float, ...] | None = None  # [m/s^2], known while events have changed it
+        self._pushes: list[_Push] = []
         self._prepare()
 
     def _prepare(self) -> None:
         pybullet.setAdditionalSearchPath(pybullet_data.getDataPath(), physicsClientId=self.client)
         pybullet.setPhysicsEngineParameter(**self._settings, physicsClientId=self.client)
-        pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self.client)
+        self.set_gravity(9.81)
+
+    def set_gravity(self, gravity: float) -> None:
+        """Set the downward gravity of the built world [m/s^2], 9.81 where nothing is said. For `build`."""
+        pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self.client)
+
+    def set_contact_stiffness(self, erp: float) -> None:
+        """Set the part of a contact's depth that a physics step takes away, in (0, 1]: Bullet's error reduction
+        parameter, 0.2 where nothing is said. For `build`: the value is kept through all resets.
+        """
+        pybullet.setDefaultContactERP(erp, physicsClientId=self.client)
 
     def load(
         self,
@@ -52,21 +74,46 @@ class Sim:
         orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
         fixed: bool = False,
         flags: int = 0,
+        self_collision: bool = False,
     ) -> Body:
-        """Load a URDF file: a path, or a name in `pybullet_data`. `flags` are PyBullet's URDF_* flags."""
+        """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or a name in `pybullet_data`.
+
+        `position` [m], `orientation` and `fixed` are for URDF: the others say themselves where a body is and whether
+        it is fixed. `flags` are PyBullet's URDF_* flags. `self_collision` lets links collide that are not each
+        other's ancestors.
+        """
         path = Path(file)
         if not path.is_absolute() and not path.exists():
             path = Path(pybullet_data.getDataPath()) / file
         if not path.exists():
             raise TaskError(f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data")
-        try:
-            body_id = pybullet.loadURDF(
-                str(path), position, orientation, useFixedBase=fixed, flags=flags, physicsClientId=self.client
-            )
-        except pybullet.error as error:
-            raise TaskError(f"PyBullet cannot load {path}: {error}") from None
+        if self_collision:
+            flags |= pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
+        if path.suffix in (".xml", ".sdf"):
+            if fixed or any(position) or tuple(orientation) != (0, 0, 0, 1):
+                raise TaskError(f"{path.name} says itself where its body is: position, orientation, fixed are for URDF")
+            body_id = self._load_placed(path, flags)
+            # A base without mass stays where it is.
+            fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0
+        else:
+            body_id = self._loaded(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
         self.bodies[name] = Body(self.client, int(self._settings["numSubSteps"]), name, body_id, path, fixed)
         return self.bodies[name]
+
+    def _load_placed(self, path: Path, flags: int) -> int:
+        if path.suffix == ".xml":
+            ids = self._loaded(path, pybullet.loadMJCF, flags=flags)
+        else:
+            ids = self._loaded(path, pybullet.loadSDF)
+        if len(ids) != 1:
+            raise TaskError(f"{path} holds {len(ids)} bodies; load takes files of one, so split it")
+        return int(ids[0])
+
+    def _loaded(self, path: Path, load: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        try:
+            return load(str(path), *args, **kwargs, physicsClientId=self.client)
+        except pybullet.error as error:
+            raise TaskError(f"PyBullet cannot load {path}: {error}") from None
 
     def body(self, name: str) -> Body:
         """Return a loaded body by its name."""
@@ -78,6 +125,8 @@ class Sim:
 
     def step(self) -> None:
         """Simulate `control_dt` seconds."""
+        if self._pushes:
+            self._apply_pushes()
         pybullet.stepSimulation(physicsClientId=self.client)
         for body in self.bodies.values():
             body._cache.clear()
@@ -85,21 +134,54 @@ class Sim:
     def save(self) -> None:
         """Remember the world as it is now, for `restore`."""
         self._saved = pybullet.saveState(physicsClientId=self.client)
+        self._built_gravity = None
         for body in self.bodies.values():
             body._save_nominal()
 
     def restore(self) -> None:
         """Put the world back as `save` found it."""
+        self._pushes.clear()
+        if self._built_gravity is not None:
+            pybullet.setGravity(*self._built_gravity, physicsClientId=self.client)
+            self._built_gravity = None
         pybullet.restoreState(self._saved, physicsClientId=self.client)
         for body in self.bodies.values():
             body._cache.clear()
             body._restore_nominal()
 
+    def shift_gravity(self, change: float) -> None:
+        """Set the vertical gravity to the built world's value plus `change` [m/s^2], until the next reset."""
+        if self._built_gravity is None:
+            engine = pybullet.getPhysicsEngineParameters(physicsClientId=self.client)
+            self._built_gravity = tuple(engine[f"gravityAcceleration{axis}"] for axis in "XYZ")
+        x, y, z = self._built_gravity
+        pybullet.setGravity(x, y, z + change, physicsClientId=self.client)
+
+    def push(self, body: str, force: Sequence[float], duration_s: float, link: str | None = None) -> None:
+        """Push a link, or the base, at its centre of mass with `force` [N, world frame] for `duration_s` [s].
+
+        The push acts in whole control steps, at least one, from the next one on; a reset ends it.
+        """
+        pushed = self.body(body)
+        index = -1 if link is None else pushed._part_index(link)
+        self._pushes.append(_Push(pushed, index, force, max(1, round(duration_s / self._settings["fixedTimeStep"]))))
+
+    def _apply_pushes(self) -> None:
+        # PyBullet forgets a force after a step, but not in restoreState: so none is given to it ahead of time.
+        for push in self._pushes:
+            centre = push.body._mass_centre(push.link)
+            pybullet.applyExternalForce(
+                push.body.id, push.link, push.force, centre, pybullet.WORLD_FRAME, physicsClientId=self.client
+            )
+            push.steps -= 1
+        self._pushes = [push for push in self._pushes if push.steps]
+
     def clear(self) -> None:
         """Empty the world, as if it had just been made."""
         pybullet.resetSimulation(physicsClientId=self.client)
         self.bodies.clear()
-        self._saved = None
+        self._pushes.clear()
+        self._saved = self._built_gravity = None
         self._prepare()
 
     def add_marker(self, position: Sequence[float], radius: float, color: Sequence[float]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -40,6 +40,9 @@ class Task:
     reward_weights: ClassVar[Mapping[str, float]] = {}
     """Weight per reward term; a term with weight 0 is a metric."""
     events: ClassVar[Mapping[str, Event]] = {}
+    stages: ClassVar[Sequence[Mapping[str, Any]]] = ()
+    """Curriculum, as the recipe's key `stages`, which replaces it: `{"task": {"tolerance": 0.2}, "promote":
+    {"success": 0.8, "window": 100}}`, and so on; the last, often `{}`, is what is wanted and evaluated."""
     fast_reset: ClassVar[bool] = True
     """Reset by restoring the built world. False loads the world anew at every reset: slower by a factor of
     a hundred, for worlds whose contacts do not repeat bit for bit after a restore."""

@@ -1,14 +1,14 @@
-"""Events: when they act, what they draw, and that a new episode never feels an old one's."""
+"""Events: when they act, what they draw, how they widen, and that a new episode never feels an old one's."""
 
 import numpy as np
 import pytest
 
-from rlctl.errors import RecipeError, TaskError
+from rlctl.errors import RecipeError
 from rlctl.task import Event, events
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
-from tests.task.tasks import Cart, Slider
+from tests.task.tasks import Cart
 
 
 @pytest.fixture
@@ -129,28 +129,51 @@ def test_an_event_that_is_part_of_the_problem(make):
     assert make(Pushed()).reset(seed=0)[1] == {"events": {"mass": {"factor": 1.0}}}
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"mas": {}}, "events: this task has no event 'mas'. Did you mean 'mass'? It has: mass, friction."),
-        (
-            {"mass": {"factr": (1, 2)}},
-            "events.mass: no parameter 'factr'. Did you mean 'factor'? It has: body, factor.",
-        ),
-    ],
-)
-def test_a_typo_names_the_closest(changes, message):
-    with pytest.raises(RecipeError) as caught:
-        TaskEnv(Cart(), events=EventSettings(changes=changes))
-    assert str(caught.value) == message
+def test_ranges_widen_with_the_level(make):
+    env = make(Cart(), mass={"factor": {"from": [0.9, 1.1], "to": [0.5, 2.1]}})
+
+    def drawn_at(level):
+        env.set_level(level)
+        return np.array([env.reset(seed=seed)[1]["events"]["mass"]["factor"] for seed in range(200)])
+
+    assert env.level == 1.0  # without a curriculum everything is as wide as it gets
+    # Half way: 0.7 to 1.6
+    for level, low, high in [(0.0, 0.9, 1.1), (0.5, 0.7, 1.6), (1.0, 0.5, 2.1)]:
+        drawn = drawn_at(level)
+        assert low <= drawn.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < drawn.max() <= high
+    # The same chance at every level: from one seed, the same place in the range.
+    np.testing.assert_allclose((drawn_at(0.0) - 0.9) / 0.2, (drawn_at(1.0) - 0.5) / 1.6)
 
 
-def test_a_task_without_events():
-    with pytest.raises(RecipeError, match=r"^events: this task has no event 'mass'. It has: none.$"):
-        TaskEnv(Slider(), events=EventSettings(changes={"mass": {}}))
+def test_a_level_holds_for_whole_episodes(make):
+    env = make(Cart(), friction={"every_s": 1 / 60, "friction": {"from": 0.5, "to": 1.5}})
+    env.set_level(0.0)
+    env.reset(seed=0)
+    env.set_level(1.0)
+    assert env.step([0.0])[4]["events"]["friction"]["friction"] == 0.5
+    env.reset(seed=0)
+    assert env.step([0.0])[4]["events"]["friction"]["friction"] == 1.5
 
 
-def test_an_event_on_an_unknown_body(make):
-    env = make(Cart(), mass={"body": "cub"})
-    with pytest.raises(TaskError, match=r"^no body 'cub'\. Did you mean 'cube'\? Loaded: plane, cube\.$"):
-        env.reset(seed=0)
+@pytest.mark.parametrize("level", [-0.1, 1.5, float("nan")])
+def test_a_level_that_is_none(make, level):
+    with pytest.raises(RecipeError, match=r"^level: .* is not in \[0, 1\]$"):
+        make(Cart()).set_level(level)
+
+
+def test_an_event_of_the_authors_own(make):
+    def tilt(sim, rng, *, angle):
+        drawn = float(rng.uniform(*angle))
+        sim.body("cube").set_base((0, 0, 1), (np.sin(drawn / 2), 0, 0, np.cos(drawn / 2)))
+        return {"angle": drawn}
+
+    class Tilted(Cart):
+        events = {"tilt": Event("start", tilt, angle={"from": (0.0, 0.0), "to": (0.3, 0.5)})}
+
+    env = make(Tilted(), randomize=True)
+    drawn = env.reset(seed=0)[1]["events"]["tilt"]["angle"]
+    assert 0.3 <= drawn <= 0.5
+    assert env.task.cube.base_orientation[0] == pytest.approx(np.sin(drawn / 2))
+    env.set_level(0.0)
+    assert env.reset(seed=0)[1]["events"] == {"tilt": {"angle": 0.0}}

@@ -1,0 +1,154 @@
+"""The events that act in one environment: called at their moments, in the order the task declares them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from rlctl.errors import RlctlError, TaskError, did_you_mean
+from rlctl.task.events.event import BoundEvent, Drawn, Parts, Signal, When
+from rlctl.task.sim import Sim
+
+_ACTION = "action"
+
+
+class ActingEvents:
+    """Changes of the world at `reset`, `start` and `interval`; `level` in [0, 1] is how wide their ranges are."""
+
+    def __init__(self, events: Mapping[str, BoundEvent], control_dt: float) -> None:
+        self._events: dict[When, list[BoundEvent]] = {"reset": [], "start": [], "interval": []}
+        for event in events.values():
+            self._events.get(event.event.when, []).append(event)
+        self._periods = [max(1, round(event.event.every_s / control_dt)) for event in self._events["interval"]]
+
+    def run(self, when: When, sim: Sim, rng: np.random.Generator, level: float) -> dict[str, Drawn]:
+        """Let the events of `when` act; returns what they drew, by name."""
+        return {event.name: event(sim, rng, level) for event in self._events[when]}
+
+    def run_due(self, step: int, sim: Sim, rng: np.random.Generator, level: float) -> dict[str, Drawn]:
+        """Let the interval events act whose period ends at `step`."""
+        due = zip(self._events["interval"], self._periods, strict=True)
+        return {event.name: event(sim, rng, level) for event, period in due if step % period == 0}
+
+    @property
+    def has_intervals(self) -> bool:
+        return bool(self._periods)
+
+    def rehearse(self, moments: Iterable[When], sim: Sim) -> None:
+        """Let events act once, for their mistakes: a name that is not in this world, or a result that is none."""
+        for when in moments:
+            for event in self._events[when]:
+                try:
+                    drawn = event(sim, np.random.default_rng(0), 1.0)
+                except RlctlError as error:
+                    raise event.error(f"events.{event.name}: {error}") from None
+                _check_drawn(event.name, drawn)
+
+
+class Signals:
+    """Noise and delay on observations and actions.
+
+    `bounds` are those of the observations, which noise does not leave.
+    """
+
+    def __init__(
+        self,
+        events: Mapping[str, BoundEvent],
+        first: Parts,
+        action_space: spaces.Space[Any],
+        bounds: Mapping[str, tuple[float, float]],
+    ) -> None:
+        self._on_observation = [event for event in events.values() if event.event.when == "observation"]
+        self._on_action = [event for event in events.values() if event.event.when == "action"]
+        self._of = {event.name: _observed_names(event, first) for event in self._on_observation}
+        self._first = first
+        self._space = action_space
+        for event in self._on_action:
+            if not isinstance(action_space, spaces.Box):
+                raise event.error(
+                    f"events.{event.name}: only actions in a Box can be noisy or late, not {action_space}."
+                )
+        self._bounds = bounds
+        self._observation_signals: list[tuple[list[str], Signal]] | None = []
+        self._action_signals: list[Signal] = []
+        self.drawn: dict[str, Drawn] = {}
+        """What was drawn for this episode, by event."""
+
+    def begin(self, rng: np.random.Generator, level: float) -> None:
+        """Start an episode; all chance of it comes from `rng`."""
+        self.drawn = {}
+        self._rng, self._level = rng, level
+        self._observation_signals = None  # begins with the first observation
+        self._action_signals = [self._started(event, self._neutral_action()) for event in self._on_action]
+
+    def rehearse(self) -> None:
+        """Begin every signal once, for its mistakes."""
+        self.begin(np.random.default_rng(0), 1.0)
+        self.observe(self._first)
+
+    def _neutral_action(self) -> Parts:
+        low, high = self._space.low, self._space.high  # type: ignore[attr-defined]
+        return {_ACTION: np.clip(np.zeros_like(low), low, high)}
+
+    def _started(self, event: BoundEvent, first: Parts) -> Signal:
+        made = event(self._rng, first, self._level)
+        if not (isinstance(made, tuple) and len(made) == 2 and callable(made[1])):
+            raise TaskError(f"events.{event.name}: its function must return what it drew and a signal, not {made!r}")
+        drawn, signal = made
+        _check_drawn(event.name, drawn)
+        self.drawn[event.name] = drawn
+        return signal  # type: ignore[no-any-return]
+
+    def observe(self, parts: Parts) -> Parts:
+        """Return what the policy sees of an observation."""
+        if self._observation_signals is None:
+            return self._observe_first(parts)
+        for names, signal in self._observation_signals:
+            parts = self._through(signal, names, parts)
+        return parts
+
+    def _observe_first(self, parts: Parts) -> Parts:
+        self._observation_signals = []
+        for event in self._on_observation:
+            names = self._of[event.name]
+            signal = self._started(event, {name: parts[name] for name in names})
+            self._observation_signals.append((names, signal))
+            parts = self._through(signal, names, parts)
+        return parts
+
+    def _through(self, signal: Signal, names: list[str], parts: Parts) -> Parts:
+        changed = dict(signal({name: parts[name] for name in names}))
+        for name in names:
+            if name in self._bounds:
+                changed[name] = np.clip(changed[name], *self._bounds[name])
+        return {**parts, **changed}
+
+    def act(self, action: Any) -> Any:
+        """Return what the motors get of an action; it stays inside the action space."""
+        if not self._action_signals:
+            return action
+        parts = {_ACTION: action}
+        for signal in self._action_signals:
+            parts = signal(parts)
+        low, high = self._space.low, self._space.high  # type: ignore[attr-defined]
+        return np.clip(parts[_ACTION], low, high).astype(self._space.dtype)
+
+
+def _observed_names(event: BoundEvent, first: Parts) -> list[str]:
+    of = event.event.of
+    names = [of] if isinstance(of, str) else list(of)
+    for name in names:
+        if name not in first:
+            raise event.error(
+                f"events.{event.name}: nothing observed is called {name!r}.{did_you_mean(str(name), first)} "
+                f"There is: {', '.join(first)}."
+            )
+    return names or list(first)
+
+
+def _check_drawn(name: str, drawn: Any) -> None:
+    if not isinstance(drawn, dict) or not all(isinstance(value, int | float) for value in drawn.values()):
+        raise TaskError(f"events.{name}: its function must return what it drew, as numbers by name, not {drawn!r}")

@@ -1,0 +1,144 @@
+"""Events that change the world: physical properties, colours, start states and pushes.
+
+Each draws from the ranges it is given, changes a body from its nominal values, and returns what it drew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from rlctl.errors import TaskError
+from rlctl.task.events.event import Drawn, acts_at
+from rlctl.task.events.ranges import Fraction, NotNegative, Positive, Range
+from rlctl.task.sim import Sim
+
+Rng = np.random.Generator
+
+
+@acts_at("reset", "start", "interval")
+def scale_mass(sim: Sim, rng: Rng, *, body: str, factor: Positive, links: Sequence[str] = ()) -> Drawn:
+    """Scale the mass and inertia of `links`, or of the whole body, by one factor."""
+    drawn = float(rng.uniform(*factor))
+    sim.body(body).scale_mass(drawn, links)
+    return {"factor": drawn}
+
+
+@acts_at("reset", "start", "interval")
+def set_friction(sim: Sim, rng: Rng, *, body: str, friction: NotNegative, links: Sequence[str] = ()) -> Drawn:
+    """Set the lateral friction of `links`, or of the whole body; a contact has the product of its two bodies'."""
+    drawn = float(rng.uniform(*friction))
+    sim.body(body).set_friction(drawn, links)
+    return {"friction": drawn}
+
+
+@acts_at("reset", "start", "interval")
+def shift_gravity(sim: Sim, rng: Rng, *, change: Range) -> Drawn:
+    """Add `change` [m/s^2] to the vertical gravity: -9.81 with (-0.5, 0.5) is -10.31 to -9.31."""
+    drawn = float(rng.uniform(*change))
+    sim.shift_gravity(drawn)
+    return {"change": drawn}
+
+
+@acts_at("reset", "start", "interval")
+def scale_joint_damping(sim: Sim, rng: Rng, *, body: str, factor: NotNegative, joints: Sequence[str] = ()) -> Drawn:
+    """Scale the damping of `joints`, or of all, by one factor."""
+    drawn = float(rng.uniform(*factor))
+    sim.body(body).scale_joint_damping(drawn, joints)
+    return {"factor": drawn}
+
+
+@acts_at("reset", "start", "interval")
+def set_joint_damping(sim: Sim, rng: Rng, *, body: str, damping: NotNegative, joints: Sequence[str] = ()) -> Drawn:
+    """Set the damping of `joints`, or of all [N m s/rad or N s/m]: for models that have none to scale."""
+    drawn = float(rng.uniform(*damping))
+    sim.body(body).set_joint_damping(drawn, joints)
+    return {"damping": drawn}
+
+
+@acts_at("reset", "start", "interval")
+def scale_motor_strength(sim: Sim, rng: Rng, *, body: str, factor: NotNegative, joints: Sequence[str] = ()) -> Drawn:
+    """Scale the force that the motors of `joints`, or of all, give by one factor."""
+    drawn = float(rng.uniform(*factor))
+    sim.body(body).scale_motor_strength(drawn, joints)
+    return {"factor": drawn}
+
+
+@acts_at("reset", "start", "interval")
+def set_color(
+    sim: Sim, rng: Rng, *, body: str, red: Fraction, green: Fraction, blue: Fraction, links: Sequence[str] = ()
+) -> Drawn:
+    """Paint `links`, or the whole body, in one colour; a texture shows through."""
+    drawn = [float(rng.uniform(*channel)) for channel in (red, green, blue)]
+    sim.body(body).set_color(drawn, links)
+    return dict(zip(("red", "green", "blue"), drawn, strict=True))
+
+
+@acts_at("start")
+def offset_joints(
+    sim: Sim,
+    rng: Rng,
+    *,
+    body: str,
+    position: Range = (0.0, 0.0),
+    velocity: Range = (0.0, 0.0),
+    joints: Sequence[str] = (),
+) -> Drawn:
+    """Start `joints`, or all, off where the task's reset put them: position [rad or m] and velocity [rad/s or m/s].
+
+    Every joint has draws of its own; positions stay inside the joint's limits.
+    """
+    moved = sim.body(body)
+    places = moved.joint_places(joints)
+    by_position = rng.uniform(*position, len(places))
+    by_velocity = rng.uniform(*velocity, len(places))
+    positions, velocities = moved.joint_positions.copy(), moved.joint_velocities.copy()
+    low, high = moved.joint_low[places], moved.joint_high[places]
+    started = positions[places] + by_position
+    # A joint without limits says so by a lower one that is not below the upper.
+    positions[places] = np.where(low < high, np.clip(started, low, high), started)
+    velocities[places] += by_velocity
+    moved.set_joints(positions, velocities)
+    names = [moved.joint_names[place] for place in places]
+    drawn = {f"{name} position": float(by) for name, by in zip(names, by_position, strict=True)}
+    return drawn | {f"{name} velocity": float(by) for name, by in zip(names, by_velocity, strict=True)}
+
+
+@acts_at("start", "interval")
+def push(
+    sim: Sim,
+    rng: Rng,
+    *,
+    body: str,
+    force: NotNegative,
+    duration_s: Positive = (0.1, 0.1),
+    link: str | None = None,
+) -> Drawn:
+    """Push a link, or the base, with a horizontal force [N] from a random side for `duration_s` [s].
+
+    Rounded to control steps, of which it lasts at least one.
+    """
+    drawn = {
+        "force": float(rng.uniform(*force)),
+        "direction": float(rng.uniform(-math.pi, math.pi)),  # [rad], from the world's x axis
+        "duration_s": float(rng.uniform(*duration_s)),
+    }
+    sim.push(body, _horizontal(drawn["force"], drawn["direction"]), drawn["duration_s"], link)
+    return drawn
+
+
+@acts_at("start", "interval")
+def kick(sim: Sim, rng: Rng, *, body: str, speed: NotNegative) -> Drawn:
+    """Change the velocity of the base, at once, by a horizontal `speed` [m/s] in a random direction."""
+    kicked = sim.body(body)
+    if kicked.fixed:
+        raise TaskError(f"body {body!r} is fixed to the world: a kick cannot move it")
+    drawn = {"speed": float(rng.uniform(*speed)), "direction": float(rng.uniform(-math.pi, math.pi))}
+    kicked.add_velocity(_horizontal(drawn["speed"], drawn["direction"]))
+    return drawn
+
+
+def _horizontal(length: float, direction: float) -> tuple[float, float, float]:
+    return length * math.cos(direction), length * math.sin(direction), 0.0

@@ -1,0 +1,185 @@
+"""`Event`: a named change of a task, its parameters, and what a recipe makes of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, Literal, TypeVar
+
+from numpy.typing import NDArray
+
+from rlctl.errors import RecipeError, RlctlError, TaskError, did_you_mean
+from rlctl.task.events.ranges import Limits, Range, Widening, read_range
+
+When = Literal["reset", "start", "interval", "observation", "action"]
+Drawn = dict[str, float]
+Parts = dict[str, NDArray[Any]]
+Signal = Callable[[Parts], Parts]
+"""What a control step's values, by name, become: a sensor or a motor that is noisy or late."""
+
+Change = Callable[..., Drawn]
+"""`(sim, rng, **parameters)`: changes the world, always from its nominal values, and returns what it drew."""
+SignalMaker = Callable[..., tuple[Drawn, Signal]]
+"""`(rng, first, **parameters)`: starts an episode whose first values are `first`; returns what it drew and a signal."""
+
+_MOMENTS: tuple[When, ...] = typing.get_args(When)
+_ALL_MOMENTS = f"There are: {', '.join(_MOMENTS)}."
+_SETTINGS: Mapping[When, list[str]] = {"interval": ["every_s"], "observation": ["of"]}
+_acts_at: dict[Callable[..., Any], tuple[When, ...]] = {}
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def acts_at(*when: When) -> Callable[[_Function], _Function]:
+    """Mark an event function with the moments at which it makes sense; any, without this."""
+
+    def mark(function: _Function) -> _Function:
+        _acts_at[function] = when
+        return function
+
+    return mark
+
+
+class Event:
+    """A change `function(..., **parameters)` that a task offers and a recipe switches on, or that is part of it.
+
+    `when` is one of
+    - `reset`: before the task's own reset, for properties such as a mass;
+    - `start`: after it, for a state such as joint angles or velocities;
+    - `interval`: every `every_s` seconds of an episode;
+    - `observation`: on what is observed, or only on the names in `of`, at every step;
+    - `action`: on what `Task.act` gets, at every step.
+
+    Events act when the recipe says so; one that is part of the problem says `enabled=True`.
+    """
+
+    def __init__(
+        self,
+        when: When,
+        function: Change | SignalMaker,
+        *,
+        every_s: float = 1.0,
+        of: str | Sequence[str] = (),
+        enabled: bool = False,
+        **parameters: Any,
+    ) -> None:
+        self.when = when
+        self.function = function
+        self.every_s = every_s
+        self.of = of
+        self.enabled = enabled
+        self.parameters = parameters
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """What a recipe can set: the function's own parameters, then `every_s` or `of` where they mean something."""
+        return [*self._signature, *_SETTINGS.get(self.when, [])]
+
+    @cached_property
+    def _signature(self) -> dict[str, inspect.Parameter]:
+        found = list(inspect.signature(self.function).parameters.values())[2:]
+        return {p.name: p for p in found if p.kind is not p.VAR_KEYWORD}
+
+    def with_parameters(self, name: str, changes: Mapping[str, Any]) -> Event:
+        """Return this event, enabled, with some parameters replaced; `name` is for the error."""
+        for key in changes:
+            if key not in self.parameter_names:
+                raise RecipeError(
+                    f"events.{name}: no parameter {key!r}.{did_you_mean(str(key), self.parameter_names)} "
+                    f"It has: {', '.join(self.parameter_names) or 'none'}."
+                )
+        settings = {"every_s": self.every_s, "of": self.of, **self.parameters, **changes}
+        return Event(self.when, self.function, enabled=True, **settings)
+
+    def bind(self, name: str, error: type[RlctlError] = TaskError) -> BoundEvent:
+        """Check everything that can be known without a world; raises `error` that begins with `events.<name>`."""
+        where = f"events.{name}"
+        if self.when not in _MOMENTS:
+            raise error(f"{where}: no moment {self.when!r}.{did_you_mean(self.when, _MOMENTS)} {_ALL_MOMENTS}")
+        possible = _acts_at.get(self.function, _MOMENTS)
+        if self.when not in possible:
+            function = getattr(self.function, "__name__", str(self.function))
+            raise error(f"{where}: {function} does not act at {self.when!r}, but at: {', '.join(possible)}.")
+        for key, parameter in self._signature.items():
+            if parameter.default is parameter.empty and key not in self.parameters:
+                raise error(f"{where}: parameter {key!r} is missing. It has: {', '.join(self.parameter_names)}.")
+        values = {key: self._read(f"{where}.{key}", key, value, error) for key, value in self.parameters.items()}
+        if self.when == "observation":
+            _check_type(f"{where}.of", str | Sequence[str], self.of, error)
+        elif self.of:
+            raise error(f"{where}.of: names observations, so it is for events at 'observation', not {self.when!r}.")
+        if self.when == "interval":
+            read_range(f"{where}.every_s", self.every_s, Limits(0.0, above=True), error)
+        return BoundEvent(name, self, values, error)
+
+    @cached_property
+    def _hints(self) -> dict[str, Any]:
+        try:
+            return typing.get_type_hints(self.function, include_extras=True)
+        except NameError:  # types that the function's module does not have at run time
+            return {}
+
+    def _read(self, where: str, key: str, value: Any, error: type[RlctlError]) -> Any:
+        hint = self._hints.get(key)
+        limits = next((m for m in getattr(hint, "__metadata__", ()) if isinstance(m, Limits)), Limits())
+        widens = hint is None and isinstance(value, Mapping) and value.keys() == {"from", "to"}
+        if widens or hint == Range or getattr(hint, "__origin__", None) == Range:
+            return read_range(where, value, limits, error)
+        if hint is not None:
+            _check_type(where, hint, value, error)
+        return value
+
+
+def _check_type(where: str, hint: Any, value: Any, error: type[RlctlError]) -> None:
+    import pydantic
+
+    try:
+        pydantic.TypeAdapter(hint).validate_python(value)
+    except pydantic.ValidationError as problem:
+        told = problem.errors()[0]["msg"].removeprefix("Input ")
+        raise error(f"{where}: {told}, got {value!r}") from None
+    except pydantic.errors.PydanticSchemaGenerationError:
+        return  # a type of the author's own
+
+
+@dataclasses.dataclass(frozen=True)
+class BoundEvent:
+    """An event that acts in an environment, checked; `error` is the kind that its mistakes are."""
+
+    name: str
+    event: Event
+    values: Mapping[str, Any]
+    error: type[RlctlError]
+
+    def __call__(self, first: Any, second: Any, level: float) -> Any:
+        """Call the function, with its ranges at `level`."""
+        values = {key: v.at(level) if isinstance(v, Widening) else v for key, v in self.values.items()}
+        return self.event.function(first, second, **values)
+
+
+@dataclasses.dataclass(frozen=True)
+class EventSettings:
+    """What a recipe says of a task's events."""
+
+    randomize: bool = False
+    changes: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+
+    def apply(self, events: Mapping[str, Event]) -> dict[str, BoundEvent]:
+        """Return the events that act, by name; also looks at those that rest for mistakes."""
+        for name in self.changes:
+            if name not in events:
+                raise RecipeError(
+                    f"events: this task has no event {name!r}.{did_you_mean(name, events)} "
+                    f"It has: {', '.join(events) or 'none'}."
+                )
+        active = {}
+        for name, event in events.items():
+            bound = event.bind(name)
+            if name in self.changes:
+                active[name] = event.with_parameters(name, self.changes[name]).bind(name, RecipeError)
+            elif event.enabled or self.randomize:
+                active[name] = bound
+        return active

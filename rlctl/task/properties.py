@@ -1,0 +1,177 @@
+"""What may change on a body until the next reset: mass, friction, joint damping, colour, motor strength."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError, did_you_mean
+from rlctl.task.bullet import pybullet
+
+
+class _Dynamics(NamedTuple):
+    mass: float  # [kg]
+    friction: float
+    inertia: tuple[float, float, float]  # [kg m^2]
+
+
+class Properties:
+    """The part of `Body` that events change: always from the values of the built world, back to them at a reset.
+
+    `links` and `joints` are names, `base_name` too; nothing given means all of them, the base included.
+    """
+
+    client: int
+    id: int
+    file: Path
+    base_name: str
+    joint_names: list[str]
+    joint_indices: list[int]
+    _links: dict[str, int]
+
+    def __init__(self) -> None:
+        self._dynamics_changed = self._damping_changed = self._colors_changed = False
+        self.motor_strength: NDArray[np.float64] | None = None
+        """Part of their force that the motors give, shape (joints,); None while it is all of it."""
+        self._built_strength: NDArray[np.float64] | None = None
+
+    # PyBullet's saved states have positions and velocities, but none of these values.
+
+    def _save_nominal(self) -> None:
+        self._dynamics_changed = self._damping_changed = self._colors_changed = False
+        self._built_strength = self.motor_strength
+        for values in ("_dynamics", "_damping", "_colors"):
+            self.__dict__.pop(values, None)  # read again when needed: `build` may have set others
+
+    def _restore_nominal(self) -> None:
+        self.motor_strength = self._built_strength
+        if self._dynamics_changed:
+            self._dynamics_changed = False
+            for link, (mass, friction, inertia) in self._dynamics.items():
+                self._change(link, mass=mass, lateralFriction=friction, localInertiaDiagonal=inertia)
+        if self._damping_changed:
+            self._damping_changed = False
+            for link, damping in zip(self.joint_indices, self._damping, strict=True):
+                self._change(link, jointDamping=damping)
+        if self._colors_changed:
+            self._colors_changed = False
+            for (link, shape), color in self._colors.items():
+                self._paint(link, shape, color)
+
+    @cached_property
+    def _dynamics(self) -> dict[int, _Dynamics]:
+        infos = {
+            link: pybullet.getDynamicsInfo(self.id, link, physicsClientId=self.client)
+            for link in range(-1, len(self._links))
+        }
+        return {link: _Dynamics(info[0], info[1], info[2]) for link, info in infos.items()}
+
+    @cached_property
+    def _damping(self) -> list[float]:
+        pybullet.syncBodyInfo(physicsClientId=self.client)  # getJointInfo tells what was loaded, until then
+        return [pybullet.getJointInfo(self.id, i, physicsClientId=self.client)[6] for i in self.joint_indices]
+
+    @cached_property
+    def _colors(self) -> dict[tuple[int, int], tuple[float, ...]]:
+        seen: dict[int, int] = {}
+        colors = {}
+        for shape in pybullet.getVisualShapeData(self.id, physicsClientId=self.client):
+            index = seen[shape[1]] = seen.get(shape[1], -1) + 1  # a link may have several shapes
+            colors[shape[1], index] = shape[7]
+        return colors
+
+    def _weakened(self, forces: list[float]) -> list[float]:
+        # What the motors give of what they are asked for: one element per joint.
+        return forces if self.motor_strength is None else (self.motor_strength * forces).tolist()
+
+    def _change(self, link: int, **values: object) -> None:
+        pybullet.changeDynamics(self.id, link, **values, physicsClientId=self.client)
+
+    def _paint(self, link: int, shape: int, color: Sequence[float]) -> None:
+        pybullet.changeVisualShape(self.id, link, shapeIndex=shape, rgbaColor=color, physicsClientId=self.client)
+
+    def _link_index(self, link: str) -> int:
+        if link not in self._links:
+            raise TaskError(
+                f"{self.file.name} has no link {link!r}.{did_you_mean(link, self._links)} "
+                f"It has: {', '.join(self._links) or f'only its base, {self.base_name!r}'}."
+            )
+        return self._links[link]
+
+    def _joint_places(self, joints: Sequence[str] = ()) -> list[int]:
+        # Where they stand in joint arrays.
+        for joint in joints:
+            if joint not in self.joint_names:
+                raise TaskError(
+                    f"{self.file.name} has no joint {joint!r}.{did_you_mean(joint, self.joint_names)} "
+                    f"It has: {', '.join(self.joint_names) or 'none'}."
+                )
+        if not self.joint_names:
+            raise TaskError(f"{self.file.name} has no joints")
+        return [self.joint_names.index(joint) for joint in joints or self.joint_names]
+
+    def _part_index(self, part: str) -> int:
+        # A link's index, or -1 for the base, by its name.
+        return -1 if part == self.base_name and part not in self._links else self._link_index(part)
+
+    def _chosen(self, links: Sequence[str]) -> list[int]:
+        return [self._part_index(link) for link in links] or list(range(-1, len(self._links)))
+
+    def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
+        """Set mass and inertia to `factor` times the built world's values, until the next reset."""
+        chosen, nominal = self._chosen(links), self._dynamics
+        self._dynamics_changed = True
+        for link in chosen:
+            mass, _, inertia = nominal[link]
+            self._change(link, mass=mass * factor, localInertiaDiagonal=[element * factor for element in inertia])
+
+    def set_friction(self, friction: float, links: Sequence[str] = ()) -> None:
+        """Set the lateral friction, until the next reset."""
+        chosen, _ = self._chosen(links), self._dynamics
+        self._dynamics_changed = True
+        for link in chosen:
+            self._change(link, lateralFriction=friction)
+
+    def scale_joint_damping(self, factor: float, joints: Sequence[str] = ()) -> None:
+        """Set the joints' damping to `factor` times the built world's values, until the next reset."""
+        nominal = self._damping
+        self._set_damping({place: factor * nominal[place] for place in self._joint_places(joints)})
+
+    def set_joint_damping(self, damping: float, joints: Sequence[str] = ()) -> None:
+        """Set the joints' damping [N m s/rad or N s/m], until the next reset."""
+        self._set_damping(dict.fromkeys(self._joint_places(joints), damping))
+
+    def _set_damping(self, values: dict[int, float]) -> None:
+        _ = self._damping  # nominal values are read before the first change
+        self._damping_changed = True
+        for place, damping in values.items():
+            self._change(self.joint_indices[place], jointDamping=damping)
+
+    def set_color(self, rgb: Sequence[float], links: Sequence[str] = ()) -> None:
+        """Paint the links: red, green, blue in [0, 1]; how opaque they are stays. Until the next reset."""
+        chosen, nominal = self._chosen(links), self._colors
+        self._colors_changed = True
+        for (link, shape), color in nominal.items():
+            if link in chosen:
+                self._paint(link, shape, (*rgb, color[3]))
+
+    def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
+        """Let the joints' motors give `factor` times the force they are asked for, until the next reset."""
+        built = np.ones(len(self.joint_indices)) if self._built_strength is None else self._built_strength
+        strength = built.copy() if self.motor_strength is None else self.motor_strength.copy()
+        places = self._joint_places(joints)
+        strength[places] = factor * built[places]
+        self.motor_strength = strength
+
+    def _mass_centre(self, link: int) -> tuple[float, ...]:
+        # [m], world frame, of a link's index; -1 is the base.
+        if link < 0:
+            state = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+        else:
+            state = pybullet.getLinkState(self.id, link, computeForwardKinematics=1, physicsClientId=self.client)
+        return tuple(state[0])
