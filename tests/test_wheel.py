@@ -27,8 +27,10 @@ def test_the_wheel_trains_reach_from_an_empty_folder(tmp_path):
     call(scripts / "pip", "install", "-q", "-c", ROOT / "constraints.txt", wheel, cwd=tmp_path)
     empty = tmp_path / "empty"
     empty.mkdir()
-    (task,) = json.loads(call(scripts / "rlctl", "tasks", "--check", "--json", "-", cwd=empty))["tasks"]
-    assert (task["name"], task["algo"], task["problem"]) == ("reach", "ppo", None)
+    tasks = json.loads(call(scripts / "rlctl", "tasks", "--check", "--json", "-", cwd=empty))["tasks"]
+    assert [(task["name"], task["algo"], task["problem"]) for task in tasks] == [
+        (name, "ppo", None) for name in ("ant", "half-cheetah", "hopper", "humanoid", "reach", "walker2d")
+    ]
     result = json.loads(call(scripts / "rlctl", "train", "reach", "-n", "8000", "--json", "-", cwd=empty))
     assert result["steps"] >= 8000
     report = json.loads(call(scripts / "rlctl", "export", "reach", "--onnx", "--json", "-", cwd=empty))

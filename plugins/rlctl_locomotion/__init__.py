@@ -1,0 +1,1 @@
+"""The five locomotion classics of PyBullet, bundled with rlctl."""

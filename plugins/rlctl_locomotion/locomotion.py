@@ -1,0 +1,157 @@
+"""What the five robots share: torques in, running towards a far target, the family's observations and rewards.
+
+These are the tasks of `AntBulletEnv-v0` and its family as pybullet-envs-gymnasium 0.6.0 has them from an instance's
+second episode on, which is what training sees. (In the first one the floor joins the mean of the body parts' places
+only after the reset, and step 1 is rewarded for the jump.) Comments say where their behaviour is odd: published scores
+depend on it, so it stays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from rlctl.task import Event, Sim, Task, events
+
+TARGET_X, TARGET_Y = 1000.0, 0.0  # [m], world frame: a direction rather than a place
+START_NOISE = 0.1  # [rad]
+AT_LIMIT = 0.99  # of the way from the middle of a joint's range to its end
+OBSERVED = 5.0  # what is observed is cut off beyond it
+
+
+class Locomotion(Task):
+    """Run towards +x and stay on your feet. A robot fills in its model, feet and motors, and says when it stands."""
+
+    model: ClassVar[str]
+    """MJCF file in `pybullet_data`; one of its links, or the base, is called `torso`."""
+    feet: ClassVar[tuple[str, ...]]
+    """Links whose contact with the floor is observed."""
+    motors: ClassVar[Mapping[str, float]]
+    """Torque at action 1 [N m] of each joint, in the order of actions and observations, which is the model's."""
+    torque_type: ClassVar[type[np.floating[Any]]] = np.float64
+    alive_bonus: ClassVar[float] = 1.0
+    power_price, torque_price = 2.0, 0.1
+    """Of the mean |action * joint speed / 10|, and of the mean squared action."""
+
+    control_dt, substeps, episode_s = 0.0165, 4, 16.5  # [s], -, [s]
+    solver_iterations = 5
+    action_meaning = "joint torques; 1 is a motor's top torque"
+    observation_units = {"height": "m", "roll_pitch": "rad"}
+    # feet_collision, the feet that touch the robot itself: the family has it and leaves it out of the sum.
+    reward_weights = {
+        "alive": 1.0,
+        "progress": 1.0,
+        "electricity": -1.0,
+        "joints_at_limit": -0.1,
+        "feet_collision": 0.0,
+    }
+    events = {  # with `randomize: true`; without, the tasks are the family's
+        "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
+        "friction": Event("reset", events.set_friction, body="floor", friction=(0.5, 1.1)),
+        "motor_strength": Event("reset", events.scale_motor_strength, body="robot", factor=(0.8, 1.0)),
+        "joint_noise": Event("observation", events.noise, of="joints", std=(0.0, 0.02)),
+        "action_noise": Event("action", events.noise, std=(0.0, 0.05)),
+        "action_delay": Event("action", events.delay, steps=(0, 1)),  # of 16.5 ms
+    }
+    rlctl_ignore = {"RL609": "the family counts returns; how far to run is nowhere said"}
+
+    def stands(self, height: float, pitch: float) -> bool:
+        """Say whether the robot is up, from the height [m] and pitch [rad] of its torso."""
+        raise NotImplementedError
+
+    def build(self, sim: Sim) -> None:
+        sim.set_gravity(9.8)
+        sim.set_contact_stiffness(0.9)
+        self.floor = sim.load("floor", "plane_stadium.sdf")
+        self.floor.set_friction(0.8)  # and no restitution: theirs is multiplied with the robot's, which is 0
+        self.body = sim.load("robot", f"mjcf/{self.model}", self_collision=True)
+        self.body.disable_motors()
+        for link in ("torso", *self.feet):
+            self.body.mass_state(link)  # raises for one that the model does not have
+        places = self.body.joint_places(self.motors)
+        if places != list(range(places[0], places[0] + len(places))):
+            raise ValueError(f"{self.model}: name the motors one after the other, as the model has them")
+        self.joints = slice(places[0], places[0] + len(places))  # twice as fast as a list
+        self.top_torques = np.array(list(self.motors.values()), self.torque_type)
+        self.joint_low = self.body.joint_low[self.joints]
+        self.joint_range = self.body.joint_high[self.joints] - self.joint_low
+        self.torques = np.zeros(len(self.body.joint_names))
+        names = [self.body.base_name, *self.body.link_names]
+        torso = names.index("torso")
+        # In the family's order: the last bit of a mean depends on it.
+        self.parts = [1, torso, *(part for part in range(2, len(names)) if part != torso)]
+
+    def reset(self, rng: np.random.Generator) -> None:
+        positions = self.body.joint_positions.copy()
+        positions[self.joints] = rng.uniform(-START_NOISE, START_NOISE, len(self.motors))
+        self.body.set_joints(positions)
+        self.start_height = self.body.mass_state("torso").position[2]
+        self.feet_contact = self.last_feet_contact = np.zeros(len(self.feet), np.float32)
+        self.look()
+
+    def look(self) -> None:
+        """Work out what both rewards and observations need, once per step."""
+        places = self.body.mass_positions
+        count = len(self.parts) + 1  # the family's mean has the floor, at 0, among the parts
+        x = np.add.reduce([places[part][0] for part in self.parts]) / count
+        y = np.add.reduce([places[part][1] for part in self.parts]) / count
+        self.to_target = np.array([TARGET_Y - y, TARGET_X - x])  # [m]
+        # -1 and 1 at the limits.
+        positions = 2 * (self.body.joint_positions[self.joints] - self.joint_low) / self.joint_range - 1
+        self.joint_states = np.array((positions, 0.1 * self.body.joint_velocities[self.joints]), np.float32)
+
+    def potential(self) -> float:
+        """Minus the time [s] to the target at 1 m per control step; its change is the speed [m/s] towards it."""
+        return -math.sqrt(self.to_target.dot(self.to_target)) / self.control_dt
+
+    def act(self, action: np.ndarray) -> None:
+        # Contacts are observed, and by the half-cheetah judged, one step late.
+        self.last_feet_contact = self.feet_contact
+        self.last_potential = self.potential()
+        self.torques[self.joints] = self.top_torques * action
+        self.body.set_torques(self.torques)
+
+    def rewards(self, action: np.ndarray) -> dict[str, float]:
+        self.look()
+        touching = self.body.links_touching(self.floor)
+        self.feet_contact = np.array([foot in touching for foot in self.feet], np.float32)
+        power = np.add.reduce(np.abs(action * self.joint_states[1])) / action.size
+        torque = np.add.reduce(np.square(action)) / action.size
+        return {
+            "alive": self.alive(),
+            "progress": self.potential() - self.last_potential,
+            "electricity": self.power_price * float(power) + self.torque_price * float(torque),
+            "joints_at_limit": float(np.count_nonzero(np.abs(self.joint_states[0]) > AT_LIMIT)),
+            "feet_collision": float(len(self.body.links_touching(self.body).intersection(self.feet))),
+        }
+
+    def alive(self) -> float:
+        """The bonus while the robot stands, -1 when it does not."""
+        torso = self.body.mass_state("torso")
+        return self.alive_bonus if self.stands(torso.position[2], torso.roll_pitch_yaw[1]) else -1.0
+
+    def is_terminated(self) -> bool:
+        return self.alive() < 0
+
+    def observe(self) -> dict[str, np.ndarray]:
+        torso = self.body.mass_state("torso")
+        roll, pitch, yaw = torso.roll_pitch_yaw
+        heading = math.atan2(*self.to_target) - yaw
+        (vx, vy, vz), sin, cos = torso.velocity, math.sin(yaw), math.cos(yaw)
+        forward = (cos * vx + sin * vy, cos * vy - sin * vx, vz)  # [m/s], in the direction that the torso faces
+        return {
+            "height": np.array([cut_off(torso.position[2] - self.start_height)]),
+            "heading": np.array([math.sin(heading), math.cos(heading)]),
+            "velocity": np.array([cut_off(0.3 * speed) for speed in forward]),
+            "roll_pitch": np.array([roll, pitch]),
+            "joints": np.minimum(np.maximum(self.joint_states, -OBSERVED), OBSERVED).T,
+            "feet_contact": self.last_feet_contact,
+        }
+
+
+def cut_off(value: float) -> float:
+    """Return `value`, or the end of the observed range that it is beyond."""
+    return min(max(value, -OBSERVED), OBSERVED)
