@@ -24,6 +24,10 @@ class EnvSpec:
     randomize: bool = False
     events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     frame_stack: int = 1
+    stage: int = 0
+    """Stage of the curriculum that these are of, from 1, for who reads it; 0 where there is none."""
+    level: float = 1.0
+    """How far the ranges of events that widen have done so, in [0, 1]."""
 
     def make(self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None) -> gymnasium.Env[Any, Any]:
         """Build the environment; raises `UsageError` for what the user typed, `TaskError` for what it does."""
@@ -31,8 +35,8 @@ class EnvSpec:
         if is_task(constructor):
             env = self._make_task_env(constructor, render_mode)
         else:
-            for key in ("reward_weights", "events"):
-                if getattr(self, key):
+            for key in ("reward_weights", "events", "level"):
+                if getattr(self, key) != getattr(EnvSpec(self.task), key):
                     raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
             env = self._make_plain_env(constructor, render_mode)
         if self.frame_stack > 1:
@@ -48,7 +52,7 @@ class EnvSpec:
         from rlctl.task.events import EventSettings
 
         parameters = _task_parameters(constructor, self.parameters)
-        env: gymnasium.Env[Any, Any] = guarded(
+        env: TaskEnv = guarded(
             self.task,
             lambda: TaskEnv(
                 constructor(**parameters),
@@ -57,6 +61,7 @@ class EnvSpec:
                 events=EventSettings(self.randomize, self.events),
             ),
         )
+        env.set_level(self.level)
         return env
 
     def _make_plain_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:

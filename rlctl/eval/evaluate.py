@@ -16,7 +16,7 @@ from rlctl.rollout.collect import Episode, run_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
 from rlctl.run import directory
-from rlctl.run.policy import BatchActor, Policy, load_policy
+from rlctl.run.policy import BatchActor, Policy, PolicyInfo, load_policy
 
 _ENVS = 32
 
@@ -31,6 +31,8 @@ class EvalRequest:
     episodes: int = 100
     seed: int = 0
     task_parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    stage: str | None = None
+    """Stage of the curriculum, from 1, or `all`; None: the last."""
     deterministic: bool = True
     n_envs: int | None = None
     env_timeout_s: float = 60.0
@@ -68,8 +70,16 @@ class Gates:
         if not has_success and (self.min_success is not None or self.min_success_lower is not None):
             raise UsageError("--min-success: this task reports no success (no is_success); use --min-return")
 
-    def check(self, result: Evaluation) -> None:
-        """Raise `AnswerIsNo`, naming every gate that was missed."""
+    def check(self, *results: Evaluation) -> None:
+        """Raise `AnswerIsNo`, naming every gate that was missed; of several stages each must reach them."""
+        missed = []
+        for result in results:
+            stage = f"stage {result.spec.stage}: " if len(results) > 1 else ""
+            missed += [stage + each for each in self._missed(result)]
+        if missed:
+            raise AnswerIsNo("gate missed: " + "; ".join(missed))
+
+    def _missed(self, result: Evaluation) -> list[str]:
         rate, interval = result.success_rate, result.success_interval
         missed = []
         if self.min_success is not None and rate is not None and rate < self.min_success:
@@ -78,19 +88,46 @@ class Gates:
             missed.append(f"lower bound {interval[0]:.3f} of the success rate is below {self.min_success_lower:g}")
         if self.min_return is not None and result.returns.mean < self.min_return:
             missed.append(f"mean return {result.returns.mean:.3f} is below {self.min_return:g}")
-        if missed:
-            raise AnswerIsNo("gate missed: " + "; ".join(missed))
+        return missed
 
 
 def run_evaluation(request: EvalRequest, gates: Gates) -> Evaluation:
     """Find the policy, live its episodes, and return their statistics."""
+    (evaluation,) = run_evaluations(request, gates)
+    return evaluation
+
+
+def run_evaluations(request: EvalRequest, gates: Gates) -> list[Evaluation]:
+    """Find the policy and evaluate it as `run_evaluation` does, in every stage that was asked for, with equal seeds."""
     path, _ = directory.find_policy(request.run, request.checkpoint)
     if path.suffix == ".safetensors":
         from rlctl.run.torch_policy import pin_threads
 
         pin_threads()
     policy = load_policy(path)
-    spec = policy.info.env_spec(request.task, request.task_parameters)
+    return [_evaluate(path, policy, spec, request, gates) for spec in _specs(policy.info, request)]
+
+
+def _specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
+    if request.stage is None:
+        return [info.env_spec(request.task, request.task_parameters)]
+    if request.task is not None and request.task != info.task:
+        raise UsageError(f"--stage: stages are those of {info.task}, which the policy was trained on; leave out --task")
+    if not info.stages:
+        raise UsageError(f"--stage {request.stage}: this policy was trained without stages; leave out --stage")
+    if request.stage == "all":
+        numbers = list(range(1, len(info.stages) + 1))
+    elif request.stage.isdecimal() and 1 <= int(request.stage) <= len(info.stages):
+        numbers = [int(request.stage)]
+    else:
+        raise UsageError(
+            f"--stage {request.stage}: this policy was trained in {len(info.stages)} stages; "
+            f"give a number from 1 to {len(info.stages)}, or all"
+        )
+    return [info.stage_spec(number, request.task_parameters) for number in numbers]
+
+
+def _evaluate(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
     n_envs = min(request.n_envs or _ENVS, request.episodes)
     with Workers(spec, n_envs, timeout_s=request.env_timeout_s) as workers:
         policy.info.check_fits(workers.info, path)

@@ -3,12 +3,60 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 from rlctl import output
+from rlctl.env_spec import EnvSpec
 from rlctl.eval.evaluate import Evaluation
 from rlctl.eval.statistics import Spread
 from rlctl.run.policy import versions
+
+
+def show_all(results: Sequence[Evaluation], json: str | None) -> None:
+    """Print the numbers, or write them as JSON; those of several stages as a table."""
+    if len(results) == 1:
+        show(results[0], json)
+    elif json is not None:
+        output.write_result_json(json, {"stages": [as_json(result) for result in results]})
+    else:
+        _show_stages(results)
+
+
+def _show_stages(results: Sequence[Evaluation]) -> None:
+    from rich.table import Table
+
+    first, out = results[0], output.out()
+    _show_head(first)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("stage", justify="right")
+    for column in ("success", "95 % interval", "return", "length"):
+        table.add_column(column, justify="right", header_style="bold")
+    table.add_column("changes")
+    for result in results:
+        rate, interval = result.success_rate, result.success_interval
+        table.add_row(
+            str(result.spec.stage),
+            "-" if rate is None else f"{rate:.1%}",
+            "-" if interval is None else f"{interval[0]:.1%} to {interval[1]:.1%}",
+            f"{result.returns.mean:.4g}",
+            f"{result.lengths.mean:.4g}",
+            _differing(result.spec, [each.spec for each in results]),
+        )
+    out.print(table)
+
+
+def _differing(spec: EnvSpec, specs: Sequence[EnvSpec]) -> str:
+    """Name what is not the same in all stages."""
+    parts = []
+    for field in ("parameters", "reward_weights", "events"):
+        for name in dict.fromkeys(name for each in specs for name in getattr(each, field)):
+            values = [getattr(each, field).get(name) for each in specs]
+            if any(value != values[0] for value in values):
+                value = getattr(spec, field).get(name)
+                parts.append(f"{name} {'as it is' if value is None else value}")
+    levels = {each.level for each in specs}
+    return ", ".join([*parts, *([f"level {spec.level:g}"] if len(levels) > 1 else [])])
 
 
 def show(result: Evaluation, json: str | None) -> None:
@@ -19,10 +67,9 @@ def show(result: Evaluation, json: str | None) -> None:
     from rich.table import Table
 
     out = output.out()
-    info = result.policy.info
-    mode = "" if result.deterministic else ", sampled actions"
-    out.print(f"{result.spec.task}: {result.policy_file} ({info.algo}, step {info.training_steps:,})", markup=False)
-    out.print(f"{len(result.episodes)} episodes, seed {result.seed}{mode}")
+    _show_head(result)
+    if result.spec.stage:
+        out.print(f"stage {result.spec.stage} of {len(result.policy.info.stages)}")
     if result.success_rate is not None and result.success_interval is not None:
         low, high = result.success_interval
         out.print(f"success rate {result.success_rate:.1%}  (95 % interval {low:.1%} to {high:.1%})")
@@ -39,6 +86,13 @@ def show(result: Evaluation, json: str | None) -> None:
     out.print(table)
 
 
+def _show_head(result: Evaluation) -> None:
+    out, info = output.out(), result.policy.info
+    mode = "" if result.deterministic else ", sampled actions"
+    out.print(f"{result.spec.task}: {result.policy_file} ({info.algo}, step {info.training_steps:,})", markup=False)
+    out.print(f"{len(result.episodes)} episodes, seed {result.seed}{mode}")
+
+
 def _numbers(spread: Spread) -> list[str]:
     return [f"{value:.4g}" for value in (spread.mean, spread.iqm, spread.std, spread.min, spread.max)]
 
@@ -48,6 +102,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
     info = result.policy.info
     return {
         "task": {"name": result.spec.task, "parameters": dict(result.spec.parameters)},
+        **({"stage": result.spec.stage} if result.spec.stage else {}),
         "policy": {
             "file": str(result.policy_file),
             "algo": info.algo,

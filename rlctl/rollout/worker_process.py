@@ -126,6 +126,11 @@ class _Worker:
         self.arrays.inside[episode.index] = seed, 0
         self.store(self.arrays.observation, episode, episode.start(seed))
 
+    def close(self) -> None:
+        for episode in self.episodes:
+            episode.env.close()
+        self.episodes = []
+
     def step(self) -> list[dict[str, Any]]:
         ended: list[dict[str, Any]] = []
         for episode in self.episodes:
@@ -221,12 +226,10 @@ def _serve(job: dict[str, Any]) -> None:
         connection.send_bytes(json.dumps(content).encode())
 
     try:
-        spec = EnvSpec(**job["spec"])
-        worker = _Worker(int(sys.argv[2]), spec, job["first"], job["count"], job["total"])
+        worker = _built(job, job["spec"])
     except BaseException as error:
         answer(error=_error(error))
         return
-    gc.freeze()  # what is there now stays; collections need not look at it again
     answer(info=worker.info.model_dump())
     while True:
         try:
@@ -239,6 +242,13 @@ def _serve(job: dict[str, Any]) -> None:
             elif message == b"attach":
                 worker.attach()
                 ended = []
+            elif message.startswith(b"{"):
+                worker.close()
+                gc.unfreeze()
+                gc.collect()  # environments may hold themselves in cycles
+                worker = _built(job, json.loads(message))
+                answer(info=worker.info.model_dump())
+                continue
             else:
                 ended = worker.reset(json.loads(message))
         except BaseException as error:
@@ -248,5 +258,10 @@ def _serve(job: dict[str, Any]) -> None:
             answer(ended=ended)
         else:
             connection.send_bytes(b"")
-    for episode in worker.episodes:
-        episode.env.close()
+    worker.close()
+
+
+def _built(job: dict[str, Any], spec: dict[str, Any]) -> _Worker:
+    worker = _Worker(int(sys.argv[2]), EnvSpec(**spec), job["first"], job["count"], job["total"])
+    gc.freeze()  # what is there now stays; collections need not look at it again
+    return worker

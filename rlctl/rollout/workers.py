@@ -155,6 +155,17 @@ class Workers:
         self._send_all(b"attach")
         self._answers(range(len(self._processes)), self.timeout_s, "attaching")
 
+    def rebuild(self, spec: EnvSpec) -> EnvInfo:
+        """Close the environments and build those of another spec in their place; return what they are.
+
+        None of them is in an episode then: call `reset`. `arrays` are new ones.
+        """
+        self._wait_until_built()
+        self._spec = spec
+        self._ready = False
+        self._send_all(json.dumps(dataclasses.asdict(spec)).encode())
+        return self.info
+
     def reset(self, seeds: dict[int, int]) -> None:
         """Start an episode in some environments: environment index -> seed; a negative one lets it rest."""
         self._wait_until_built()
@@ -173,7 +184,8 @@ class Workers:
         self._send_all(b"step")
         answers = self._answers(range(len(self._processes)), self.timeout_s, "stepping")
         ended = []
-        for answer in answers.values():
+        # In the order of the environments, not of the answers: what is decided from the last ones must repeat.
+        for _, answer in sorted(answers.items()):
             for each in answer.get("ended", ()):
                 ended.append(
                     EpisodeResult(

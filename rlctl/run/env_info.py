@@ -32,14 +32,13 @@ class EnvInfo(pydantic.BaseModel):
         """Return the observation and the action space."""
         return space_from_json(self.observation_space), space_from_json(self.action_space)
 
-    def difference(self, other: EnvInfo) -> str | None:
+    def difference(self, other: EnvInfo, whose: str = "the environment's") -> str | None:
         """Say how the spaces of `other` differ from these, in a few words; None if they do not."""
         for name in ("observation", "action"):
             ours, theirs = getattr(self, f"{name}_space"), getattr(other, f"{name}_space")
             if ours != theirs:
                 return (
-                    f"its {name} space is {_short(space_from_json(ours))}, "
-                    f"the environment's is {_short(space_from_json(theirs))}"
+                    f"its {name} space is {_short(space_from_json(ours))}, {whose} is {_short(space_from_json(theirs))}"
                 )
         return None
 

@@ -32,7 +32,9 @@ class EpisodeInfo(pydantic.BaseModel):
     events: dict[str, dict[str, Any]] = {}
     frame_stack: int = 1
     stage: int = 0
-    """Level of the curriculum."""
+    """Stage of the curriculum, from 1; 0 where there is none."""
+    level: float = 1.0
+    """How far the ranges of events that widen had done so, in [0, 1]."""
     seed: int
     policy: str = ""
     """What chose the actions, for people: a file name and a training step."""
@@ -51,13 +53,22 @@ class EpisodeInfo(pydantic.BaseModel):
             randomize=spec.randomize,
             events={name: dict(changes) for name, changes in spec.events.items()},
             frame_stack=spec.frame_stack,
+            stage=spec.stage,
+            level=spec.level,
             **rest,
         )
 
     def env_spec(self) -> EnvSpec:
         """Return what the episode was lived in."""
         return EnvSpec(
-            self.task, self.task_parameters, self.reward_weights, self.randomize, self.events, self.frame_stack
+            self.task,
+            self.task_parameters,
+            self.reward_weights,
+            self.randomize,
+            self.events,
+            self.frame_stack,
+            self.stage,
+            self.level,
         )
 
 

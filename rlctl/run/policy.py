@@ -7,6 +7,7 @@ read without pickle. An exported `.onnx` file is a policy too.
 from __future__ import annotations
 
 import abc
+import dataclasses
 import json
 import platform
 from collections.abc import Mapping
@@ -24,6 +25,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.run import files
 from rlctl.run.env_info import EnvInfo
+from rlctl.run.stages import StageContent
 
 FORMAT = 1
 ROWS = 64
@@ -56,15 +58,41 @@ class PolicyInfo(pydantic.BaseModel):
     randomize: bool = False
     events: dict[str, dict[str, Any]] = {}
     frame_stack: int = 1
+    stages: list[StageContent] = []
+    """Stages of the curriculum; the fields above are those of the last."""
     training_steps: int = 0
     versions: dict[str, str] = {}
 
     def env_spec(self, task: str | None = None, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
-        """Return what this policy was trained on, or another task, with parameters put over its own."""
+        """Return what this policy was trained for, or another task, with parameters put over its own.
+
+        A policy trained in stages is for the last of them; `stage_spec` returns the others.
+        """
         if task is not None and task != self.task:
             return EnvSpec(task, parameters or {}, frame_stack=self.frame_stack)
         merged = {**self.task_parameters, **(parameters or {})}
-        return EnvSpec(self.task, merged, self.reward_weights, self.randomize, self.events, self.frame_stack)
+        return EnvSpec(
+            self.task,
+            merged,
+            self.reward_weights,
+            self.randomize,
+            self.events,
+            self.frame_stack,
+            stage=len(self.stages),
+            level=self.stages[-1].level if self.stages else 1.0,
+        )
+
+    def stage_spec(self, number: int, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
+        """Return a stage of this policy's curriculum, from 1 to `len(stages)`, with parameters put over its own."""
+        content = self.stages[number - 1]
+        return dataclasses.replace(
+            self.env_spec(),
+            parameters={**content.task_parameters, **(parameters or {})},
+            reward_weights=content.reward_weights,
+            events=content.events,
+            stage=number,
+            level=content.level,
+        )
 
     def check_fits(self, env: EnvInfo, file: Path) -> None:
         """Raise `ArtifactError` if the policy in `file` was made for other spaces than `env` has."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,6 +18,7 @@ from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean
 from rlctl.run import yaml_text
+from rlctl.run.stages import Promotion, Stage, check_promotions
 
 Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
@@ -68,6 +69,7 @@ class Recipe(_Section):
     eval: Evaluation = Evaluation()
     stop_success: float | None = Field(None, gt=0, le=1)
     checkpoint: Checkpoints = Checkpoints()
+    stages: list[Stage] = []
 
     @pydantic.field_validator("algo_kwargs")
     @classmethod
@@ -77,13 +79,30 @@ class Recipe(_Section):
                 _RANGES[name].check(name, value)
         return values
 
-    def env_spec(self, task: str) -> EnvSpec:
-        """Return what the environments of this recipe are made from."""
-        return EnvSpec(task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack)
+    @pydantic.field_validator("stages")
+    @classmethod
+    def _end_in_turn(cls, values: list[Stage]) -> list[Stage]:
+        check_promotions(values)
+        return values
+
+    def env_specs(self, task: str) -> list[EnvSpec]:
+        """Return what environments are made from, stage by stage; of a recipe without stages a list of one."""
+        base = EnvSpec(task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack)
+        return [
+            dataclasses.replace(
+                base,
+                parameters=merge(self.task, stage.task),
+                reward_weights={**self.reward_weights, **stage.reward_weights},
+                events=merge(self.events, stage.events),
+                stage=number,
+                level=stage.level,
+            )
+            for number, stage in enumerate(self.stages, start=1)
+        ] or [base]
 
     def to_yaml(self) -> str:
         """Return the recipe as YAML that is itself valid for `--config`."""
-        return yaml_text.dump(self.model_dump(mode="json"))
+        return yaml_text.dump(self.model_dump(mode="json", by_alias=True))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,8 +197,13 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
     return result
 
 
-def resolve(task: str, config: Path | None, settings: Mapping[str, Any]) -> Recipe:
-    """Merge the packaged recipe, `--config` and the command line's settings, and check every key."""
+def resolve(
+    task: str, config: Path | None, settings: Mapping[str, Any], stages: Sequence[Mapping[str, Any]] = ()
+) -> Recipe:
+    """Merge the packaged recipe, `--config` and the command line's settings, and check every key.
+
+    `stages` are those that the task's class declares; a recipe that has the key replaces them.
+    """
     packaged_file = registry.recipe_file(task)
     packaged = read(packaged_file) if packaged_file else {}
     given = merge(read(config) if config else {}, settings)
@@ -188,6 +212,8 @@ def resolve(task: str, config: Path | None, settings: Mapping[str, Any]) -> Reci
         # Hyperparameters of another algorithm would be wrong here, and so would its number of environments.
         packaged = {k: v for k, v in packaged.items() if k not in _OF_THE_ALGORITHM}
     merged = merge(packaged, given)
+    if stages and "stages" not in merged:
+        merged["stages"] = validate({"stages": list(stages)}, f"class of {task}").model_dump(by_alias=True)["stages"]
     source = "recipe" if not config else f"recipe {config}"
     return with_defaults(validate(merged, source))
 
@@ -215,15 +241,26 @@ def validate(values: Mapping[str, Any], source: str) -> Recipe:
 
 def _explain(problem: Any) -> str:
     path = [str(part) for part in problem["loc"]]
+    where = ""
+    if path[0] == "stages" and len(path) > 1:
+        where, path = f"stage {problem['loc'][1] + 1}: ", path[2:]
     key = ".".join(path)
     if problem["type"] == "extra_forbidden":
-        sections: dict[str, type[_Section]] = {"normalize": Normalize, "eval": Evaluation, "checkpoint": Checkpoints}
-        names = list(sections.get(path[0], Recipe).model_fields)
-        return f"no key {key!r}.{did_you_mean(path[-1], names)} Keys here: {', '.join(names)}."
+        section = _SECTIONS.get(path[-2], Recipe) if len(path) > 1 else Stage if where else Recipe
+        names = [field.alias or name for name, field in section.model_fields.items()]
+        return f"{where}no key {key!r}.{did_you_mean(path[-1], names)} Keys here: {', '.join(names)}."
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if problem["type"] == "value_error":
-        return f"{key}.{message}"
-    return f"{key}: {message}, got {problem['input']!r}"
+        return f"{where}{key}{'.' if key == 'algo_kwargs' else ': '}{message}"
+    return f"{where}{key + ': ' if key else ''}{message}, got {problem['input']!r}"
+
+
+_SECTIONS: dict[str, type[pydantic.BaseModel]] = {
+    "normalize": Normalize,
+    "eval": Evaluation,
+    "checkpoint": Checkpoints,
+    "promote": Promotion,
+}
 
 
 def with_defaults(recipe: Recipe) -> Recipe:

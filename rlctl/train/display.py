@@ -58,12 +58,20 @@ class Display(abc.ABC):
         """An update is done."""
 
     @abc.abstractmethod
+    def stage(self, title: str, why: str = "") -> None:
+        """A stage of the curriculum begins, or goes on after a resume."""
+
+    @abc.abstractmethod
     def evaluation(self, steps: int, success: float | None, mean_return: float, best: bool) -> None:
         """An evaluation is done."""
 
     @abc.abstractmethod
     def message(self, text: str) -> None:
         """Something to tell: a warning, or what an environment printed."""
+
+
+def stage_line(title: str, why: str) -> str:
+    return f"{title}  ({why})" if why else title
 
 
 def evaluation_line(steps: int, success: float | None, mean_return: float, best: bool) -> str:
@@ -77,6 +85,7 @@ class PlainDisplay(Display):
     def __init__(self, title: str, total: int) -> None:
         super().__init__(title, total)
         self._last_line = 0.0
+        self._stage = ""
         self._started: tuple[float, int] | None = None
 
     def __enter__(self) -> Display:
@@ -93,6 +102,8 @@ class PlainDisplay(Display):
             return
         self._last_line = now
         parts = [f"{steps:,}/{self.total:,} steps", f"{fps:,.0f} steps/s"]
+        if self._stage:
+            parts.append(self._stage)
         if success is not None:
             parts.append(f"success {percent(success)}")
         if mean_return is not None:
@@ -101,6 +112,10 @@ class PlainDisplay(Display):
             rate = (steps - self._started[1]) / max(now - self._started[0], 1e-9)
             parts.append(f"{duration(max(self.total - steps, 0) / rate)} left")
         self._print("  ".join(parts))
+
+    def stage(self, title: str, why: str = "") -> None:
+        self._stage = title.partition(":")[0]
+        self._print(stage_line(title, why))
 
     def evaluation(self, steps: int, success: float | None, mean_return: float, best: bool) -> None:
         self._print(evaluation_line(steps, success, mean_return, best))
@@ -121,6 +136,7 @@ class LiveDisplay(Display):
 
         self._steps = 0
         self._fps = 0.0
+        self._stage = ""
         self._returns: deque[float] = deque(maxlen=_CURVE)
         self._successes: deque[float] = deque(maxlen=_CURVE)
         self._evaluations: list[tuple[int, float | None, float, bool]] = []
@@ -145,6 +161,9 @@ class LiveDisplay(Display):
             self._returns.append(mean_return)
         if success is not None:
             self._successes.append(success)
+
+    def stage(self, title: str, why: str = "") -> None:
+        self._stage = stage_line(title, why)
 
     def evaluation(self, steps: int, success: float | None, mean_return: float, best: bool) -> None:
         self._evaluations.append((steps, success, mean_return, best))
@@ -175,6 +194,8 @@ class LiveDisplay(Display):
             f"{self._time_left()} left",
         )
         lines: list[Any] = [bar]
+        if self._stage:
+            lines.append(Text(f"  {self._stage}"))
         if self._successes:
             curve = sparkline(list(self._successes), 0.0, 1.0)
             lines.append(Text.assemble("  success ", (curve, "green"), f" {percent(self._successes[-1])}"))

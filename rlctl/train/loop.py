@@ -6,34 +6,31 @@ that a checkpoint never falls inside a rollout, and a run can be resumed.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import math
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, DivergedError, Interrupted
 from rlctl.eval.statistics import mean_return, mean_terms, success_rate
 from rlctl.rollout.collect import Episode, run_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import EpisodeResult, Workers
-from rlctl.run import files
 from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import BatchActor, PolicyInfo, save_policy
 from rlctl.run.recipe import ON_POLICY, Recipe
 from rlctl.run.torch_policy import Normalizer, TorchPolicy
 from rlctl.train import checkpoint
+from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
 from rlctl.train.episodes import EpisodeKeeper
 from rlctl.train.pack import pack
+from rlctl.train.progress import Progress, append_row, table_size
 from rlctl.train.vec_env import WorkerVecEnv
 
 _LOSSES = (
@@ -44,22 +41,6 @@ _LOSSES = (
 # Explained variance, for one, is not a number where rewards are constant, and nothing is wrong.
 _MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", "actor_loss", "critic_loss")
 _OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
-
-
-@dataclasses.dataclass
-class Progress:
-    """What the loop must remember over a resume; plain data."""
-
-    next_eval: int
-    best_success: float | None = None
-    best_return: float | None = None
-    best_step: int | None = None
-    last_eval_step: int | None = None
-    good_in_a_row: int = 0
-    seconds: float = 0.0
-    metrics_bytes: int = 0
-    evals_bytes: int = 0
-    episodes_started: list[int] = dataclasses.field(default_factory=list)
 
 
 class TrainingStopped(Exception):
@@ -77,7 +58,7 @@ class TrainingLoop(BaseCallback):
         eval_workers: Workers,
         progress: Progress,
         display: Display,
-        spec: EnvSpec,
+        curriculum: Curriculum,
     ) -> None:
         super().__init__()
         self.run_directory = run
@@ -85,9 +66,9 @@ class TrainingLoop(BaseCallback):
         self.env = env
         self.progress = progress
         self.display = display
-        self.spec = spec
+        self.curriculum = curriculum
         self.stop_signal: int | None = None
-        self.episodes = EpisodeKeeper(run, spec, env.workers.info)
+        self.episodes = EpisodeKeeper(run, curriculum.goal_spec, curriculum.goal)
         self._eval_workers = eval_workers
         self._started = time.monotonic() - progress.seconds
         self._last_row = (time.monotonic(), 0)
@@ -115,12 +96,15 @@ class TrainingLoop(BaseCallback):
     def boundary(self) -> None:
         """Do everything that is due after an update."""
         steps = self.model.num_timesteps
-        self._recent += self.env.take_ended()
+        self._take_ended()
+        stage_done = self.curriculum.is_due(steps)
         on_policy = self.recipe.algo in ON_POLICY
-        if on_policy or steps >= self._next_row:
+        if on_policy or steps >= self._next_row or stage_done:
             self.check_finite()
             self._write_metrics(steps)
             self._next_row = steps + max(1, self.recipe.total_timesteps // _OFF_POLICY_ROWS)
+        if stage_done:
+            self._begin_next_stage(steps)
         self._stop_if_asked()
         if steps >= self.progress.next_eval:
             self.evaluate()
@@ -128,6 +112,18 @@ class TrainingLoop(BaseCallback):
             self._stop_if_asked()
             if self.recipe.stop_success is not None and self.progress.good_in_a_row >= 2:
                 raise TrainingStopped
+
+    def _take_ended(self) -> None:
+        ended = self.env.take_ended()
+        self._recent += ended
+        self.curriculum.count(ended)
+        if warning := self.curriculum.warning():
+            self.display.message(warning)
+
+    def _begin_next_stage(self, steps: int) -> None:
+        self.env.workers.rebuild(self.curriculum.next_spec())
+        begin_next_episodes(self.model)
+        self.display.stage(*self.curriculum.go_on(steps))
 
     def _stop_if_asked(self) -> None:
         if self.stop_signal is None:
@@ -144,8 +140,10 @@ class TrainingLoop(BaseCallback):
         """Evaluate and save what the training ended with; raises `ArtifactError` if it cannot be saved."""
         self._boundary_steps = self.model.num_timesteps
         self.check_finite()
-        self._recent += self.env.take_ended()
+        self._take_ended()
         self._write_metrics(self.model.num_timesteps)
+        if self.curriculum.is_due(self.model.num_timesteps):  # for a resume that makes the run longer
+            self.display.stage(*self.curriculum.go_on(self.model.num_timesteps))
         self.evaluate()
         self.logger.dump(self.model.num_timesteps)
         if not self.save_checkpoint():
@@ -184,6 +182,7 @@ class TrainingLoop(BaseCallback):
             "steps": steps,
             "seconds": round(now - self._started, 3),
             "fps": round((steps - steps_before) / max(now - before, 1e-9), 1),
+            **self.curriculum.columns(),
         }
         terms = dict.fromkeys(self.env.workers.info.reward_weights)
         row.update({"return": None, "length": None, "success": None})
@@ -196,7 +195,9 @@ class TrainingLoop(BaseCallback):
         row.update({f"term/{name}": value for name, value in terms.items()})
         losses = self.logger.name_to_value
         row.update({name: losses.get(f"train/{name}") for name in _LOSSES})
-        self._saving("metrics", lambda: _append_row(self.run_directory.metrics_file, row))
+        self._saving("metrics", lambda: append_row(self.run_directory.metrics_file, row))
+        for name, number in self.curriculum.columns().items():
+            self.logger.record(f"curriculum/{name}", number)
         for name, value in terms.items():
             if value is not None:
                 self.logger.record(f"reward_terms/{name}", value)
@@ -206,7 +207,7 @@ class TrainingLoop(BaseCallback):
     def evaluate(self) -> None:
         """Live the evaluation episodes, keep the best policy, and write the row and the episodes."""
         steps, began = self.model.num_timesteps, time.monotonic()
-        packed = pack(self.model, self.recipe.algo, self.spec, self.env.workers.info)
+        packed = self._pack()
         episodes = self._live_episodes(*packed)
         results = [episode.result for episode in episodes]
         success, mean = success_rate(results), mean_return(results)
@@ -223,13 +224,14 @@ class TrainingLoop(BaseCallback):
         row = {
             "steps": steps,
             "seconds": round(time.monotonic() - self._started, 3),
+            **self.curriculum.columns(),
             "episodes": len(results),
             "success": success,
             "return": mean,
             "length": float(np.mean([result.length for result in results])),
             **{f"term/{name}": value for name, value in mean_terms(results).items()},
         }
-        self._saving("evaluation", lambda: _append_row(self.run_directory.evals_file, row))
+        self._saving("evaluation", lambda: append_row(self.run_directory.evals_file, row))
         self.logger.record("eval/mean_reward", mean)
         if success is not None:
             self.logger.record("eval/success_rate", success)
@@ -237,6 +239,10 @@ class TrainingLoop(BaseCallback):
         self.display.evaluation(steps, success, mean, better)
         # The rate of training is without the time of evaluations.
         self._last_row = (self._last_row[0] + time.monotonic() - began, steps)
+
+    def _pack(self) -> tuple[PolicyInfo, dict[str, Any]]:
+        goal = self.curriculum
+        return pack(self.model, self.recipe.algo, goal.goal_spec, goal.goal, goal.contents())
 
     def _live_episodes(self, info: PolicyInfo, tensors: dict[str, Any]) -> list[Episode]:
         was_training = self.model.policy.training
@@ -260,10 +266,10 @@ class TrainingLoop(BaseCallback):
         """Write a checkpoint of the present boundary; False, with a warning, if the disk does not take it."""
         progress = self.progress
         progress.seconds = time.monotonic() - self._started
-        progress.metrics_bytes = _size(self.run_directory.metrics_file)
-        progress.evals_bytes = _size(self.run_directory.evals_file)
+        progress.metrics_bytes = table_size(self.run_directory.metrics_file)
+        progress.evals_bytes = table_size(self.run_directory.evals_file)
         progress.episodes_started = list(self.env.episodes_started)
-        packed = pack(self.model, self.recipe.algo, self.spec, self.env.workers.info)
+        packed = self._pack()
         return self._saving(
             "checkpoint",
             lambda: self._save(packed, dataclasses.asdict(progress)),
@@ -282,24 +288,3 @@ class TrainingLoop(BaseCallback):
             self.display.message(f"warning: not saved: {self._unsaved}; training goes on")
             return False
         return True
-
-
-def _append_row(path: Path, row: dict[str, Any]) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, row)
-    if not path.exists():
-        writer.writeheader()
-    writer.writerow({key: "" if value is None else value for key, value in row.items()})
-    files.append_line(path, text.getvalue().replace("\r\n", "\n").rstrip("\n"))
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
-
-
-def cut_back(run: RunDirectory, progress: Progress) -> None:
-    """Cut the growing tables back to a checkpoint, so that no row is there twice."""
-    for path, size in ((run.metrics_file, progress.metrics_bytes), (run.evals_file, progress.evals_bytes)):
-        if path.exists() and path.stat().st_size > size:
-            with path.open("r+b") as file:
-                file.truncate(size)

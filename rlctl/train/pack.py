@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from numpy.typing import NDArray
@@ -12,10 +13,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 from rlctl.env_spec import EnvSpec
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo, versions
+from rlctl.run.stages import StageContent
 from rlctl.run.torch_policy import describe_network, policy_name
 
 
-def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
+def pack(
+    model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo, stages: Sequence[StageContent] = ()
+) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
     """Return description and tensors of a model's policy, with the normalisation it has now.
 
     The arrays are copies: training may go on.
@@ -39,6 +43,7 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> tuple[
         randomize=spec.randomize,
         events={name: dict(changes) for name, changes in spec.events.items()},
         frame_stack=spec.frame_stack,
+        stages=list(stages),
         training_steps=model.num_timesteps,
         versions=versions(),
     )

@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
-import os
-import platform
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import DivergedError, Interrupted, RecipeError, TaskError, UsageError
+from rlctl.errors import Interrupted, RecipeError, TaskError, UsageError
 from rlctl.rollout.workers import Workers
-from rlctl.run import directory, files
+from rlctl.run import directory
 from rlctl.run.directory import RunDirectory, RunLock
-from rlctl.run.policy import versions
+from rlctl.run.env_info import EnvInfo
 from rlctl.run.recipe import Recipe, resolve, validate
+from rlctl.train import status
 from rlctl.train.display import Display, make_display
 from rlctl.train.precheck import Precheck
 
 if TYPE_CHECKING:
-    from rlctl.train.loop import Progress, TrainingLoop
+    from rlctl.train.loop import TrainingLoop
+    from rlctl.train.progress import Progress
 
 _EVAL_ENVS = 32
 _FOR_RESUME = ("total_timesteps", "stop_success")
@@ -62,6 +59,9 @@ class TrainResult:
     eval_episodes: int
     recordings: list[Path]
     note: str = ""
+    stage: int = 0
+    """Stage of the curriculum at the end, from 1; 0 where there is none."""
+    stages: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +74,11 @@ class _Start:
     lock: RunLock | None = None
     checkpoint: Path | None = None
     state: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def stage(self) -> int:
+        """Stage of the curriculum, from 1."""
+        return self.state["progress"].get("stage") or 1 if self.state else 1
 
 
 def run_training(request: TrainRequest) -> TrainResult:
@@ -91,22 +96,33 @@ def run_training(request: TrainRequest) -> TrainResult:
 def _run(request: TrainRequest, start: _Start) -> TrainResult:
     if start.state and start.state["counters"]["num_timesteps"] >= start.recipe.total_timesteps:
         return _nothing_to_do(start)
-    spec = start.recipe.env_spec(start.task)
+    specs = start.recipe.env_specs(start.task)
     title = f"{'resume' if start.state else 'train'} {start.task} ({start.recipe.algo})"
     with make_display(title, start.recipe.total_timesteps) as display:
         # The workers build their environments, and the check runs, while this process imports torch.
-        workers = _workers(spec, start.recipe.n_envs, request, display)
-        precheck = Precheck(spec, request.env_timeout_s) if request.check and not start.state else None
+        workers = _workers(specs[start.stage - 1], start.recipe.n_envs, request, display)
+        precheck = Precheck(specs[-1], request.env_timeout_s) if request.check and not start.state else None
         try:
-            return _train(request, start, spec, workers, precheck, display)
+            return _train(request, start, specs, workers, precheck, display)
         finally:
             workers.close()
 
 
+def _goal(specs: list[EnvSpec], workers: Workers, request: TrainRequest, display: Display) -> EnvInfo:
+    """Return what the last stage's environments are, after a look at every stage: now, not after hours of training."""
+    if len(specs) == 1:
+        return workers.info
+    from rlctl.train.curriculum import check_stages
+
+    with _workers(specs[0], 1, request, display) as probe:
+        return check_stages(specs, probe)
+
+
 def _new(request: TrainRequest) -> _Start:
     task = request.task or ""
-    registry.load(task)
-    return _Start(task, resolve(task, request.config, request.settings))
+    constructor: Any = registry.load(task)
+    stages = constructor.stages if registry.is_task(constructor) else ()
+    return _Start(task, resolve(task, request.config, request.settings, stages))
 
 
 def _resumed(request: TrainRequest) -> _Start:
@@ -119,7 +135,7 @@ def _resumed(request: TrainRequest) -> _Start:
         raise UsageError("--resume goes on with the run's own recipe: leave out --config")
     run = directory.find_run(request.resume, request.root)
     recipe = run.recipe()
-    recipe = validate({**recipe.model_dump(), **request.settings}, "recipe")
+    recipe = validate({**recipe.model_dump(by_alias=True), **request.settings}, "recipe")
     lock = run.lock()  # before looking: a process that is training removes old checkpoints
     try:
         run.remove_leftovers()
@@ -144,6 +160,8 @@ def _nothing_to_do(start: _Start) -> TrainResult:
         start.recipe.eval.episodes,
         [],
         note="this run is finished already: nothing to do; -n makes it longer",
+        stage=progress.get("stage", 0),
+        stages=len(start.recipe.stages),
     )
 
 
@@ -154,7 +172,7 @@ def _workers(spec: EnvSpec, n_envs: int, request: TrainRequest, display: Display
 def _train(
     request: TrainRequest,
     start: _Start,
-    spec: EnvSpec,
+    specs: list[EnvSpec],
     workers: Workers,
     precheck: Precheck | None,
     display: Display,
@@ -162,17 +180,21 @@ def _train(
     from rlctl.run.torch_policy import pin_threads
     from rlctl.train import checkpoint
     from rlctl.train.algorithms import build_model
-    from rlctl.train.loop import Progress, TrainingLoop, cut_back
+    from rlctl.train.curriculum import Curriculum
+    from rlctl.train.loop import TrainingLoop
+    from rlctl.train.progress import Progress, cut_back
     from rlctl.train.tensorboard import make_logger, writer_errors
     from rlctl.train.vec_env import WorkerVecEnv
 
     pin_threads()
     recipe = start.recipe
-    if recipe.stop_success is not None and not _may_succeed(workers):
-        raise RecipeError(f"stop_success: {start.task} does not report success; leave it out")
+    goal = _goal(specs, workers, request, display)
+    if not _may_succeed(workers):
+        _refuse_success(start.task, recipe)
     progress = Progress(next_eval=recipe.eval.every_steps or recipe.total_timesteps)
     if start.state:
         progress = Progress(**start.state["progress"])
+    curriculum = Curriculum(recipe.stages, specs, goal, progress)
     env = WorkerVecEnv(workers, recipe.seed, list(progress.episodes_started) or None)
     model = build_model(recipe, env, request.device)
     if start.checkpoint is not None:
@@ -183,35 +205,44 @@ def _train(
     lock = start.lock or run.lock()
     if start.state:
         cut_back(run, progress)
-    _write_start(run, start, request)
+    resumed_at = start.state["counters"]["num_timesteps"] if start.state else None
+    status.write_start(run, start.task, recipe, request.device, resumed_at)
     model.set_logger(make_logger(run.tensorboard, display.message))
 
     # They build their environments beside the first updates, which leave a core idle.
-    eval_workers = _workers(spec, min(recipe.eval.episodes, _EVAL_ENVS), request, display)
-    loop = TrainingLoop(run, recipe, env, eval_workers, progress, display, spec)
+    eval_workers = _workers(specs[-1], min(recipe.eval.episodes, _EVAL_ENVS), request, display)
+    loop = TrainingLoop(run, recipe, env, eval_workers, progress, display, curriculum)
+    if recipe.stages:
+        display.stage(curriculum.title)
     try:
         with _signals(loop, display), writer_errors(display.message):
             _learn(model, loop, recipe)
         recordings = _record(loop, request.record)
     except BaseException as error:
         with contextlib.suppress(OSError):  # a full disk must not hide the error itself
-            run.write_status(
-                {"status": _STATUS.get(type(error), "failed"), "error": str(error) or repr(error), "ended": _now()}
-            )
+            status.write_failure(run, error)
         raise
     finally:
         eval_workers.close()
         lock.release()
-    _write_end(run, model.num_timesteps, loop)
+    status.write_end(run, model.num_timesteps, progress)
     return _result(run, start, model.num_timesteps, progress, recordings)
-
-
-_STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
 
 
 def _may_succeed(workers: Workers) -> bool:
     # Of a plain environment it is not known before an episode has ended.
     return workers.info.has_success or not workers.info.reward_weights
+
+
+def _refuse_success(task: str, recipe: Recipe) -> None:
+    if recipe.stop_success is not None:
+        raise RecipeError(f"stop_success: {task} does not report success; leave it out")
+    for number, stage in enumerate(recipe.stages, start=1):
+        if stage.promote is not None and stage.promote.success is not None:
+            raise RecipeError(
+                f"stage {number} of {len(recipe.stages)}: promote.success: {task} does not report success; "
+                "promote by return: promote: {return: 50.0}"
+            )
 
 
 def _learn(model: Any, loop: TrainingLoop, recipe: Recipe) -> None:
@@ -266,57 +297,6 @@ def _record(loop: TrainingLoop, count: int) -> list[Path]:
     return recordings
 
 
-def _now() -> str:
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-def _write_start(run: RunDirectory, start: _Start, request: TrainRequest) -> None:
-    files.write_text(run.recipe_file, start.recipe.to_yaml())
-    changes: dict[str, Any] = {
-        "status": "running",
-        "error": None,
-        "task": start.task,
-        "origin": registry.origin(start.task),
-        "algo": start.recipe.algo,
-        "seed": start.recipe.seed,
-        "device": request.device,
-        "versions": versions(),
-        "git_commit": _git_commit(),
-        "command": ["rlctl", *sys.argv[1:]],
-        "host": platform.node(),
-        "pid": os.getpid(),
-    }
-    if start.state:
-        changes["resumed"] = _now()
-        changes["resumed_at_step"] = start.state["counters"]["num_timesteps"]
-    else:
-        changes["started"] = _now()
-    run.write_status(changes)
-
-
-def _git_commit() -> str | None:
-    try:
-        found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5.0, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return found.stdout.strip() or None
-
-
-def _write_end(run: RunDirectory, steps: int, loop: TrainingLoop) -> None:
-    progress = loop.progress
-    run.write_status(
-        {
-            "status": "finished",
-            "ended": _now(),
-            "steps": steps,
-            "seconds": round(progress.seconds, 3),
-            "best_step": progress.best_step,
-            "best_success": progress.best_success,
-            "best_return": progress.best_return,
-        }
-    )
-
-
 def _result(run: RunDirectory, start: _Start, steps: int, progress: Progress, recordings: list[Path]) -> TrainResult:
     return TrainResult(
         run,
@@ -328,4 +308,6 @@ def _result(run: RunDirectory, start: _Start, steps: int, progress: Progress, re
         progress.best_return,
         start.recipe.eval.episodes,
         recordings,
+        stage=progress.stage,
+        stages=len(start.recipe.stages),
     )

@@ -24,6 +24,7 @@ def show(result: TrainResult, json: str | None) -> None:
                     "episodes": result.eval_episodes,
                     "policy": str(result.run.best_policy),
                 },
+                **({"stage": result.stage, "stages": result.stages} if result.stages else {}),
                 "recordings": [str(path) for path in result.recordings],
                 "note": result.note,
             },
@@ -40,6 +41,9 @@ def show(result: TrainResult, json: str | None) -> None:
             f"best at step {result.best_step:,}: {success}return {result.best_return:.2f} "
             f"(mean of {result.eval_episodes} episodes)"
         )
+    if result.stages:
+        short = "" if result.stage == result.stages else "; evaluated in the last, which it did not reach"
+        out.print(f"ended in stage {result.stage} of {result.stages}{short}")
     for path in result.recordings:
         out.print(f"recording: rerun {path}")
     out.print(f"run: {run}")

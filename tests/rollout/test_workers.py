@@ -219,3 +219,33 @@ def test_paths_of_this_process_are_those_of_its_workers(start, tmp_path, monkeyp
     workers = start(EnvSpec("only_here:Here"), 1)
     workers.reset({0: 0})
     assert workers.info.action_space["shape"] == [2]
+
+
+def test_rebuilt_workers_are_as_new_ones(spec, start):
+    workers = start(spec("Walk"), 3, n_workers=2)
+    roll(workers, 5)
+    processes = {child.pid for child in psutil.Process().children()}
+    assert workers.rebuild(spec("Walk", size=4)) == start(spec("Walk", size=4), 3).info
+    seen, ended = roll(workers, 20)
+    assert processes <= {child.pid for child in psutil.Process().children()}
+    expected, also = roll(start(spec("Walk", size=4), 3), 20)
+    for a, b in zip(seen, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert [result for result, _ in ended] == [result for result, _ in also]
+
+
+def test_what_cannot_be_rebuilt_ends_the_workers(spec, start):
+    workers = start(spec("Walk"), 2)
+    with pytest.raises(RecipeError, match=r"no parameter 'sise'. Did you mean 'size'\?"):
+        workers.rebuild(spec("Walk", sise=4))
+
+
+def test_episodes_end_in_the_order_of_the_environments(spec, start):
+    workers = start(spec("Walk"), 6, n_workers=3)
+    workers.reset(dict.fromkeys(range(6), 1))  # one seed, one length: all end in one step
+    workers.arrays.next_seed[:] = -1
+    workers.arrays.action[:] = 0.0
+    ended = []
+    while not ended:
+        ended = workers.step()
+    assert [result.env for result in ended] == [0, 1, 2, 3, 4, 5]

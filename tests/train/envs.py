@@ -128,3 +128,19 @@ class FixedStart(Line):
 class Unbuilt(Line):
     def __init__(self):
         raise RuntimeError("no licence")
+
+
+class Staged(Line):
+    """Success within `tolerance`; every step costs `cost`; observed `size` times over."""
+
+    def __init__(self, tolerance: float = 0.0, cost: float = 1.0, size: int = 1):
+        super().__init__()
+        self.tolerance, self.cost, self.size = tolerance, cost, size
+        self.observation_space = spaces.Box(-10.0, 10.0, (size,), np.float32)
+
+    def _observation(self):
+        return np.full(self.size, self.x, np.float32)
+
+    def step(self, action):
+        observation, _, terminated, truncated, _ = super().step(action)
+        return observation, -self.cost, terminated, truncated, {"is_success": abs(self.x) < self.tolerance}

@@ -1,0 +1,100 @@
+"""Curricula: the stages of a recipe, from easy to what is wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pydantic
+from pydantic import Field
+
+from rlctl.env_spec import EnvSpec
+
+_STRICT = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class Promotion(pydantic.BaseModel):
+    """When training goes on to the next stage: by the success rate or the mean return of its last episodes."""
+
+    model_config = _STRICT
+
+    success: float | None = Field(None, gt=0, le=1)
+    mean_return: pydantic.FiniteFloat | None = Field(None, alias="return")
+    window: int = Field(100, ge=1)
+    """How many finished training episodes of the stage are looked at; the rule holds no earlier than that."""
+    min_steps: int = Field(0, ge=0)
+    """Environment steps that a stage lasts at least, all environments together."""
+
+    @pydantic.model_validator(mode="after")
+    def _one_measure(self) -> Promotion:
+        if (self.success is None) == (self.mean_return is None):
+            raise ValueError("give success or return, one of the two: promote: {success: 0.8, window: 100}")
+        return self
+
+    @property
+    def threshold(self) -> float:
+        """The success rate, in (0, 1], or the mean return to reach."""
+        return self.success if self.success is not None else self.mean_return or 0.0
+
+
+class Stage(pydantic.BaseModel):
+    """What a stage changes in the recipe's own `task`, `reward_weights` and `events`, and when it ends.
+
+    Each stage changes the recipe, not the stage before it: `{}` is the task as the recipe has it.
+    """
+
+    model_config = _STRICT
+
+    task: dict[str, Any] = {}
+    reward_weights: dict[str, pydantic.FiniteFloat] = {}
+    events: dict[str, dict[str, Any]] = {}
+    level: float = Field(1.0, ge=0, le=1)
+    """How far ranges of events written `{from: ..., to: ...}` have widened."""
+    promote: Promotion | None = None
+
+    def __str__(self) -> str:
+        changes = [f"{name} {value}" for name, value in self.task.items()]
+        changes += [f"reward_weights.{name} {value:g}" for name, value in self.reward_weights.items()]
+        for event, parameters in self.events.items():
+            changes += [f"{event}.{name} {value}" for name, value in parameters.items()] or [event]
+        changes += [f"level {self.level:g}"] if self.level != 1 else []
+        return ", ".join(changes) or "the recipe's own task"
+
+
+class StageContent(pydantic.BaseModel):
+    """All that the environments of a stage are made from, beside what all stages share; kept in policy files."""
+
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+    task_parameters: dict[str, Any] = {}
+    reward_weights: dict[str, float] = {}
+    events: dict[str, dict[str, Any]] = {}
+    level: float = 1.0
+
+    @classmethod
+    def of(cls, spec: EnvSpec) -> StageContent:
+        """Return the part of an environment that stages change."""
+        return cls(
+            task_parameters=dict(spec.parameters),
+            reward_weights=dict(spec.reward_weights),
+            events={name: dict(changes) for name, changes in spec.events.items()},
+            level=spec.level,
+        )
+
+
+def check_promotions(stages: Sequence[Stage]) -> None:
+    """Raise `ValueError` unless every stage but the last says when it ends, and the last does not."""
+    for number, stage in enumerate(stages, start=1):
+        last = number == len(stages)
+        if stage.promote is None and not last:
+            raise ValueError(
+                f"stage {number} of {len(stages)} ({stage}) has no promotion rule, so training would never leave it; "
+                "add promote: {success: 0.8, window: 100} or promote: {return: 50.0, window: 100}"
+            )
+        if stage.promote is not None and last:
+            raise ValueError(f"stage {number} of {len(stages)} ({stage}) is the last: leave out its promote")
+
+
+def title(number: int, stages: Sequence[Stage]) -> str:
+    """Return what people are told: `stage 2 of 3: tolerance 0.1`."""
+    return f"stage {number} of {len(stages)}: {stages[number - 1]}"

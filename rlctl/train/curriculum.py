@@ -1,0 +1,149 @@
+"""Where a training is in its curriculum, and when it goes on."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import RecipeError, RlctlError
+from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.run.env_info import EnvInfo
+from rlctl.run.stages import Stage, StageContent, title
+from rlctl.train.display import percent
+from rlctl.train.progress import Progress
+
+
+class Curriculum:
+    """The stages of a training; without any, nothing is ever due.
+
+    What it knows of the past is in `progress`, which checkpoints keep.
+    """
+
+    def __init__(self, stages: Sequence[Stage], specs: Sequence[EnvSpec], goal: EnvInfo, progress: Progress) -> None:
+        self.stages = stages
+        self.goal_spec = specs[-1]
+        """What evaluations live in, and policies are for: the last stage."""
+        self.goal = goal
+        """What the environments of `goal_spec` are."""
+        self._specs = specs
+        self._progress = progress
+        self._warned = False
+        if stages and not progress.stage:
+            progress.stage = 1
+
+    @property
+    def number(self) -> int:
+        """The present stage, from 1; 0 without stages."""
+        return self._progress.stage
+
+    @property
+    def title(self) -> str:
+        """The present stage for people: `stage 2 of 3: tolerance 0.1`."""
+        return title(self.number, self.stages)
+
+    def columns(self) -> dict[str, int]:
+        """Return what tables say of the stage: nothing without stages."""
+        return {"stage": self.number} if self.stages else {}
+
+    def contents(self) -> list[StageContent]:
+        """Return what a policy file keeps of the stages."""
+        return [StageContent.of(spec) for spec in self._specs] if self.stages else []
+
+    def count(self, ended: Sequence[EpisodeResult]) -> None:
+        """Take note of training episodes of the present stage, in the order in which they ended."""
+        rule = self.stages[self.number - 1].promote if self.stages else None
+        if rule is None:
+            return
+        if rule.success is not None:
+            values = [None if each.success is None else float(each.success) for each in ended]
+        else:
+            values = [each.total_reward for each in ended]
+        self._progress.stage_episodes = [*self._progress.stage_episodes, *values][-rule.window :]
+
+    def measured(self) -> float | None:
+        """Return the success rate or mean return that the rule looks at; None while its window is not full."""
+        rule = self.stages[self.number - 1].promote if self.stages else None
+        values = self._progress.stage_episodes
+        if rule is None or len(values) < rule.window:
+            return None
+        # An environment may speak of success only when there is one.
+        return statistics.fmean(0.0 if value is None else value for value in values)
+
+    def is_due(self, steps: int) -> bool:
+        """Say whether the present stage is done, after `steps` environment steps of training."""
+        measured = self.measured()
+        rule = self.stages[self.number - 1].promote if self.stages else None
+        if rule is None or measured is None:
+            return False
+        return steps - self._progress.stage_began >= rule.min_steps and measured >= rule.threshold
+
+    def next_spec(self) -> EnvSpec:
+        """Return what the environments of the next stage are made from."""
+        return self._specs[self.number]
+
+    def go_on(self, steps: int) -> tuple[str, str]:
+        """Enter the next stage; return its title and why it begins."""
+        rule, measured = self.stages[self.number - 1].promote, self.measured()
+        assert rule is not None  # else nothing would be due
+        assert measured is not None
+        told = f"success {percent(measured)}" if rule.success is not None else f"return {measured:.2f}"
+        progress = self._progress
+        progress.stage, progress.stage_began, progress.stage_episodes = progress.stage + 1, steps, []
+        return self.title, f"after {steps:,} steps: {told} over {rule.window} episode{'s' if rule.window > 1 else ''}"
+
+    def warning(self) -> str | None:
+        """Return, once, what is wrong with a rule that nothing can fulfil."""
+        rule = self.stages[self.number - 1].promote if self.stages else None
+        values = self._progress.stage_episodes
+        if rule is None or self._warned or len(values) < rule.window or any(each is not None for each in values):
+            return None
+        self._warned = True
+        return (
+            f"warning: {self.title}: promote.success waits for info['is_success'], which none of the last "
+            f"{rule.window} episodes has given; promote.return needs none"
+        )
+
+
+def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
+    """Build an environment of every stage, one after the other; return what those of the last are.
+
+    `workers` have the first. Raises `RecipeError` or `TaskError`, which name the stage, for one that cannot be
+    built, and `RecipeError` for one with other spaces or reward terms than the first.
+    """
+    first = info = None
+    for number, spec in enumerate(specs, start=1):
+        where = f"stage {number} of {len(specs)}"
+        try:
+            info = workers.info if number == 1 else workers.rebuild(spec)
+        except RlctlError as error:
+            raise type(error)(f"{where}: {error}", details=error.details) from None
+        first = first or info
+        if difference := info.difference(first, "stage 1's"):
+            raise RecipeError(
+                f"{where}: {difference}. One policy learns in all stages: leave out the task parameter that changes it"
+            )
+        if list(info.reward_weights) != list(first.reward_weights):
+            raise RecipeError(
+                f"{where}: its reward terms are {', '.join(info.reward_weights)}, "
+                f"stage 1's are {', '.join(first.reward_weights)}; all stages need the same"
+            )
+    assert info is not None  # there is a first
+    return info
+
+
+def begin_next_episodes(model: BaseAlgorithm) -> None:
+    """Leave the running episodes and begin the next ones, as SB3 does at the start of a training."""
+    env: Any = model.env
+    if isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
+        # Cut short but not over: a return over several steps must not reach into the next stage.
+        model.replay_buffer.timeouts[model.replay_buffer.pos - 1] = 1.0
+    model._last_obs = env.reset()
+    model._last_episode_starts = np.ones(env.num_envs, np.bool_)
+    if (normalizer := model.get_vec_normalize_env()) is not None:
+        model._last_original_obs = normalizer.get_original_obs()

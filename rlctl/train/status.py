@@ -1,0 +1,81 @@
+"""What `run.json` says of a training: how it began and how it ended."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+from rlctl import registry
+from rlctl.errors import DivergedError, Interrupted
+from rlctl.run import files
+from rlctl.run.directory import RunDirectory
+from rlctl.run.policy import versions
+from rlctl.run.recipe import Recipe
+
+if TYPE_CHECKING:
+    from rlctl.train.progress import Progress
+
+_STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
+
+
+def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resumed_at: int | None) -> None:
+    """Write the recipe, and that a training runs; `resumed_at` is the step it goes on from."""
+    files.write_text(run.recipe_file, recipe.to_yaml())
+    changes: dict[str, Any] = {
+        "status": "running",
+        "error": None,
+        "task": task,
+        "origin": registry.origin(task),
+        "algo": recipe.algo,
+        "seed": recipe.seed,
+        "device": device,
+        "versions": versions(),
+        "git_commit": _git_commit(),
+        "command": ["rlctl", *sys.argv[1:]],
+        "host": platform.node(),
+        "pid": os.getpid(),
+    }
+    if resumed_at is not None:
+        changes["resumed"] = _now()
+        changes["resumed_at_step"] = resumed_at
+    else:
+        changes["started"] = _now()
+    run.write_status(changes)
+
+
+def write_failure(run: RunDirectory, error: BaseException) -> None:
+    """Write what ended a training before its time."""
+    kind = _STATUS.get(type(error), "failed")
+    run.write_status({"status": kind, "error": str(error) or repr(error), "ended": _now()})
+
+
+def write_end(run: RunDirectory, steps: int, progress: Progress) -> None:
+    """Write that a training is done, and what came of it."""
+    run.write_status(
+        {
+            "status": "finished",
+            "ended": _now(),
+            "steps": steps,
+            "seconds": round(progress.seconds, 3),
+            "best_step": progress.best_step,
+            "best_success": progress.best_success,
+            "best_return": progress.best_return,
+            **({"stage": progress.stage} if progress.stage else {}),
+        }
+    )
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def _git_commit() -> str | None:
+    try:
+        found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5.0, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return found.stdout.strip() or None
