@@ -24,11 +24,15 @@ app = typer.Typer(
     },
 )
 
+tasks_app = typer.Typer()
+app.add_typer(tasks_app, name="tasks")
+
+TASK_FORMS = "Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id."
 OptionalTask = Annotated[
     Optional[str],  # noqa: UP045
     typer.Argument(
         metavar="TASK",
-        help="Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id.",
+        help=TASK_FORMS,
         show_default=False,
     ),
 ]
@@ -186,6 +190,10 @@ def evaluate(
     checkpoint: Checkpoint = "best",
     episodes: Annotated[int, typer.Option("--episodes", help="Episodes, each with its own seed.", min=1)] = 100,
     seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    stage: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(metavar="N|all", help="Stage of the curriculum it was trained in.", show_default="the last"),
+    ] = None,
     settings: Set = [],  # noqa: B006
     stochastic: Annotated[
         bool, typer.Option("--stochastic", help="Sample actions instead of taking the mean.")
@@ -208,11 +216,11 @@ def evaluate(
 ) -> None:
     """Say how good a policy is: success rate with its interval, returns, reward terms."""
     _claim_stdout()
-    from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
-    from rlctl.eval.report import show
+    from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluations
+    from rlctl.eval.report import show_all
 
     gates = Gates(min_success, min_success_lower, min_return)
-    result = run_evaluation(
+    results = run_evaluations(
         EvalRequest(
             run=run,
             task=task,
@@ -220,14 +228,15 @@ def evaluate(
             episodes=episodes,
             seed=seed,
             task_parameters=_task_settings(settings),
+            stage=stage,
             deterministic=not stochastic,
             n_envs=n_envs,
             env_timeout_s=env_timeout,
         ),
         gates,
     )
-    show(result, json)
-    gates.check(result)
+    show_all(results, json)
+    gates.check(*results)
 
 
 @app.command()
@@ -312,15 +321,44 @@ def replay(
     result.check()
 
 
-@app.command()
+@tasks_app.callback(invoke_without_command=True)
 def tasks(
+    context: typer.Context,
     check: Annotated[bool, typer.Option("--check", help="Import each task, in a process of its own.")] = False,
     json: Json = None,
 ) -> None:
-    """List the installed tasks."""
-    from rlctl.task_list import list_tasks, show
+    """List the installed tasks; show one of them, or begin one of your own."""
+    if context.invoked_subcommand is not None:
+        if check or json is not None:
+            raise UsageError(f"options of `rlctl tasks {context.invoked_subcommand}` come after its name")
+        return
+    from rlctl.tasks.listing import list_tasks, show
 
     show(list_tasks(check=check), json)
+
+
+@tasks_app.command("show")
+def show_task(
+    task: Annotated[str, typer.Argument(metavar="TASK", help=TASK_FORMS, show_default=False)],
+    json: Json = None,
+) -> None:
+    """Show what a task observes, does and rewards, what can be set, and how it is trained."""
+    _claim_stdout()
+    from rlctl.tasks.description import describe
+    from rlctl.tasks.show import show
+
+    show(describe(task), json)
+
+
+@tasks_app.command("new")
+def new_task(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the task: letters, digits, - and _.")],
+    json: Json = None,
+) -> None:
+    """Write a plugin to begin with, in a folder of its name: a task that learns at once, its recipe and tests."""
+    from rlctl.tasks.new import create, show
+
+    show(create(name), json)
 
 
 def _claim_stdout() -> None:

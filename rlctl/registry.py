@@ -49,9 +49,11 @@ class TaskEntry:
 
     @property
     def recipe_file(self) -> Path | None:
-        """The packaged recipe: `<name>.yaml` beside the module."""
+        """The packaged recipe: `<name>.yaml` beside the module, or the module's own, `<module>.yaml`."""
         file = self.module_file
-        return _existing(file.with_name(f"{self.name}.yaml")) if file else None
+        if file is None:
+            return None
+        return _existing(file.with_name(f"{self.name}.yaml")) or _existing(file.with_suffix(".yaml"))
 
 
 def installed() -> list[TaskEntry]:
@@ -136,7 +138,7 @@ def is_task(constructor: Any) -> bool:
 
 
 def recipe_file(task: str) -> Path | None:
-    """Return the recipe that comes with a task: `<name>.yaml` beside its module, `<file>.yaml` beside its file."""
+    """Return the recipe that comes with a task: `<name>.yaml` beside its module, or `<file>.yaml` beside its file."""
     if entry := find(task):
         return entry.recipe_file
     file = source_file(task)

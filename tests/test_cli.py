@@ -222,7 +222,7 @@ def test_ctrl_c(tmp_path, write_module):
 
 def test_a_bug_shows_its_traceback(rlctl, tmp_path):
     code = (
-        "import sys; from rlctl import task_list; task_list.list_tasks = lambda check: 1 / 0; "
+        "import sys; from rlctl.tasks import listing; listing.list_tasks = lambda check: 1 / 0; "
         "from rlctl.cli import main; sys.argv[1:] = ['tasks']; main()"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)

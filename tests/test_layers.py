@@ -15,11 +15,11 @@ LAYERS = [
     {"__main__"},
     {"cli"},
     {"train"},
-    {"export", "replay"},
+    {"export", "replay", "tasks"},
     {"check_env", "eval"},
     {"rollout"},
     {"run"},
-    {"task_list", "gym"},
+    {"gym"},
     {"env_spec"},
     {"registry"},
     {"task"},
@@ -27,7 +27,7 @@ LAYERS = [
     {"errors", "__init__"},
 ]
 # Beside the order above.
-ALSO = {("task_list", "run"), ("output", "run"), ("__init__", "env_spec"), ("__init__", "run")}
+ALSO = {("output", "run"), ("__init__", "env_spec"), ("__init__", "run")}
 NOT_AMONG_VERBS = {("export", "check_env"), ("replay", "check_env"), ("replay", "export")}
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 MAY_IMPORT_TORCH = {  # besides train/
