@@ -1,4 +1,4 @@
-"""Draws a world: robots from their URDF files, what Rerun cannot read from PyBullet's own shapes, markers, paths."""
+"""Draws a world: URDF robots from their files, other bodies from their shapes, markers, paths."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rerun.chunk import Chunk
 from rerun.urdf import UrdfTree
 
 from rlctl.replay.scene import BodyMotion, Scene
-from rlctl.replay.shapes import draw_shapes
+from rlctl.replay.shapes import draw_shapes, shape_centers
 from rlctl.replay.timelines import Timelines
 
 Tell = Callable[[str], None]
@@ -22,17 +22,25 @@ _PATH_COLOR = (255, 80, 180)
 _GROUND_COLOR = (70, 74, 82)
 
 
-def draw_scene(scene: Scene, timelines: Timelines, tell: Tell) -> None:
-    """Draw everything under `world/`; `tell` hears of what could not be drawn as it should be."""
+def draw_scene(scene: Scene, timelines: Timelines, tell: Tell) -> str | None:
+    """Draw everything under `world/`; `tell` hears of what could not be drawn as it should be.
+
+    Returns the entity that the camera is to follow: the trunk of the first robot that has one, if it was drawn.
+    """
+    trunks: list[str] = []
     timelines.stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for body in scene.bodies:
         if body.ground_height is not None:
             _draw_ground(body, scene, timelines)
         else:
-            _draw_body(body, timelines, tell)
+            drawn = _draw_body(body, timelines, tell)
+            if body.trunk is not None:
+                trunk = _entity("world", body.name, body.links[body.trunk]) + "/"
+                trunks += [entity for entity in drawn if entity.startswith(trunk)]
         _draw_path(body, timelines)
     for number, (name, positions) in enumerate(scene.markers.items()):
         _draw_marker(name, positions, _MARKER_COLORS[number % len(_MARKER_COLORS)], timelines)
+    return trunks[0] if trunks else None
 
 
 def _draw_marker(name: str, positions: NDArray[np.float64], color: tuple[int, int, int], timelines: Timelines) -> None:
@@ -81,7 +89,27 @@ def bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return (points.min(axis=0), points.max(axis=0)) if len(points) else (-np.ones(3), np.ones(3))
 
 
-def _draw_body(body: BodyMotion, timelines: Timelines, tell: Tell) -> None:
+def start_bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what `bounds` does for the first robot with a trunk alone, as it stands at the reset."""
+    drawn = {body.name: {shape.link for shape in body.shapes} for body in scene.bodies}
+    bodies = (body for body in scene.bodies if body.trunk is not None and body.links[body.trunk] in drawn[body.name])
+    body = next(bodies, None)
+    if body is None:
+        return bounds(scene)
+    low, high = [], []
+    for link, name in enumerate(body.links):
+        shapes = [shape for shape in body.shapes if shape.link == name]
+        for shape, center in zip(shapes, shape_centers(body, link)[:, 0], strict=True):
+            reach = 0.0 if shape.mesh else max(shape.size, default=0.0) / 2  # a mesh has a scale, and no size
+            low.append(center - reach)
+            high.append(center + reach)
+    return np.min(low, axis=0), np.max(high, axis=0)
+
+
+def _draw_body(body: BodyMotion, timelines: Timelines, tell: Tell) -> list[str]:
+    """Draw a body that moves; return the entities of its shapes."""
+    if body.file.suffix == ".xml":
+        return draw_shapes(body, timelines, tell)
     try:
         tree = UrdfTree.from_file_path(
             body.file, frame_prefix=f"{body.name}/", static_transform_entity_path=_entity("tf", body.name, "fixed")
@@ -89,13 +117,12 @@ def _draw_body(body: BodyMotion, timelines: Timelines, tell: Tell) -> None:
     except Exception as error:  # Rerun's reader is stricter than PyBullet's, and raises what its parser raises
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         tell(f"{body.file.name}: drawn from PyBullet's shapes, Rerun cannot read it: {reason}")
-        draw_shapes(body, timelines, tell)
-        return
-    _send_meshes(tree, body, timelines.stream)
+        return draw_shapes(body, timelines, tell)
     _send_motion(tree, body, timelines)
+    return _send_meshes(tree, body, timelines.stream)
 
 
-def _send_meshes(tree: UrdfTree, body: BodyMotion, stream: rr.RecordingStream) -> None:
+def _send_meshes(tree: UrdfTree, body: BodyMotion, stream: rr.RecordingStream) -> list[str]:
     root, ours = _entity(tree.name), _entity("world", body.name)
     visuals = tree.stream().drop(content=f"{root}/collision_geometries/**")
     chunks = []
@@ -107,6 +134,7 @@ def _send_meshes(tree: UrdfTree, body: BodyMotion, stream: rr.RecordingStream) -
     stream.send_chunks(chunks)
     for chunk in chunks:
         _fill(chunk, stream)
+    return [chunk.entity_path for chunk in chunks]
 
 
 def _fill(chunk: Chunk, stream: rr.RecordingStream) -> None:
@@ -145,11 +173,19 @@ def _send_motion(tree: UrdfTree, body: BodyMotion, timelines: Timelines) -> None
 
 
 def _draw_path(body: BodyMotion, timelines: Timelines) -> None:
-    """Draw the way of an arm's last link, or of a free robot's base: a segment per step."""
-    if not body.joint_names or (body.fixed and not body.chain):
+    """Draw the way of a robot's trunk, or else of an arm's last link: a segment per step."""
+    if not body.joint_names or (body.trunk is None and not body.chain):
         return
-    points = body.positions[:, -1 if body.fixed else 0].astype(np.float32)
+    points = _traveller(body).astype(np.float32)
     entity = _entity("world", "paths", body.name)
     timelines.stream.log(entity, rr.LineStrips3D.from_fields(radii=0.004, colors=_PATH_COLOR), static=True)
     segments = [points[step - 1 : step + 1] for step in range(1, len(points))]
     timelines.send(entity, range(1, len(points)), rr.LineStrips3D.columns(strips=segments))
+
+
+def _traveller(body: BodyMotion) -> NDArray[np.float64]:
+    if body.trunk is None:
+        return body.positions[:, -1]
+    centers = shape_centers(body, body.trunk)
+    # The frame of an MJCF body may lie far outside of it.
+    return centers[0] if body.file.suffix == ".xml" and len(centers) else body.positions[:, body.trunk]

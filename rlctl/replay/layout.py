@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from rlctl.replay.bodies import WORLD_FRAME, bounds
+from rlctl.replay.bodies import WORLD_FRAME, bounds, start_bounds
 from rlctl.replay.curves import Plot
 from rlctl.replay.scene import Scene
 
@@ -17,12 +17,18 @@ _ROWS = (("reward",), ("action",), ("joints", "observation"))  # by kind; those 
 
 
 def blueprint(
-    plots: Sequence[Plot], scene: Scene | None, *, pictures: bool, success: bool, timeline: str
+    plots: Sequence[Plot],
+    scene: Scene | None,
+    *,
+    pictures: bool,
+    success: bool,
+    timeline: str,
+    followed: str | None = None,
 ) -> rrb.Blueprint:
-    """Return the layout: the world on the left, its numbers on the right."""
+    """Return the layout: the world on the left, its numbers on the right; the camera goes along with `followed`."""
     left: list[rrb.Container | rrb.View] = []
     if scene is not None:
-        left.append(_world(scene))
+        left.append(_world(scene, followed))
     if pictures:
         left.append(rrb.Spatial2DView(name="camera", origin="/camera"))
     left += [rrb.Spatial2DView(name=plot.title, origin=f"/{plot.entity}") for plot in plots if plot.kind == "image"]
@@ -58,10 +64,11 @@ def _plot(plot: Plot) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(name=plot.title, origin=f"/{plot.entity}", plot_legend=legend)
 
 
-def _world(scene: Scene) -> rrb.Spatial3DView:
-    low, high = bounds(scene)
+def _world(scene: Scene, followed: str | None) -> rrb.Spatial3DView:
+    low, high = bounds(scene) if followed is None else start_bounds(scene)
     center = (low + high) / 2
-    distance = max(1.0, 1.15 * float(np.linalg.norm(high - low)))
+    margin = 1.15 if followed is None else 1.5  # what is followed is in the middle, its feet are far below
+    distance = max(1.0, margin * float(np.linalg.norm(high - low)))
     eye = center + distance * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
     start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     so_far = [rrb.VisibleTimeRange(name, start=start, end=end) for name in ("step", "sim_time")]
@@ -72,7 +79,7 @@ def _world(scene: Scene) -> rrb.Spatial3DView:
         overrides={
             rr.new_entity_path(["world", "paths", body.name]): rrb.VisibleTimeRanges(so_far) for body in scene.robots()
         },
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=center, eye_up=(0, 0, 1)),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=center, eye_up=(0, 0, 1), tracking_entity=followed),
         spatial_information=rrb.SpatialInformation(target_frame=WORLD_FRAME),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, plane=rr.components.Plane3D.XY),
     )

@@ -63,8 +63,7 @@ def _send(stream: rr.RecordingStream, watched: Watched, title: str, tell: Tell) 
     timelines = Timelines(stream, lived.dt)
     stream.send_recording_name(title)
     stream.send_property("episode", _properties(lived))
-    if scene is not None:
-        draw_scene(scene, timelines, tell)
+    followed = None if scene is None else draw_scene(scene, timelines, tell)
     plots = send_curves(lived, scene, timelines)
     _send_happenings(lived, timelines)
     if watched.pictures:
@@ -77,6 +76,7 @@ def _send(stream: rr.RecordingStream, watched: Watched, title: str, tell: Tell) 
         pictures=bool(watched.pictures),
         success=lived.successes is not None,
         timeline=timelines.shown,
+        followed=followed,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
+from rlctl.replay.mjcf import Shape, read_shapes
 from rlctl.task.body import Body
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
@@ -18,22 +19,6 @@ Array = NDArray[np.float64]
 _GROUND_SIZE = 8.0  # [m]; a body without joints that is wider both ways is the ground
 _INERTIAL_POSE = slice(3, 5)  # of getDynamicsInfo: the centre of mass in the link frame
 _LINK_POSE = slice(4, 6)  # of getLinkState: the link frame in the world
-
-
-@dataclasses.dataclass(frozen=True)
-class Shape:
-    """One visual shape, as PyBullet has it: a kind, sizes [m], a pose in the frame of its link, a colour."""
-
-    link: str
-    kind: int
-    """`pybullet.GEOM_*`."""
-    size: tuple[float, ...]
-    """Box: full extents; sphere: radius; cylinder and capsule: length and radius; mesh: scale per axis."""
-    mesh: Path | None
-    position: tuple[float, ...]
-    orientation: tuple[float, ...]
-    color: tuple[float, ...]
-    """RGBA in [0, 1]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +42,8 @@ class BodyMotion:
     orientations: Array
     """Shape (T + 1, links, 4)."""
     shapes: list[Shape]
+    trunk: int | None
+    """Where in `links` the body is that goes places: a free base, or what sliding joints without limits carry."""
     chain: bool
     """Whether the links follow each other in one line, as those of an arm do."""
 
@@ -136,6 +123,7 @@ class _BodyReader:
 
     def motion(self) -> BodyMotion:
         body = self.body
+        shapes = self._shapes()
         return BodyMotion(
             name=body.name,
             file=body.file,
@@ -147,7 +135,8 @@ class _BodyReader:
             links=self.links,
             positions=np.array([[pose[0] for pose in poses] for poses in self._poses], np.float64),
             orientations=np.array([[pose[1] for pose in poses] for poses in self._poses], np.float64),
-            shapes=self._shapes(),
+            shapes=shapes,
+            trunk=self._trunk({shape.link for shape in shapes}),
             chain=self._is_chain(),
         )
 
@@ -167,7 +156,23 @@ class _BodyReader:
         ]
         return len(parents) > 1 and parents == list(range(-1, len(parents) - 1))
 
+    def _trunk(self, drawn: set[str]) -> int | None:
+        if not self.body.joint_names:
+            return None
+        if not self.body.fixed:
+            return 0
+        first = pybullet.getJointInfo(self.body.id, 0, physicsClientId=self.client)
+        limited = first[8] <= first[9]
+        if first[2] != pybullet.JOINT_PRISMATIC or limited:
+            return None
+        return next((index for index, link in enumerate(self.links) if link in drawn), None)
+
     def _shapes(self) -> list[Shape]:
+        if self.body.file.suffix == ".xml":
+            try:
+                return read_shapes(self.body.file)
+            except ValueError:  # PyBullet's reader is laxer; that nothing is drawn is told
+                return []
         shapes = []
         for data in pybullet.getVisualShapeData(self.body.id, physicsClientId=self.client):
             _, link, kind, size, mesh, position, orientation, color = data[:8]

@@ -1,21 +1,34 @@
-"""Draws a body from the shapes that PyBullet made of its file."""
+"""Draws a body from its shapes: those of an MJCF file, or what PyBullet made of another file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
-from rlctl.replay.scene import BodyMotion, Shape
+from rlctl.replay.mjcf import Shape
+from rlctl.replay.scene import BodyMotion
 from rlctl.replay.timelines import Timelines
 from rlctl.task.bullet import pybullet
 
 _MESHES = {".obj", ".stl", ".dae", ".glb", ".gltf"}
 
 
-def draw_shapes(body: BodyMotion, timelines: Timelines, tell: Callable[[str], None]) -> None:
-    """Draw every shape of every link, and move the links."""
-    drawn = 0
+def shape_centers(body: BodyMotion, link: int) -> NDArray[np.float64]:
+    """Return where the shapes of a link are [m], world frame, shape (shapes, T + 1, 3)."""
+    offsets = np.array([shape.position for shape in body.shapes if shape.link == body.links[link]]).reshape(-1, 3)
+    vector, scalar = body.orientations[:, link, :3], body.orientations[:, link, 3:]
+    # A vector r turned by the quaternion (v, w) is r + 2 w (v x r) + 2 v x (v x r).
+    cross = np.cross(vector, offsets[:, None])
+    turned = offsets[:, None] + 2 * scalar * cross + 2 * np.cross(vector, cross)
+    return np.asarray(body.positions[:, link] + turned, np.float64)
+
+
+def draw_shapes(body: BodyMotion, timelines: Timelines, tell: Callable[[str], None]) -> list[str]:
+    """Draw every shape of every link, and move the links; return the entities of the shapes."""
+    drawn = []
     for link, name in enumerate(body.links):
         shapes = [shape for shape in body.shapes if shape.link == name]
         if not shapes:
@@ -30,9 +43,10 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, tell: Callable[[str], No
             place = f"{entity}/shape_{number}"
             timelines.stream.log(place, archetype, static=True)
             timelines.stream.log(place, _pose(shape), static=True)
-            drawn += 1
-    if drawn < len(body.shapes) or not drawn:
-        tell(f"{body.file.name}: {drawn} of {len(body.shapes)} shapes of {body.name!r} could be drawn")
+            drawn.append(place)
+    if len(drawn) < len(body.shapes) or not drawn:
+        tell(f"{body.file.name}: {len(drawn)} of {len(body.shapes)} shapes of {body.name!r} could be drawn")
+    return drawn
 
 
 def _pose(shape: Shape) -> rr.Transform3D:

@@ -1,0 +1,122 @@
+"""The shapes of an MJCF file, read from the file.
+
+PyBullet itself cannot say: getVisualShapeData loses the pose of a geom that is given by its ends (`fromto`), and
+getCollisionShapeData crashes on some robots. Read here is what PyBullet 3.2 makes of the file, for recordings show
+what was simulated: `axisangle` is in radians whatever the compiler says, `euler`, `zaxis` and `xyaxes` do not count.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from rlctl.task.bullet import pybullet
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """One visual shape, as PyBullet has it: a kind, sizes [m], a pose in the frame of its link, a colour."""
+
+    link: str
+    kind: int
+    """`pybullet.GEOM_*`."""
+    size: tuple[float, ...]
+    """Box: full extents; sphere: radius; cylinder and capsule: length and radius; mesh: scale per axis."""
+    mesh: Path | None
+    position: tuple[float, ...]
+    orientation: tuple[float, ...]
+    color: tuple[float, ...]
+    """RGBA in [0, 1]."""
+
+
+_KINDS = {
+    "sphere": pybullet.GEOM_SPHERE,
+    "capsule": pybullet.GEOM_CAPSULE,
+    "cylinder": pybullet.GEOM_CYLINDER,
+    "box": pybullet.GEOM_BOX,
+    "plane": pybullet.GEOM_PLANE,
+}
+_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, RGBA
+_OUTERMOST = "main"  # what MJCF calls the class of all geoms that name none
+_Defaults = Mapping[str, Mapping[str, str]]  # attributes of geoms, by class
+
+
+def read_shapes(file: Path) -> list[Shape]:
+    """Return the geoms of all bodies of a file; the `link` of a shape is the name of its MJCF body.
+
+    Raises `ValueError` where the file cannot be read.
+    """
+    try:
+        root = ElementTree.parse(file).getroot()
+        group = root.find("default")
+        defaults = dict(_defaults(group, {}))
+        outermost = _OUTERMOST if group is None else group.get("class", _OUTERMOST)
+        return [shape for body in root.iterfind("worldbody/body") for shape in _of_body(body, defaults, outermost)]
+    except (OSError, ElementTree.ParseError) as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def _defaults(group: ElementTree.Element | None, outer: Mapping[str, str]) -> Iterator[tuple[str, Mapping[str, str]]]:
+    """Yield each default class with what it says of geoms, itself or by the class around it."""
+    if group is None:
+        return
+    geom = group.find("geom")
+    attributes = {**outer, **({} if geom is None else geom.attrib)}
+    yield group.get("class", _OUTERMOST), attributes
+    for inner in group.iterfind("default"):
+        yield from _defaults(inner, attributes)
+
+
+def _of_body(body: ElementTree.Element, defaults: _Defaults, around: str) -> Iterator[Shape]:
+    inherited = body.get("childclass", around)
+    for geom in body.iterfind("geom"):
+        chosen = defaults.get(geom.get("class", inherited), {})
+        yield _shape(body.get("name", ""), {**chosen, **geom.attrib})
+    for child in body.iterfind("body"):
+        yield from _of_body(child, defaults, inherited)
+
+
+def _shape(link: str, geom: Mapping[str, str]) -> Shape:
+    kind = _KINDS.get(geom.get("type", "sphere"), pybullet.GEOM_MESH)  # a mesh without a file: not drawn
+    size, ends = _numbers(geom, "size"), _numbers(geom, "fromto")
+    position, orientation, length = _numbers(geom, "pos") or (0.0, 0.0, 0.0), _orientation(geom), 0.0
+    if ends and kind in (pybullet.GEOM_CAPSULE, pybullet.GEOM_CYLINDER):
+        position, orientation, length = _between(np.array(ends[:3]), np.array(ends[3:]))
+    elif len(size) > 1:
+        length = 2 * size[1]
+    if kind == pybullet.GEOM_BOX:
+        size = tuple(2 * half for half in size)
+    elif kind in (pybullet.GEOM_CAPSULE, pybullet.GEOM_CYLINDER):
+        size = (length, size[0])
+    return Shape(link, kind, size, None, position, orientation, _numbers(geom, "rgba") or _COLOR)
+
+
+def _numbers(geom: Mapping[str, str], attribute: str) -> tuple[float, ...]:
+    return tuple(float(word) for word in geom.get(attribute, "").split())
+
+
+def _orientation(geom: Mapping[str, str]) -> tuple[float, ...]:
+    """Return the quaternion (x, y, z, w) of a geom in its body; MJCF writes (w, x, y, z)."""
+    if quaternion := _numbers(geom, "quat"):
+        w, *vector = np.array(quaternion) / np.linalg.norm(quaternion)
+        return (*map(float, vector), float(w))
+    if turn := _numbers(geom, "axisangle"):
+        axis = np.array(turn[:3]) / np.linalg.norm(turn[:3])
+        return (*map(float, math.sin(turn[3] / 2) * axis), math.cos(turn[3] / 2))
+    return (0.0, 0.0, 0.0, 1.0)
+
+
+def _between(start: np.ndarray, end: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...], float]:
+    """Return the centre [m], quaternion and length [m] of what reaches from `start` to `end` along its z axis."""
+    along = end - start
+    length = float(np.linalg.norm(along))
+    x, y, z = along / length if length else (0.0, 0.0, 1.0)
+    # The shortest turn from z to the direction: (z cross d, 1 + z . d), normalized; half a turn is about x.
+    turn = np.array([-y, x, 0.0, 1.0 + z]) if z > -1 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
+    turn /= np.linalg.norm(turn)
+    return tuple(((start + end) / 2).tolist()), tuple(turn.tolist()), length
