@@ -31,6 +31,8 @@ def test_the_wheel_trains_reach_from_an_empty_folder(tmp_path):
     assert [(task["name"], task["algo"], task["problem"]) for task in tasks] == [
         (name, "ppo", None) for name in ("ant", "half-cheetah", "hopper", "humanoid", "reach", "walker2d")
     ]
+    for task in tasks:  # with its models
+        call(scripts / "rlctl", "check-env", task["name"], "--select", "RL001,RL002,RL301", cwd=empty)
     result = json.loads(call(scripts / "rlctl", "train", "reach", "-n", "8000", "--json", "-", cwd=empty))
     assert result["steps"] >= 8000
     report = json.loads(call(scripts / "rlctl", "export", "reach", "--onnx", "--json", "-", cwd=empty))
