@@ -17,12 +17,9 @@ import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rlctl.errors import NoSuchClassError, OldGymError, TaskError, UsageError, did_you_mean
-
-if TYPE_CHECKING:
-    pass
 
 GROUP = "rlctl.tasks"
 OURS = "rlctl"

@@ -6,6 +6,7 @@ import inspect
 import sys
 from typing import Any
 
+from rlctl.check_env.bullet_clients import connected
 from rlctl.check_env.instance import Instance
 from rlctl.check_env.leaves import leaf_to_wire
 from rlctl.check_env.wire import Message
@@ -37,7 +38,7 @@ def built(instance: Instance) -> Message:
         "is_env": isinstance(env, gymnasium.Env),
         "is_old_gym": any(base.__module__.partition(".")[0] == "gym" for base in type(inner).__mro__),
         "metadata": _metadata(inner),
-        "uses_pybullet": "pybullet" in sys.modules and bool(_clients()),
+        "uses_pybullet": bool(connected()),
         "waivers": _waivers(author),
         **_place(author),
     }
@@ -47,12 +48,6 @@ def built(instance: Instance) -> Message:
             if leaf.low is not None and leaf.high is not None:
                 arrays[f"{name}/{i}/low"], arrays[f"{name}/{i}/high"] = leaf.low, leaf.high
     return header, arrays
-
-
-def _clients() -> list[int]:
-    from rlctl.check_env.bullet_clients import connected
-
-    return connected()
 
 
 def _metadata(env: Any) -> dict[str, Any]:

@@ -10,19 +10,6 @@ from rlctl.task.events import EventSettings
 from rlctl_manipulation.reach import Reach
 
 
-@pytest.fixture
-def make():
-    made = []
-
-    def build(task, randomize=False, **changes):
-        made.append(TaskEnv(task, events=EventSettings(randomize, changes)))
-        return made[-1]
-
-    yield build
-    for env in made:
-        env.close()
-
-
 class Arm(Task):
     """An arm that holds still above a cube, with every kind of change."""
 

@@ -7,21 +7,7 @@ from rlctl.errors import RecipeError
 from rlctl.task import Event, events
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
-from rlctl.task.events import EventSettings
 from tests.task.tasks import Cart
-
-
-@pytest.fixture
-def make():
-    made = []
-
-    def build(task, randomize=False, **changes):
-        made.append(TaskEnv(task, events=EventSettings(randomize, changes)))
-        return made[-1]
-
-    yield build
-    for env in made:
-        env.close()
 
 
 def mass(env):

@@ -47,19 +47,6 @@ class ByName(Clock):
     observation_layout = "dict"
 
 
-@pytest.fixture
-def make():
-    made = []
-
-    def build(task, randomize=False, **changes):
-        made.append(TaskEnv(task, events=EventSettings(randomize, changes)))
-        return made[-1]
-
-    yield build
-    for env in made:
-        env.close()
-
-
 def live(env, seed=0, steps=10):
     """Observations, shape (steps + 1, ...), of an episode whose k-th action is k / 10."""
     rows = [env.reset(seed=seed)[0]]

@@ -6,7 +6,7 @@ import re
 from typing import TypeVar
 
 from rlctl.check_env.evidence import Built, Evidence, Failure, Trajectory
-from rlctl.check_env.finding import NotApplicable, NotJudged
+from rlctl.check_env.finding import NotJudged
 
 T = TypeVar("T")
 
@@ -59,12 +59,6 @@ def why_missing(evidence: Evidence, study: str) -> str:
     if failed:
         return f"the environment failed in {failed[0].call} while it was tried: {failed[0].error}"
     return f"the process ended before {study!r} could be tried"
-
-
-def require_pybullet(evidence: Evidence) -> None:
-    """Raise `NotApplicable` for an environment that has no PyBullet client."""
-    if not built(evidence).uses_pybullet:
-        raise NotApplicable("no PyBullet world")
 
 
 def lost_display(failure: Failure) -> bool:
