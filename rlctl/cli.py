@@ -126,6 +126,7 @@ def train(
             metavar="RUN", help="Go on with a run instead: a folder, a task's name, or latest.", show_default=False
         ),
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Go on with a run even if its task has changed.")] = False,
     config: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(metavar="FILE", help="Recipe that goes over the task's own.", show_default=False),
@@ -176,6 +177,7 @@ def train(
         env_timeout_s=env_timeout,
         root=output,
         check=not no_check,
+        force=force,
     )
     show(run_training(request), json)
 

@@ -49,6 +49,17 @@ class TaskError(RlctlError):
     exit_code = 3
 
 
+class EpisodeFailed(TaskError):
+    """An environment failed in an episode that is known: to be lived again."""
+
+    def __init__(self, message: str, env: int, seed: int, step: int, *, details: str | None = None) -> None:
+        super().__init__(message, details=details)
+        self.env = env
+        self.seed = seed
+        self.step = step
+        """Number of the step that failed, from 1; 0 for the reset."""
+
+
 class DivergedError(RlctlError):
     """Training produced losses or weights that are not finite."""
 

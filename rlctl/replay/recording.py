@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rlctl import output
+from rlctl.errors import UsageError
 from rlctl.replay.difference import find_difference
 from rlctl.replay.live import Lived, live, present_versions, recorded_actions
 from rlctl.replay.report import Verification
@@ -28,14 +29,24 @@ def record_episode(episode: RecordedEpisode, path: Path, *, title: str, tell: Te
     with watched_env(spec, tell) as env:
         choose = recorded_actions(episode, env)
         watched = watch(env, spec, info.seed, choose, policy=info.policy, tell=tell)
-    if difference := find_difference(episode, watched.lived):
+    if info.failure:
+        tell(f"warning: {title}: it failed when it was recorded ({info.failure}), and did not now")
+    elif difference := find_difference(episode, watched.lived):
         tell(f"warning: {title}: lived again it is not what was recorded; {difference}")
     write_rrd(path, watched, title=title, tell=tell)
     return watched.lived
 
 
 def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Lived, Verification]:
-    """Live a recorded episode again in a fresh environment and compare every bit; `path` names it."""
+    """Live a recorded episode again in a fresh environment and compare every bit; `path` names it.
+
+    Raises `UsageError` for an episode of which only the actions are known, because it failed.
+    """
+    if episode.info.failure:
+        raise UsageError(
+            f"{path}: the episode failed ({episode.info.failure}), so there is nothing to compare; "
+            f"rlctl replay {path} lives its actions again"
+        )
     info, spec = episode.info, episode.info.env_spec()
     env = spec.make()
     try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import itertools
 import json
 import math
 import os
@@ -121,6 +122,21 @@ class _Worker:
             else:
                 self.guarded(episode, self.begin, seed)
         return []
+
+    def relive(self, episodes: list[tuple[int, int, int]], data: bytes) -> list[dict[str, Any]]:
+        """Begin episodes, (environment, seed, steps) each, and take the steps that led to where they were."""
+        row = self.arrays.action[0]
+        actions = iter(np.frombuffer(data, row.dtype).reshape(-1, *row.shape))
+        ended: list[dict[str, Any]] = []
+        for index, seed, steps in episodes:
+            episode = self.episodes[index - self.first]
+            self.arrays.next_seed[index] = -1
+            self.guarded(episode, self.begin, seed)
+            for action in itertools.islice(actions, steps):
+                self.arrays.action[index] = action
+                if episode.active:
+                    self.guarded(episode, self.step_one, ended)
+        return ended
 
     def begin(self, episode: _Episode, seed: int) -> None:
         self.arrays.inside[episode.index] = seed, 0
@@ -249,6 +265,8 @@ def _serve(job: dict[str, Any]) -> None:
                 worker = _built(job, json.loads(message))
                 answer(info=worker.info.model_dump())
                 continue
+            elif message.startswith(b"relive "):
+                ended = worker.relive(json.loads(message.removeprefix(b"relive ")), connection.recv_bytes())
             else:
                 ended = worker.reset(json.loads(message))
         except BaseException as error:

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from rlctl import errors
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import RlctlError, TaskError
+from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
 from rlctl.run.env_info import EnvInfo
 
@@ -176,6 +176,23 @@ class Workers:
             self._send(worker, json.dumps(pairs).encode())
         self._answers(by_worker, self.timeout_s, "resetting")
 
+    def relive(self, episodes: Mapping[int, tuple[int, NDArray[Any]]]) -> set[int]:
+        """Begin episodes, environment index -> (seed, actions so far), and take those steps.
+
+        Return the environments whose episode ended on the way: they are not where they were.
+        """
+        self._wait_until_built()
+        by_worker: dict[int, list[int]] = {}
+        for env in episodes:
+            by_worker.setdefault(self._owner[env], []).append(env)
+        for worker, envs in by_worker.items():
+            heads = [(env, episodes[env][0], len(episodes[env][1])) for env in envs]
+            dtype = self._arrays.action.dtype
+            self._send(worker, b"relive " + json.dumps(heads).encode())
+            self._send(worker, b"".join(episodes[env][1].astype(dtype).tobytes() for env in envs))
+        answers = self._answers(by_worker, self.timeout_s, "reliving episodes")
+        return {each["env"] for answer in answers.values() for each in answer.get("ended", ())}
+
     def step(self) -> list[EpisodeResult]:
         """Step every active environment with the row of `arrays.action`; return the episodes that ended.
 
@@ -253,29 +270,32 @@ class Workers:
 
     def _raised(self, error: dict[str, Any]) -> RlctlError:
         message = error["message"]
-        if "env" in error:
-            message += self._place(error["env"], error["seed"], error["step"])
         kind = getattr(errors, error["kind"], TaskError) if error["kind"] else TaskError
+        place = (error["env"], error["seed"], error["step"]) if "env" in error else None
+        details = None if error["kind"] else error["traceback"]
         if kind is TaskError and self._spec.task not in message.partition("\n")[0]:
             message = f"task {self._spec.task!r}: {message}"
-        details = None if error["kind"] else error["traceback"]
+        if place is not None:
+            message += self._told(*place)
+        if place is not None and kind is TaskError:
+            return EpisodeFailed(message, *place, details=details)
         result: RlctlError = kind(message, details=details)
         return result
 
-    def _place(self, env: int, seed: int, step: int) -> str:
+    def _told(self, env: int, seed: int, step: int) -> str:
         return (
             f"\nin environment {env}, episode seed {seed}, step {step}; "
             f"to see it alone: rlctl check-env {self._spec.task}"
         )
 
-    def _stopped_in(self, worker: int) -> str:
+    def _stopped(self, worker: int, message: str) -> TaskError:
         """Name the episode a worker was in when it stopped answering, or the environments it ran."""
         low, high = self._ranges[worker]
         if self._ready:
             for env, (seed, step) in enumerate(self._arrays.inside[low:high].tolist(), start=low):
                 if step >= 0:
-                    return self._place(env, seed, step)
-        return f"\nit ran the environments {low} to {high - 1}"
+                    return EpisodeFailed(message + self._told(env, seed, step), env, seed, step)
+        return TaskError(f"{message}\nit ran the environments {low} to {high - 1}")
 
     def _death(self, worker: int, doing: str) -> TaskError:
         try:
@@ -283,14 +303,15 @@ class Workers:
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         except subprocess.TimeoutExpired:
             how = "it closed its connection"
-        return TaskError(
-            f"task {self._spec.task!r}: worker {worker} died while {doing} ({how}){self._stopped_in(worker)}"
-        )
+        if how == "SIGKILL":
+            how += ": the system does that when memory runs out; fewer environments (--n-envs) need less"
+        return self._stopped(worker, f"task {self._spec.task!r}: worker {worker} died while {doing} ({how})")
 
     def _hang(self, workers: list[int], timeout_s: float, doing: str) -> TaskError:
-        return TaskError(
+        return self._stopped(
+            workers[0],
             f"task {self._spec.task!r}: no answer for {timeout_s:g} s while {doing}; "
-            f"if that may take so long, raise --env-timeout{self._stopped_in(workers[0])}"
+            "if that may take so long, raise --env-timeout",
         )
 
     def close(self, grace_s: float = 2.0) -> None:

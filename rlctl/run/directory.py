@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import fcntl
 import os
 import re
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -72,6 +72,11 @@ class RunDirectory:
             return []
         return sorted(each for each in folder.iterdir() if each.name.isdigit())
 
+    @property
+    def replay_segments(self) -> Path:
+        """The folder of the replay buffer that checkpoints share."""
+        return self.path / "checkpoints" / "replay"
+
     def episode_file(self, number: int) -> Path:
         """Return the file of a recorded episode."""
         return self.episodes / f"{number:06d}.npz"
@@ -113,13 +118,10 @@ class RunDirectory:
             raise ArtifactError(f"{self.path}: no checkpoint at step {which}; there are: {steps or 'none'}")
         return file
 
-    def remove_leftovers(self) -> None:
-        """Remove what a killed process left half-written; only for the holder of the lock."""
-        for place in [*self.path.glob(".*.part*"), *self.path.glob("*/.*.part*")]:
-            if place.is_dir():
-                shutil.rmtree(place)
-            else:
-                place.unlink()
+    def recover(self) -> None:
+        """Put right what a killed process left half-done; only for the holder of the lock."""
+        for folder in [self.path, *(each for each in self.path.glob("*") if each.is_dir()), self.replay_segments]:
+            files.recover(folder)
 
     def lock(self) -> RunLock:
         """Claim the folder for writing until the lock is released or the process ends."""
@@ -130,15 +132,29 @@ class RunLock:
     """Keeps a second process from writing a run; the system lets go of it when the process ends, however it ends."""
 
     def __init__(self, folder: Path) -> None:
-        self._descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        self._file = folder / ".lock"
+        self._descriptor = self._claim()
+
+    def _claim(self) -> int:
+        descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            owner = os.read(self._descriptor, 100).decode(errors="replace").strip()
-            os.close(self._descriptor)
-            raise UsageError(f"{folder}: another process is writing this run ({owner or 'unknown'})") from None
-        os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, f"pid {os.getpid()} on {os.uname().nodename}".encode(), 0)
+            owner = os.read(descriptor, 100).decode(errors="replace").strip()
+            os.close(descriptor)
+            raise UsageError(
+                f"{self._file.parent}: another process is writing this run ({owner or 'unknown'})"
+            ) from None
+        with contextlib.suppress(OSError):  # a full disk: only the name of the owner is missing then
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"pid {os.getpid()} on {os.uname().nodename}".encode(), 0)
+        return descriptor
+
+    def renew(self) -> None:
+        """Claim the folder again if it, or its lock file, was removed meanwhile."""
+        if not self._file.exists():
+            self.release()
+            self._descriptor = self._claim()
 
     def release(self) -> None:
         """Let go of the folder; a second call does nothing."""

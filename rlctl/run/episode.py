@@ -41,6 +41,8 @@ class EpisodeInfo(pydantic.BaseModel):
     success: bool | None = None
     total_reward: float
     term_names: list[str] = []
+    failure: str = ""
+    """What ended an episode that its environment did not survive: only its actions are known."""
     versions: dict[str, str] = {}
 
     @classmethod

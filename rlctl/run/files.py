@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import hashlib
 import io
 import json
 import os
@@ -19,17 +21,25 @@ from rlctl.errors import ArtifactError
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file beside its place, flush it to the disk, and rename it into place."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    os.makedirs(path.parent, exist_ok=True)
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with beside.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+        write_new(beside, content)
+        os.replace(beside, path)
+    except BaseException:
+        _remove(beside)
+        raise
     _sync_folder(path.parent)
+
+
+def write_new(path: Path, content: bytes) -> None:
+    """Write a file and flush it to the disk: for a folder that is not in its place yet."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    try:
+        _write_all(descriptor, content)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_text(path: Path, content: str) -> None:
@@ -70,45 +80,141 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         raise ArtifactError(f"{path}: damaged, or not an .npz file: {error}") from None
 
 
+_OLD = ".old.part"
+
+
 @contextlib.contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Give a folder to fill; it takes its place when the block ends well, and is removed when it does not."""
+    """Give a folder to fill by `write_new`; it takes its place when the block ends well, and is removed if not."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir(parents=True)
+    remove_tree(beside)
+    os.makedirs(beside)
     try:
         yield beside
-        for file in beside.iterdir():
-            _sync(file)
-        _sync(beside)
-        if path.exists():
-            shutil.rmtree(path)
-        beside.replace(path)
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        sync(beside)
+        _take_place(beside, path)
+    except BaseException:
+        remove_tree(beside)
+        raise
     _sync_folder(path.parent)
 
 
-def append_line(path: Path, line: str) -> None:
-    """Append a line in one write."""
-    with path.open("a", encoding="utf-8") as file:
-        file.write(line + "\n")
+def _take_place(new: Path, path: Path) -> None:
+    # No system call that Python has swaps two folders. Whoever finds the old one aside puts it back: `recover`.
+    aside = path.with_name(f".{path.name}{_OLD}")
+    if path.exists():
+        os.rename(path, aside)
+    try:
+        os.rename(new, path)
+    except OSError:
+        if aside.exists():
+            os.rename(aside, path)
+        raise
+    remove_tree(aside)
+
+
+def recover(folder: Path) -> None:
+    """Put back what `whole_folder` had set aside, and remove what was half-written, when its process was killed."""
+    for place in folder.glob(".*.part*"):
+        original = place.with_name(place.name[1:].removesuffix(_OLD))
+        if place.name.endswith(_OLD) and not original.exists():
+            os.rename(place, original)
+        elif place.is_dir() and not place.is_symlink():
+            remove_tree(place)
+        else:
+            _remove(place)
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a folder and all in it, if it is there."""
+    # It is moved aside first: what is removed half must not be taken for whole.
+    if not path.name.startswith("."):
+        hidden = path.with_name(f".{path.name}.{os.getpid()}.part")
+        shutil.rmtree(hidden, ignore_errors=True)
+        with contextlib.suppress(FileNotFoundError):
+            os.rename(path, hidden)
+        path = hidden
+    shutil.rmtree(path, ignore_errors=True)
+
+
+def append(path: Path, content: bytes, size: int) -> None:
+    """Append to the `size` bytes that a file has, and cut it back to them if the disk does not take it all."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
+    try:
+        if os.lseek(descriptor, 0, os.SEEK_END) > size:
+            os.ftruncate(descriptor, size)
+        os.lseek(descriptor, size, os.SEEK_SET)
+        try:
+            _write_all(descriptor, content)
+        except OSError:
+            with contextlib.suppress(OSError):  # the next one to append cuts it back again
+                os.ftruncate(descriptor, size)
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def truncate(path: Path, size: int) -> None:
+    """Cut a file back to its first `size` bytes."""
+    descriptor = os.open(path, os.O_WRONLY)
+    try:
+        os.ftruncate(descriptor, size)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_with(path: Path, write: Callable[[Path], None]) -> None:
     """Let `write` make a file under a temporary name in the same folder, then rename it into place."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    os.makedirs(path.parent, exist_ok=True)
     beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # keeps the suffix: some writers look at it
     try:
         write(beside)
-        _sync(beside)
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+        sync(beside)
+        os.replace(beside, path)
+    except BaseException:
+        _remove(beside)
+        raise
     _sync_folder(path.parent)
 
 
-def _sync(path: Path) -> None:
+def _write_all(descriptor: int, content: bytes) -> None:
+    rest = memoryview(content)
+    while rest:
+        written = os.write(descriptor, rest)
+        if written == 0:
+            raise OSError(errno.EIO, "the disk takes nothing")
+        rest = rest[written:]
+
+
+def digest(content: bytes) -> str:
+    """Return the sha256 of some content, as hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def check_digest(path: Path, expected: str) -> None:
+    """Raise `ArtifactError` if a file is not there, or not what it was when `expected` was its digest."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ArtifactError(f"{path}: {error.strerror or error}") from None
+    if digest(content) != expected:
+        raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if it is there."""
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(path)
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):  # the error that led here is the one to tell
+        os.unlink(path)
+
+
+def sync(path: Path) -> None:
+    """Flush a file or a folder to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -117,6 +223,9 @@ def _sync(path: Path) -> None:
 
 
 def _sync_folder(path: Path) -> None:
-    # Some file systems refuse to sync a folder; the rename itself has happened.
-    with contextlib.suppress(OSError):
-        _sync(path)
+    try:
+        sync(path)
+    except OSError as error:
+        # Some file systems cannot sync a folder; the rename itself has happened.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM):
+            raise

@@ -37,6 +37,15 @@ State = tuple[NDArray[np.float32], ...]
 """Recurrent state: arrays of shape (layers, rows, size)."""
 
 
+class Score(pydantic.BaseModel):
+    """What a policy reached in the evaluation that it was kept for."""
+
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+    success: float | None
+    mean_return: float
+
+
 class PolicyInfo(pydantic.BaseModel):
     """Everything about a policy but its numbers."""
 
@@ -61,6 +70,8 @@ class PolicyInfo(pydantic.BaseModel):
     stages: list[StageContent] = []
     """Stages of the curriculum; the fields above are those of the last."""
     training_steps: int = 0
+    evaluation: Score | None = None
+    """Of the best policy of a run: why it is the best."""
     versions: dict[str, str] = {}
 
     def env_spec(self, task: str | None = None, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
@@ -112,14 +123,19 @@ def versions() -> dict[str, str]:
 
 
 def save_policy(path: Path, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
-    """Write a policy file, whole or not at all.
+    """Write a policy file, whole or not at all; see `policy_bytes`."""
+    files.write_bytes(path, policy_bytes(info, tensors))
+
+
+def policy_bytes(info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> bytes:
+    """Return the content of a policy file.
 
     `tensors` has the network's under `policy/`, and mean and variance per observation key under `normalize/`.
     """
     from safetensors.numpy import save
 
     contiguous = {name: np.asarray(value, order="C") for name, value in tensors.items()}
-    files.write_bytes(path, save(contiguous, metadata={"rlctl": info.model_dump_json()}))
+    return save(contiguous, metadata={"rlctl": info.model_dump_json()})
 
 
 def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:

@@ -45,6 +45,8 @@ class Evaluation(_Section):
 
     every_steps: int | None = Field(None, ge=1)
     episodes: int = Field(100, ge=1)
+    deterministic: bool = True
+    """Whether to take the mean action, and not a sample."""
 
 
 class Checkpoints(_Section):

@@ -1,190 +1,272 @@
-"""Checkpoints: everything to go on with a training, without pickle.
+"""Checkpoints: everything to go on with a training exactly as if it had never stopped, without pickle.
 
-A folder with `policy.safetensors` (a policy file), `state.safetensors` (optimisers and other tensors), `state.json`
-(counters, and each file's sha256) and, for off-policy algorithms, `replay.npz`. It appears whole or not at all.
+A folder with `policy.safetensors` (a policy file), `state.safetensors` (optimisers, generators, statistics, the actions
+of running episodes) and `state.json` (plain data, and each file's sha256); it appears whole or not at all. The replay
+buffer of an off-policy algorithm is in segments beside the folders.
 """
 
 from __future__ import annotations
 
-import hashlib
-import shutil
+import dataclasses
+import json
+import platform
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pydantic
 import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from rlctl.errors import ArtifactError
 from rlctl.run import files
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import PolicyInfo, save_policy
-from rlctl.train.pack import observation_statistics
+from rlctl.run.policy import PolicyInfo, policy_bytes, versions
+from rlctl.train import replay_segments, snapshot
+from rlctl.train.curriculum import begin_next_episodes
+from rlctl.train.progress import Progress
+from rlctl.train.replay_segments import ReplaySegments, Segment
+from rlctl.train.snapshot import Tensors
+from rlctl.train.vec_env import WorkerVecEnv
 
 FORMAT = 1
-_POLICY, _STATE, _TENSORS, _REPLAY = "policy.safetensors", "state.json", "state.safetensors", "replay.npz"
-_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls", "exploration_rate")
+_POLICY, _STATE, _TENSORS = "policy.safetensors", "state.json", "state.safetensors"
 
 
-def save(
-    run: RunDirectory,
-    model: BaseAlgorithm,
-    packed: tuple[PolicyInfo, dict[str, Any]],
-    progress: dict[str, Any],
-    keep: int,
-) -> Path:
-    """Write a checkpoint of the present step and remove the oldest beyond `keep`; return its folder.
+class State(pydantic.BaseModel):
+    """What `state.json` says."""
 
-    `progress` is what the training loop wants back, as JSON.
-    """
-    target = run.checkpoint(model.num_timesteps)
-    tensors, structure = _flatten(model.get_parameters())
-    with files.whole_folder(target) as folder:
-        save_policy(folder / _POLICY, *packed)
-        files.write_bytes(folder / _TENSORS, save_tensors({**tensors, **_normalizer_tensors(model)}))
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+    format: int = FORMAT
+    step: int
+    at_end: bool
+    """Whether it was saved after the last update, and not between two."""
+    model: dict[str, Any]
+    """Plain data of `snapshot.take`."""
+    progress: Progress
+    segments: list[Segment] = []
+    """Where the replay buffer is."""
+    computed_with: dict[str, str]
+    """What the last bits of a result depend on: versions, processor, threads."""
+    sha256: dict[str, str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint that was read and found whole."""
+
+    folder: Path
+    state: State
+    tensors: Tensors = dataclasses.field(repr=False)
+
+    @property
+    def progress(self) -> Progress:
+        return self.state.progress
+
+
+class Checkpoints:
+    """Writes the checkpoints of a training, and puts one back."""
+
+    def __init__(self, run: RunDirectory, model: BaseAlgorithm, env: WorkerVecEnv, keep: int) -> None:
+        self._run = run
+        self._model = model
+        self._env = env
+        self._keep = keep
+        self._replay: ReplaySegments | None = None
         if isinstance(model, OffPolicyAlgorithm):
-            files.write_npz(folder / _REPLAY, _replay_arrays(model))
-        state = {
-            "format": FORMAT,
-            "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
-            "parameters": structure,
-            "progress": progress,
-            "sha256": {file.name: _digest(file) for file in sorted(folder.iterdir())},
+            assert model.replay_buffer is not None  # SB3 makes it in its constructor
+            self._replay = ReplaySegments(run.replay_segments, model.replay_buffer)
+
+    @property
+    def _added(self) -> int:
+        """How many transitions the replay buffer has been given: one for each step of all environments."""
+        return self._model.num_timesteps // self._env.num_envs
+
+    def save(self, packed: tuple[PolicyInfo, Tensors], progress: Progress, *, at_end: bool) -> Path:
+        """Write a checkpoint of the present boundary and remove the oldest; return its folder.
+
+        Raises `OSError` if the disk does not take it, and `DivergedError` if a number in it is not finite.
+        """
+        target = self._run.checkpoint(self._model.num_timesteps)
+        tensors, plain = snapshot.take(self._model)
+        tensors |= _environment_tensors(self._env)
+        segments: list[Segment] = []
+        if self._replay is not None:
+            segments = self._replay.save(self._added)
+            tensors |= replay_segments.hindsight_tensors(self._replay.buffer)
+        contents = {
+            _POLICY: policy_bytes(*packed),
+            _TENSORS: save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()}),
         }
-        files.write_json(folder / _STATE, state)
-    for old in run.checkpoints()[:-keep]:
-        shutil.rmtree(old)
-    return target
+        state = State(
+            step=self._model.num_timesteps,
+            at_end=at_end,
+            model=plain,
+            progress=progress,
+            segments=segments,
+            computed_with=self.computed_with(),
+            sha256={name: files.digest(content) for name, content in contents.items()},
+        )
+        with files.whole_folder(target) as folder:
+            for name, content in contents.items():
+                files.write_new(folder / name, content)
+            files.write_new(folder / _STATE, _sealed(state.model_dump(mode="json")))
+        return target
+
+    def computed_with(self) -> dict[str, str]:
+        """Return what the last bits of this training's results depend on."""
+        return {
+            **versions(),
+            "machine": platform.machine(),
+            "processor": torch.backends.cpu.get_cpu_capability(),
+            "threads": str(torch.get_num_threads()),
+            "device": str(self._model.device),
+        }
+
+    def remove_old(self) -> None:
+        """Remove all checkpoints but the newest few, and the segments of the replay buffer that none of them names."""
+        for old in self._run.checkpoints()[: -self._keep]:
+            files.remove_tree(old)
+        if self._replay is not None:
+            replay_segments.remove_unnamed(self._run.replay_segments, _named_segments(self._run))
+
+    def put_back(self, checkpoint: Checkpoint) -> str | None:
+        """Put model, replay buffer and environments where a checkpoint has them.
+
+        Return, if an environment did not come back to where it was, what to tell: all begin their next episodes then.
+        """
+        model, tensors = self._model, checkpoint.tensors
+        try:
+            snapshot.put_back(model, tensors, checkpoint.state.model)
+            if self._replay is not None:
+                self._replay.load(checkpoint.state.segments, self._added)
+                replay_segments.put_back_hindsight(self._replay.buffer, tensors)
+            strayed = _put_back_environments(self._env, tensors)
+        except (ArtifactError, KeyError) as error:
+            raise ArtifactError(f"{checkpoint.folder}: {error}") from None
+        if (normalizer := model.get_vec_normalize_env()) is not None:
+            normalizer.old_obs = self._env.workers.observations()
+        if strayed is not None:
+            begin_next_episodes(model)
+            if self._replay is not None:
+                self._replay.changed_last(self._added)
+        return strayed
 
 
-def newest(run: RunDirectory) -> tuple[Path, dict[str, Any]]:
-    """Return the newest undamaged checkpoint and its state; raises `ArtifactError` if there is none."""
-    damage: ArtifactError | None = None
+def newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
+    """Return the newest undamaged checkpoint, and what is wrong with those after it; None where there is none yet.
+
+    Raises `ArtifactError` if all are damaged.
+    """
+    damage: list[str] = []
     for folder in reversed(run.checkpoints()):
         try:
-            return folder, read_state(folder)
+            return read(folder), damage
         except ArtifactError as error:
-            damage = damage or error
-    raise damage or ArtifactError(f"{run.path}: no checkpoint yet; start anew with rlctl train")
+            damage.append(str(error))
+    if damage:
+        raise ArtifactError(f"{damage[0]}\nnone of the checkpoints of {run.path} can be read; train anew")
+    return None, []
 
 
-def read_state(folder: Path) -> dict[str, Any]:
-    """Read and check a checkpoint's `state.json` and its files' hashes."""
-    state = files.read_json(folder / _STATE)
-    if not isinstance(state, dict) or not isinstance(state.get("format"), int):
-        raise ArtifactError(f"{folder}: not a checkpoint of rlctl")
-    if state["format"] > FORMAT:
-        raise ArtifactError(f"{folder}: checkpoint format {state['format']} is newer than this rlctl reads ({FORMAT})")
-    for name, digest in state["sha256"].items():
-        if not (folder / name).is_file():
-            raise ArtifactError(f"{folder / name}: missing")
-        if _digest(folder / name) != digest:
-            raise ArtifactError(f"{folder / name}: damaged: its sha256 is not the one it was saved with")
+def read(folder: Path) -> Checkpoint:
+    """Read a checkpoint and check all of it; raises `ArtifactError` if something is missing, damaged or not ours."""
+    state = _read_state(folder)
+    for name in (_POLICY, _TENSORS):
+        files.check_digest(folder / name, state.sha256.get(name, ""))
+    replay_segments.check(folder.parent / "replay", state.segments)
+    try:
+        tensors = load_tensors((folder / _TENSORS).read_bytes())
+    except (OSError, SafetensorError) as error:
+        raise ArtifactError(f"{folder / _TENSORS}: damaged: {error}") from None
+    return Checkpoint(folder, state, tensors)
+
+
+def _read_state(folder: Path) -> State:
+    file = folder / _STATE
+    sealed = files.read_json(file)
+    if not isinstance(sealed, dict) or not isinstance(sealed.get("state"), dict):
+        raise ArtifactError(f"{file}: damaged, or not a checkpoint of rlctl")
+    content = sealed["state"]
+    if isinstance(content.get("format"), int) and content["format"] > FORMAT:
+        raise ArtifactError(f"{file}: checkpoint format {content['format']} is newer than this rlctl reads ({FORMAT})")
+    if sealed.get("sha256") != _seal(content):
+        raise ArtifactError(f"{file}: damaged: its sha256 is not the one it was saved with")
+    try:
+        state = State.model_validate(content)
+    except pydantic.ValidationError as error:
+        raise ArtifactError(f"{file}: not a checkpoint of rlctl: {str(error).splitlines()[0]}") from None
+    if state.step != int(folder.name):
+        raise ArtifactError(f"{folder}: this is the checkpoint of step {state.step}, under another name")
     return state
 
 
-def restore(model: BaseAlgorithm, folder: Path, state: dict[str, Any]) -> None:
-    """Put weights, optimisers, normalisation, counters and replay buffer of a checkpoint into a model."""
-    tensors = load_tensors((folder / _TENSORS).read_bytes())
-    try:
-        model.set_parameters(_unflatten(state["parameters"], tensors), exact_match=True, device=model.device)
-        _restore_normalizer(model, tensors)
-    except (KeyError, ValueError, RuntimeError) as error:
-        raise ArtifactError(f"{folder}: does not fit this recipe: {' '.join(str(error).split())[:200]}") from None
-    for name, value in state["counters"].items():
-        setattr(model, name, value)
-    if isinstance(model, OffPolicyAlgorithm):
-        _restore_replay(model, files.read_npz(folder / _REPLAY))
+def _sealed(state: dict[str, Any]) -> bytes:
+    return json.dumps({"sha256": _seal(state), "state": state}).encode()
 
 
-def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+def _seal(state: Any) -> str:
+    return files.digest(json.dumps(state, sort_keys=True).encode())
 
 
-def _flatten(value: Any, path: str = "parameters") -> tuple[dict[str, Any], Any]:
-    """Split nested state dicts into tensors by path, and JSON that refers to them."""
-    if isinstance(value, torch.Tensor):
-        return {path: value.detach().cpu().numpy().copy()}, {"tensor": path}
-    if isinstance(value, dict):
-        tensors: dict[str, Any] = {}
-        entries = []
-        for key, each in value.items():
-            below, structure = _flatten(each, f"{path}/{key}")
-            tensors.update(below)
-            entries.append([key, structure])
-        return tensors, {"dict": entries}
-    if isinstance(value, list | tuple):
-        below, structure = _flatten(dict(enumerate(value)), path)
-        kind = "list" if isinstance(value, list) else "tuple"
-        return below, {kind: [each for _, each in structure["dict"]]}
-    return {}, {"value": value}
+def _named_segments(run: RunDirectory) -> list[Segment]:
+    named: list[Segment] = []
+    for folder in run.checkpoints():
+        try:
+            named += _read_state(folder).segments
+        except ArtifactError:  # a damaged checkpoint needs no segments any more
+            continue
+    return named
 
 
-def _unflatten(structure: Any, tensors: dict[str, Any]) -> Any:
-    ((kind, content),) = structure.items()
-    if kind == "tensor":
-        return torch.from_numpy(tensors[content].copy())
-    if kind == "dict":
-        return {key: _unflatten(each, tensors) for key, each in content}
-    if kind in ("list", "tuple"):
-        items = [_unflatten(each, tensors) for each in content]
-        return items if kind == "list" else tuple(items)
-    return content
+def differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
+    """Return `torch 2.13.0 -> 2.14.0` for each entry that is another one now."""
+    names = dict.fromkeys([*before, *now])
+    return [
+        f"{name} {before.get(name, 'none')} -> {now.get(name, 'none')}"
+        for name in names
+        if before.get(name) != now.get(name)
+    ]
 
 
-def _normalizer_tensors(model: BaseAlgorithm) -> dict[str, Any]:
-    normalizer = model.get_vec_normalize_env()
-    if normalizer is None:
-        return {}
-    tensors: dict[str, Any] = {"normalize/returns": normalizer.returns}
-    for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
-        tensors[f"normalize/{key}/mean"] = np.asarray(rms.mean)
-        tensors[f"normalize/{key}/var"] = np.asarray(rms.var)
-        tensors[f"normalize/{key}/count"] = np.asarray(rms.count)
+def _environment_tensors(env: WorkerVecEnv) -> Tensors:
+    """Return the episodes that environments are in, what was done in them, and what was observed last."""
+    taken = env.history.all()
+    known = [actions for actions in taken if actions is not None and len(actions)]
+    row = env.workers.arrays.action[:0]
+    tensors = {
+        "environments/episodes_started": np.array(env.episodes_started, np.int64),
+        "environments/steps": np.array([-1 if actions is None else len(actions) for actions in taken], np.int64),
+        "environments/actions": np.concatenate([row, *known]),
+    }
+    for key, observation in env.workers.arrays.observation.items():
+        tensors[f"environments/observation/{key}"] = observation
     return tensors
 
 
-def _restore_normalizer(model: BaseAlgorithm, tensors: dict[str, Any]) -> None:
-    normalizer = model.get_vec_normalize_env()
-    if normalizer is None:
-        return
-    normalizer.returns = tensors["normalize/returns"].copy()
-    for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
-        rms.mean = tensors[f"normalize/{key}/mean"].copy()
-        rms.var = tensors[f"normalize/{key}/var"].copy()
-        rms.count = float(tensors[f"normalize/{key}/count"])
-
-
-_REPLAY_FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-
-
-def _replay_arrays(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    buffer = _buffer(model)
-    filled = buffer.size()
-    arrays = {"position": np.array(buffer.pos), "full": np.array(buffer.full)}
-    for name in _REPLAY_FIELDS:
-        values = getattr(buffer, name)
-        if isinstance(values, dict):
-            arrays.update({f"{name}/{key}": value[:filled] for key, value in values.items()})
-        else:
-            arrays[name] = values[:filled]
-    return arrays
-
-
-def _restore_replay(model: OffPolicyAlgorithm, arrays: dict[str, Any]) -> None:
-    buffer = _buffer(model)
-    for name, stored in arrays.items():
-        field, _, key = name.partition("/")
-        if field in _REPLAY_FIELDS:
-            values = getattr(buffer, field)
-            (values[key] if key else values)[: len(stored)] = stored
-    buffer.pos, buffer.full = int(arrays["position"]), bool(arrays["full"])
-
-
-def _buffer(model: OffPolicyAlgorithm) -> ReplayBuffer | DictReplayBuffer:
-    assert model.replay_buffer is not None  # SB3 makes it in its constructor
-    return model.replay_buffer
+def _put_back_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
+    """Live the running episodes again; return what to tell if an environment ended up elsewhere."""
+    steps = tensors["environments/steps"].tolist()
+    if len(steps) != env.num_envs:
+        raise ArtifactError(f"it is of {len(steps)} environments, not {env.num_envs}")
+    started = tensors["environments/episodes_started"].tolist()
+    if min(steps) < 0:
+        env.episodes_started = started
+        return f"environment {steps.index(-1)} is in an episode too long to be lived again"
+    actions: list[NDArray[Any]] = np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])
+    strayed = set(env.relive(started, actions))
+    for key, observation in env.workers.arrays.observation.items():
+        before = tensors[f"environments/observation/{key}"]
+        strayed.update(index for index in range(env.num_envs) if not np.array_equal(before[index], observation[index]))
+    if not strayed:
+        return None
+    return (
+        f"environment {min(strayed)} did not come back to where it was with its seed and actions, "
+        "so all begin their next episodes"
+    )

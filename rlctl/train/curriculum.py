@@ -43,6 +43,11 @@ class Curriculum:
         return self._progress.stage
 
     @property
+    def spec(self) -> EnvSpec:
+        """What the environments of the present stage are made from."""
+        return self._specs[max(self.number, 1) - 1]
+
+    @property
     def title(self) -> str:
         """The present stage for people: `stage 2 of 3: tolerance 0.1`."""
         return title(self.number, self.stages)

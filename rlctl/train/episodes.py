@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections import deque
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
+from rlctl.errors import ArtifactError
 from rlctl.rollout.collect import Episode
+from rlctl.run import files
 from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.run.policy import versions
 
 _LATEST = 1000
+_POLICY = "training step "
 
 
 class EpisodeKeeper:
@@ -38,6 +45,14 @@ class EpisodeKeeper:
         """Write the last `count` episodes of the last evaluation, and return them with their files."""
         return [(self._write(episode), episode) for episode in list(self._latest)[-count:]] if count else []
 
+    def keep_failed(self, spec: EnvSpec, seed: int, actions: NDArray[Any], failure: str) -> Path:
+        """Write the actions of an episode that an environment did not survive, shape (steps, ...); return the file."""
+        nothing = np.zeros(0)
+        info = EpisodeInfo.of(
+            spec, seed=seed, policy="training", total_reward=0.0, versions=versions(), failure=failure
+        )
+        return self._write(RecordedEpisode(info, actions, nothing, nothing, nothing.reshape(0, 0)))
+
     def _write(self, episode: RecordedEpisode) -> Path:
         path = self.run.episode_file(self.run.next_episode_number())
         save_episode(path, episode)
@@ -50,10 +65,22 @@ class EpisodeKeeper:
         info = EpisodeInfo.of(
             spec,
             seed=episode.seed,
-            policy=f"training step {steps}",
+            policy=f"{_POLICY}{steps}",
             success=episode.result.success,
             total_reward=episode.result.total_reward,
             term_names=list(self.info.reward_weights),
             versions=versions(),
         )
         return RecordedEpisode(info, trajectory.actions, trajectory.observations, trajectory.rewards, trajectory.terms)
+
+
+def remove_after(run: RunDirectory, steps: int) -> None:
+    """Remove the episodes of evaluations after a training step: a resumed run lives them again."""
+    for file in run.episodes.glob("*.npz"):
+        try:
+            policy = load_episode(file).info.policy
+        except ArtifactError:
+            continue  # not one that a training has written whole
+        step = policy.removeprefix(_POLICY)
+        if policy.startswith(_POLICY) and step.isdigit() and int(step) > steps:
+            files.remove(file)

@@ -1,36 +1,37 @@
 """What happens at the boundaries between updates: metrics, evaluation, checkpoints, stopping.
 
 SB3 calls `on_rollout_start` after each update and before the next step. All of rlctl's own work is done there, so
-that a checkpoint never falls inside a rollout, and a run can be resumed.
+that a checkpoint never falls inside a rollout. What is decided there is decided by steps, never by the clock, but for
+when to write a checkpoint, which changes nothing: so a run that was resumed is the run that was never stopped.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from rlctl.errors import ArtifactError, DivergedError, Interrupted
+from rlctl.errors import ArtifactError, DivergedError, EpisodeFailed, Interrupted, TaskError
 from rlctl.eval.statistics import mean_return, mean_terms, success_rate
-from rlctl.rollout.collect import Episode, run_episodes
-from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.rollout.collect import Episode
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import BatchActor, PolicyInfo, save_policy
+from rlctl.run.policy import Score, save_policy
 from rlctl.run.recipe import ON_POLICY, Recipe
-from rlctl.run.torch_policy import Normalizer, TorchPolicy
-from rlctl.train import checkpoint
+from rlctl.train import snapshot
+from rlctl.train.checkpoint import Checkpoint
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
 from rlctl.train.episodes import EpisodeKeeper
+from rlctl.train.evaluation import Evaluator
 from rlctl.train.pack import pack
-from rlctl.train.progress import Progress, append_row, table_size
+from rlctl.train.progress import Progress
+from rlctl.train.saving import Packed, Saver
 from rlctl.train.vec_env import WorkerVecEnv
 
 _LOSSES = (
@@ -47,75 +48,80 @@ class TrainingStopped(Exception):
     """Ends SB3's `learn` at a boundary; nothing is wrong."""
 
 
+class _Asked(Exception):
+    """A signal came while the evaluation episodes were lived."""
+
+
 class TrainingLoop(BaseCallback):
     """Runs at every boundary; raises `TrainingStopped` when the recipe's success rate holds."""
 
     def __init__(
         self,
+        model: BaseAlgorithm,
         run: RunDirectory,
         recipe: Recipe,
         env: WorkerVecEnv,
-        eval_workers: Workers,
+        evaluator: Evaluator,
+        saver: Saver,
         progress: Progress,
         display: Display,
         curriculum: Curriculum,
+        resumed: Checkpoint | None = None,
     ) -> None:
         super().__init__()
+        self.model = model
         self.run_directory = run
         self.recipe = recipe
         self.env = env
+        self.saver = saver
         self.progress = progress
         self.display = display
         self.curriculum = curriculum
         self.stop_signal: int | None = None
         self.episodes = EpisodeKeeper(run, curriculum.goal_spec, curriculum.goal)
-        self._eval_workers = eval_workers
+        self._evaluator = evaluator
+        self._resumed = resumed
+        self._told_to_stop = False
         self._started = time.monotonic() - progress.seconds
-        self._last_row = (time.monotonic(), 0)
-        self._next_row = 0
-        self._recent: list[EpisodeResult] = []
-        self._boundary_steps = 0
-        self._unsaved: str | None = None
+        self._last_row = (time.monotonic(), model.num_timesteps)
 
     def _on_step(self) -> bool:
-        self.display.steps(self.num_timesteps)
+        self.display.steps(self.model.num_timesteps)
+        if self.stop_signal is not None and not self._told_to_stop:
+            self._told_to_stop = True
+            self.display.message("stopping after this update, with a checkpoint; once more to stop now")
         return True
 
-    def _on_training_start(self) -> None:
-        self._started_at = self.model.num_timesteps
-        self._last_row = (time.monotonic(), self._started_at)
-        self._next_row = self._started_at
-
     def _on_rollout_start(self) -> None:
-        # The first boundary comes before any step, or right after a resume, and repeats what is there.
-        first = self.model.num_timesteps == self._started_at
-        self._boundary_steps = self.model.num_timesteps
-        if not first:
+        resumed, self._resumed = self._resumed, None
+        if resumed is not None and not resumed.state.at_end:
+            # gSDE has just drawn, as it had when the checkpoint was taken.
+            snapshot.put_back_randomness(self.model, resumed.tensors, resumed.state.model)
+        if self.model.num_timesteps > 0:
             self.boundary()
 
     def boundary(self) -> None:
-        """Do everything that is due after an update."""
+        """Do everything that is due after an update, and that a checkpoint resumed from does not say was done."""
         steps = self.model.num_timesteps
         self._take_ended()
         stage_done = self.curriculum.is_due(steps)
-        on_policy = self.recipe.algo in ON_POLICY
-        if on_policy or steps >= self._next_row or stage_done:
-            self.check_finite()
-            self._write_metrics(steps)
-            self._next_row = steps + max(1, self.recipe.total_timesteps // _OFF_POLICY_ROWS)
+        self._write_metrics_if_due(steps, stage_done)
         if stage_done:
             self._begin_next_stage(steps)
         self._stop_if_asked()
         if steps >= self.progress.next_eval:
             self.evaluate()
+            if self._is_good_enough():
+                self._save_the_end(at_end=False)
+                raise TrainingStopped
             self.save_checkpoint()
             self._stop_if_asked()
-            if self.recipe.stop_success is not None and self.progress.good_in_a_row >= 2:
-                raise TrainingStopped
+        elif self.saver.checkpoint_is_due():
+            self.save_checkpoint()
 
     def _take_ended(self) -> None:
         ended = self.env.take_ended()
-        self._recent += ended
+        self.progress.recent += ended
         self.curriculum.count(ended)
         if warning := self.curriculum.warning():
             self.display.message(warning)
@@ -125,37 +131,41 @@ class TrainingLoop(BaseCallback):
         begin_next_episodes(self.model)
         self.display.stage(*self.curriculum.go_on(steps))
 
+    def _is_good_enough(self) -> bool:
+        return self.recipe.stop_success is not None and self.progress.good_in_a_row >= 2
+
     def _stop_if_asked(self) -> None:
-        if self.stop_signal is None:
-            return
-        saved = self.save_checkpoint()
+        if self.stop_signal is not None:
+            self._stop(self.stop_signal, at_end=False)
+
+    def _stop(self, number: int, *, at_end: bool) -> None:
+        saved = self.save_checkpoint(at_end=at_end)
         told = "checkpoint saved" if saved else "the last saved checkpoint stands"
         raise Interrupted(
             f"interrupted at step {self.model.num_timesteps:,}; {told}. Go on with: "
             f"rlctl train --resume {self.run_directory.path}",
-            self.stop_signal,
+            number,
         )
 
     def finish(self) -> None:
         """Evaluate and save what the training ended with; raises `ArtifactError` if it cannot be saved."""
-        self._boundary_steps = self.model.num_timesteps
-        self.check_finite()
+        steps = self.model.num_timesteps
         self._take_ended()
-        self._write_metrics(self.model.num_timesteps)
-        if self.curriculum.is_due(self.model.num_timesteps):  # for a resume that makes the run longer
-            self.display.stage(*self.curriculum.go_on(self.model.num_timesteps))
-        self.evaluate()
-        self.logger.dump(self.model.num_timesteps)
-        if not self.save_checkpoint():
-            raise ArtifactError(
-                f"{self.run_directory.path}: the training is done, but could not be saved: {self._unsaved}"
-            )
+        stage_done = self.curriculum.is_due(steps)
+        self._write_metrics_if_due(steps, True)
+        if stage_done:  # for a resume that makes the run longer
+            self.display.stage(*self.curriculum.go_on(steps))
+        if self.progress.last_eval < steps:
+            self.evaluate(at_end=True)
+        self.logger.dump(steps)
+        self._save_the_end(at_end=True)
 
-    def save_after_fault(self) -> None:
-        """Save the last boundary: what was collected since is lost, the network is still that of the boundary."""
-        if self._boundary_steps > 0:
-            self.model.num_timesteps = self._boundary_steps
-            self.save_checkpoint()
+    def _save_the_end(self, *, at_end: bool) -> None:
+        self.progress.done = True
+        if not self.save_checkpoint(at_end=at_end):
+            raise ArtifactError(
+                f"{self.run_directory.path}: the training is done, but could not be saved: {self.saver.trouble}"
+            )
 
     def check_finite(self) -> None:
         """Raise `DivergedError` if a weight or a loss is not finite."""
@@ -174,10 +184,19 @@ class TrainingLoop(BaseCallback):
             f"What was saved before is in {self.run_directory.path}"
         )
 
+    def _write_metrics_if_due(self, steps: int, anyway: bool) -> None:
+        due = anyway or self.recipe.algo in ON_POLICY or steps >= self.progress.next_row
+        if due and steps > self.progress.last_row:
+            self.check_finite()
+            self._write_metrics(steps)
+            self.progress.last_row = steps
+            self.progress.next_row = steps + max(1, self.recipe.total_timesteps // _OFF_POLICY_ROWS)
+
     def _write_metrics(self, steps: int) -> None:
         now = time.monotonic()
         before, steps_before = self._last_row
         self._last_row = (now, steps)
+        recent, self.progress.recent = self.progress.recent, []
         row: dict[str, Any] = {
             "steps": steps,
             "seconds": round(now - self._started, 3),
@@ -186,41 +205,66 @@ class TrainingLoop(BaseCallback):
         }
         terms = dict.fromkeys(self.env.workers.info.reward_weights)
         row.update({"return": None, "length": None, "success": None})
-        if self._recent:
-            row["return"] = mean_return(self._recent)
-            row["length"] = float(np.mean([result.length for result in self._recent]))
-            row["success"] = success_rate(self._recent)
-            known = mean_terms(self._recent)
+        if recent:
+            row["return"] = mean_return(recent)
+            row["length"] = float(np.mean([result.length for result in recent]))
+            row["success"] = success_rate(recent)
+            known = mean_terms(recent)
             terms.update({name: known.get(name) for name in terms})
         row.update({f"term/{name}": value for name, value in terms.items()})
         losses = self.logger.name_to_value
         row.update({name: losses.get(f"train/{name}") for name in _LOSSES})
-        self._saving("metrics", lambda: append_row(self.run_directory.metrics_file, row))
+        self.saver.row(self.saver.metrics, row)
         for name, number in self.curriculum.columns().items():
             self.logger.record(f"curriculum/{name}", number)
         for name, value in terms.items():
             if value is not None:
                 self.logger.record(f"reward_terms/{name}", value)
         self.display.metrics(steps, row["fps"], row["return"], row["success"])
-        self._recent = []
 
-    def evaluate(self) -> None:
-        """Live the evaluation episodes, keep the best policy, and write the row and the episodes."""
+    def evaluate(self, *, at_end: bool = False) -> None:
+        """Live the evaluation episodes, keep the best policy, and write the row and the episodes.
+
+        An environment that fails costs this evaluation, not the training.
+        """
         steps, began = self.model.num_timesteps, time.monotonic()
         packed = self._pack()
-        episodes = self._live_episodes(*packed)
+        try:
+            self._take_note(self._evaluator.live(self.model, *packed, self._leave_if_asked), packed)
+        except _Asked:
+            assert self.stop_signal is not None
+            self._stop(self.stop_signal, at_end=at_end)
+        except TaskError as error:
+            self._evaluation_failed(error)
+        self.progress.last_eval = steps
+        while self.progress.next_eval <= steps:
+            self.progress.next_eval += self.recipe.eval.every_steps or self.recipe.total_timesteps
+        # The rate of training is without the time of evaluations.
+        self._last_row = (self._last_row[0] + time.monotonic() - began, self._last_row[1])
+
+    def _leave_if_asked(self) -> None:
+        # An evaluation may take minutes, and who asks may wait seconds only: the resumed run lives it again.
+        if self.stop_signal is not None:
+            raise _Asked
+
+    def _evaluation_failed(self, error: TaskError) -> None:
+        progress, steps = self.progress, self.model.num_timesteps
+        progress.failed_evaluations += 1
+        progress.first_failure = progress.first_failure or f"at step {steps:,}: {error}"
+        self.display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
+
+    def _take_note(self, episodes: list[Episode], packed: Packed) -> None:
+        progress, steps = self.progress, self.model.num_timesteps
         results = [episode.result for episode in episodes]
         success, mean = success_rate(results), mean_return(results)
-        progress = self.progress
         better = self._is_better(success, mean)
-        if better and self._saving("best policy", lambda: save_policy(self.run_directory.best_policy, *packed)):
-            progress.best_success, progress.best_return, progress.best_step = success, mean, steps
+        if better:
+            info = packed[0].model_copy(update={"evaluation": Score(success=success, mean_return=mean)})
+            if self.saver.attempt("best policy", lambda: save_policy(self.run_directory.best_policy, info, packed[1])):
+                progress.best_success, progress.best_return, progress.best_step = success, mean, steps
         threshold = self.recipe.stop_success
         good = threshold is not None and success is not None and success >= threshold
         progress.good_in_a_row = progress.good_in_a_row + 1 if good else 0
-        progress.last_eval_step = steps
-        while progress.next_eval <= steps:
-            progress.next_eval += self.recipe.eval.every_steps or self.recipe.total_timesteps
         row = {
             "steps": steps,
             "seconds": round(time.monotonic() - self._started, 3),
@@ -231,28 +275,16 @@ class TrainingLoop(BaseCallback):
             "length": float(np.mean([result.length for result in results])),
             **{f"term/{name}": value for name, value in mean_terms(results).items()},
         }
-        self._saving("evaluation", lambda: append_row(self.run_directory.evals_file, row))
+        self.saver.row(self.saver.evals, row)
         self.logger.record("eval/mean_reward", mean)
         if success is not None:
             self.logger.record("eval/success_rate", success)
-        self._saving("episodes", lambda: self.episodes.keep(episodes, steps))
+        self.saver.attempt("episodes", lambda: self.episodes.keep(episodes, steps))
         self.display.evaluation(steps, success, mean, better)
-        # The rate of training is without the time of evaluations.
-        self._last_row = (self._last_row[0] + time.monotonic() - began, steps)
 
-    def _pack(self) -> tuple[PolicyInfo, dict[str, Any]]:
+    def _pack(self) -> Packed:
         goal = self.curriculum
         return pack(self.model, self.recipe.algo, goal.goal_spec, goal.goal, goal.contents())
-
-    def _live_episodes(self, info: PolicyInfo, tensors: dict[str, Any]) -> list[Episode]:
-        was_training = self.model.policy.training
-        policy = TorchPolicy(info, self.model.policy, Normalizer(info, tensors))
-        count = self.recipe.eval.episodes
-        seeds = episode_seeds(self.recipe.seed, Stream.EVAL_IN_TRAINING, count)
-        actor = BatchActor(policy, self._eval_workers.n_envs)
-        episodes = run_episodes(self._eval_workers, actor, seeds, record=True)
-        self.model.policy.set_training_mode(was_training)
-        return episodes
 
     def _is_better(self, success: float | None, mean: float) -> bool:
         best = self.progress
@@ -262,29 +294,25 @@ class TrainingLoop(BaseCallback):
             return success > best.best_success
         return best.best_return is None or mean > best.best_return
 
-    def save_checkpoint(self) -> bool:
+    def explain_fault(self, error: TaskError) -> TaskError:
+        """Keep the actions of the episode that failed, and return the error with what to do next."""
+        told = [str(error)]
+        if self.saver.saved_step is not None:
+            told.append(
+                f"the checkpoint of step {self.saver.saved_step:,} stands; "
+                f"go on with: rlctl train --resume {self.run_directory.path}"
+            )
+        if isinstance(error, EpisodeFailed) and (actions := self.env.history.of(error.env)) is not None:
+            file: list[Path] = []
+            spec, what = self.curriculum.spec, str(error).partition("\n")[0]
+            self.saver.attempt(
+                "failed episode", lambda: file.append(self.episodes.keep_failed(spec, error.seed, actions, what))
+            )
+            told += [f"to live its actions again: rlctl replay {path}" for path in file]
+        return TaskError("\n".join(told), details=error.details)
+
+    def save_checkpoint(self, *, at_end: bool = False) -> bool:
         """Write a checkpoint of the present boundary; False, with a warning, if the disk does not take it."""
-        progress = self.progress
-        progress.seconds = time.monotonic() - self._started
-        progress.metrics_bytes = table_size(self.run_directory.metrics_file)
-        progress.evals_bytes = table_size(self.run_directory.evals_file)
-        progress.episodes_started = list(self.env.episodes_started)
-        packed = self._pack()
-        return self._saving(
-            "checkpoint",
-            lambda: self._save(packed, dataclasses.asdict(progress)),
-        )
-
-    def _save(self, packed: Any, progress: dict[str, Any]) -> None:
-        save_policy(self.run_directory.last_policy, *packed)
-        checkpoint.save(self.run_directory, self.model, packed, progress, self.recipe.checkpoint.keep)
-
-    def _saving(self, what: str, write: Callable[[], object]) -> bool:
-        """Write something; a disk that does not take it costs a warning, and the next boundary tries again."""
-        try:
-            write()
-        except OSError as error:
-            self._unsaved = f"{what}: {error.strerror or error}"
-            self.display.message(f"warning: not saved: {self._unsaved}; training goes on")
-            return False
-        return True
+        self.check_finite()
+        self.progress.seconds = time.monotonic() - self._started
+        return self.saver.checkpoint(self._pack, self.progress, at_end=at_end)

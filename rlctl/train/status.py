@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from rlctl import registry
@@ -29,7 +30,7 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
         "status": "running",
         "error": None,
         "task": task,
-        "origin": registry.origin(task),
+        **_identity(task),
         "algo": recipe.algo,
         "seed": recipe.seed,
         "device": device,
@@ -45,6 +46,25 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
     else:
         changes["started"] = _now()
     run.write_status(changes)
+
+
+def _identity(task: str) -> dict[str, Any]:
+    """Return what tells one version of a task from another: its distribution's, and its source."""
+    source = registry.source_file(task)
+    digest = files.digest(source.read_bytes()) if source is not None else None
+    return {"origin": registry.origin(task), "source_sha256": digest}
+
+
+def task_changes(told: Mapping[str, Any], task: str) -> list[str]:
+    """Say how a task differs from what `run.json` told when its training began; nothing if it does not."""
+    now = _identity(task)
+    before, after = (each if isinstance(each, dict) else {} for each in (told.get("origin"), now["origin"]))
+    if before != after:
+        names = (" ".join(map(str, each.values())) or "no installed package" for each in (before, after))
+        return ["task {} came from {} when the run began, and comes from {} now".format(task, *names)]
+    if told.get("source_sha256") != now["source_sha256"]:
+        return [f"{registry.source_file(task) or task} is not what it was when the run began"]
+    return []
 
 
 def write_failure(run: RunDirectory, error: BaseException) -> None:

@@ -9,11 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
+from torch.utils.tensorboard.writer import SummaryWriter
+
+
+class _Format(TensorBoardOutputFormat):
+    def __init__(self, folder: Path, first_step: int) -> None:
+        # What an earlier process wrote of these steps is not shown twice.
+        self.writer = SummaryWriter(log_dir=str(folder), purge_step=first_step or None)
+        self._is_closed = False
 
 
 class _TensorBoard(KVWriter):
-    def __init__(self, folder: Path, warn: Callable[[str], None]) -> None:
-        self._format: TensorBoardOutputFormat | None = TensorBoardOutputFormat(str(folder))
+    def __init__(self, folder: Path, warn: Callable[[str], None], first_step: int) -> None:
+        self._format: TensorBoardOutputFormat | None = _Format(folder, first_step)
         self._warn = warn
 
     def write(self, key_values: dict[str, Any], key_excluded: Mapping[str, tuple[str, ...]], step: int = 0) -> None:
@@ -49,7 +57,11 @@ def writer_errors(warn: Callable[[str], None]) -> Iterator[None]:
         threading.excepthook = before
 
 
-def make_logger(folder: Path, warn: Callable[[str], None]) -> Logger:
-    """Return a logger that writes to a TensorBoard folder; `warn` is told if it cannot."""
-    folder.mkdir(parents=True, exist_ok=True)
-    return Logger(str(folder), [_TensorBoard(folder, warn)])
+def make_logger(folder: Path, warn: Callable[[str], None], first_step: int = 0) -> Logger:
+    """Return a logger that writes to a TensorBoard folder from a step on; `warn` is told if it cannot."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return Logger(str(folder), [_TensorBoard(folder, warn, first_step)])
+    except OSError as error:
+        warn(f"warning: no TensorBoard logs: {folder}: {error.strerror or error}")
+        return Logger(str(folder), [])

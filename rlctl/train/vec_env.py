@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from rlctl.rollout.history import ActionHistory
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import EpisodeResult, Workers
 
@@ -17,33 +19,50 @@ _NOTHING: dict[str, Any] = {}
 class WorkerVecEnv(VecEnv):
     """Steps `Workers` for SB3. Every episode's seed follows from its address; SB3's own seeding is not used."""
 
-    def __init__(self, workers: Workers, run_seed: int, episodes_started: list[int] | None = None) -> None:
+    def __init__(self, workers: Workers, run_seed: int) -> None:
         self.workers = workers
         self.run_seed = run_seed
-        self.episodes_started = episodes_started or [0] * workers.n_envs
+        self.episodes_started = [0] * workers.n_envs
         """Per environment, how many episodes have begun: the next one's number."""
+        self.history = ActionHistory(workers.n_envs)
+        """What was done in the running episodes."""
         self.ended: list[EpisodeResult] = []
         """Episodes that ended since somebody last took them."""
         self.render_mode = None
         super().__init__(workers.n_envs, *workers.info.spaces())
 
-    def _start_next(self, env: int) -> int:
-        address = EpisodeAddress(self.run_seed, Stream.TRAIN, env, self.episodes_started[env])
-        self.episodes_started[env] += 1
-        return address.seed
+    def _seed(self, env: int, episode: int) -> int:
+        return EpisodeAddress(self.run_seed, Stream.TRAIN, env, episode).seed
 
     def reset(self) -> Any:
-        self.workers.reset({env: self._start_next(env) for env in range(self.num_envs)})
-        self._set_next_seeds(range(self.num_envs))
+        self.workers.reset({env: self._seed(env, number) for env, number in enumerate(self.episodes_started)})
+        self.episodes_started = [number + 1 for number in self.episodes_started]
+        self._begun(range(self.num_envs))
         return self.workers.observations()
 
-    def _set_next_seeds(self, envs: Any) -> None:
+    def _begun(self, envs: Iterable[int]) -> None:
+        envs = list(envs)
+        self.history.begin(envs)
         for env in envs:
-            address = EpisodeAddress(self.run_seed, Stream.TRAIN, env, self.episodes_started[env])
-            self.workers.arrays.next_seed[env] = address.seed
+            self.workers.arrays.next_seed[env] = self._seed(env, self.episodes_started[env])
+
+    def relive(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
+        """Put each environment into the episode it was in, and take the actions that were taken in it.
+
+        `actions` has shape (steps, ...) per environment. Return the environments whose episode ended on the way,
+        which they would not if they were deterministic.
+        """
+        self.episodes_started = list(episodes_started)
+        seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
+        ended = self.workers.relive(dict(enumerate(zip(seeds, actions, strict=True))))
+        self.history = ActionHistory.of_episodes(actions, self.workers.arrays.action)
+        for env in range(self.num_envs):
+            self.workers.arrays.next_seed[env] = self._seed(env, self.episodes_started[env])
+        return ended
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self.workers.arrays.action[:] = actions
+        self.history.add(self.workers.arrays.action)
 
     def step_wait(self) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         ended = self.workers.step()
@@ -56,7 +75,7 @@ class WorkerVecEnv(VecEnv):
                 env = result.env
                 self.episodes_started[env] += 1
                 infos[env] = self._end_info(result, _row(final, place))
-            self._set_next_seeds(envs)
+            self._begun(envs)
             self.ended += ended
         # float32, as SB3's own environments hand rewards over.
         rewards = arrays.reward.astype(np.float32)

@@ -104,22 +104,22 @@ def test_a_missing_npz(tmp_path):
 def test_a_whole_folder(tmp_path):
     target = tmp_path / "checkpoints" / "000100"
     with files.whole_folder(target) as folder:
-        (folder / "a").write_text("1")
+        files.write_new(folder / "a", b"1")
         assert not target.exists()
     assert os.listdir(target) == ["a"]
     with files.whole_folder(target) as folder:
-        (folder / "b").write_text("2")
+        files.write_new(folder / "b", b"2")
     assert os.listdir(target) == ["b"]
 
 
 def test_half_a_folder_is_taken_away(tmp_path):
     target = tmp_path / "000100"
     with files.whole_folder(target) as folder:
-        (folder / "a").write_text("1")
+        files.write_new(folder / "a", b"1")
 
     def fill():
         with files.whole_folder(target) as folder:
-            (folder / "b").write_text("2")
+            files.write_new(folder / "b", b"2")
             raise OSError("disk full")
 
     with pytest.raises(OSError, match="disk full"):
@@ -128,8 +128,30 @@ def test_half_a_folder_is_taken_away(tmp_path):
     assert os.listdir(target) == ["a"]
 
 
-def test_lines_are_appended(tmp_path):
+def test_appending_goes_on_at_the_given_size(tmp_path):
     path = tmp_path / "metrics.csv"
-    files.append_line(path, "a,b")
-    files.append_line(path, "1,2")
-    assert path.read_text() == "a,b\n1,2\n"
+    files.append(path, b"a,b\n", 0)
+    files.append(path, b"1,2\n", 4)
+    files.append(path, b"3,4\n", 8)
+    assert path.read_bytes() == b"a,b\n1,2\n3,4\n"
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_what_a_killed_process_left_is_put_right(tmp_path, there):
+    (tmp_path / ".000100.old.part").mkdir()
+    (tmp_path / ".000100.old.part" / "old").write_text("1")
+    (tmp_path / ".000200.77.part").mkdir()
+    (tmp_path / ".policy.77.part").write_text("half")
+    if there:
+        (tmp_path / "000100").mkdir()
+    files.recover(tmp_path)
+    # The folder that was set aside comes back, unless the one that takes its place is there.
+    assert os.listdir(tmp_path) == ["000100"]
+    assert os.listdir(tmp_path / "000100") == ([] if there else ["old"])
+
+
+def test_a_tree_is_removed(tmp_path):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    files.remove_tree(tmp_path / "a")
+    files.remove_tree(tmp_path / "a")
+    assert os.listdir(tmp_path) == []

@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from rlctl.run import recipe
+from rlctl.run.directory import RunDirectory
 from rlctl.train.request import TrainRequest, TrainResult, run_training
 
 ENVS = Path(__file__).with_name("envs.py")
@@ -20,15 +21,19 @@ def train(tmp_path: Path):
     """Train on an environment of envs.py in this process, into a temporary folder."""
 
     def run(env: str, settings: dict, **request) -> TrainResult:
-        return run_training(TrainRequest(f"{ENVS}:{env}", settings=settings, root=tmp_path / "runs", **request))
+        task = f"{ENVS}:{env}" if env[0].isupper() else env
+        return run_training(TrainRequest(task, settings=settings, root=tmp_path / "runs", **request))
 
     return run
 
 
 @pytest.fixture
 def resume(tmp_path: Path):
-    def run(result: TrainResult, **settings) -> TrainResult:
-        return run_training(TrainRequest(None, resume=str(result.run.path), settings=settings, root=tmp_path / "runs"))
+    def run(run: TrainResult | RunDirectory, *, force=False, **settings) -> TrainResult:
+        path = run.path if isinstance(run, RunDirectory) else run.run.path
+        return run_training(
+            TrainRequest(None, resume=str(path), settings=settings, root=tmp_path / "runs", force=force)
+        )
 
     return run
 

@@ -1,0 +1,68 @@
+"""The actions of the episodes that environments are in: what it takes to live them again up to now."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_BYTES = 2**28
+"""Memory for actions, 256 MB. An episode that goes back further than that cannot be lived again."""
+
+
+class ActionHistory:
+    """Remembers the actions of all environments since the oldest of their running episodes began."""
+
+    def __init__(self, n_envs: int) -> None:
+        self._rows: deque[NDArray[Any]] = deque()
+        self._first = 0  # what number the first of the rows has
+        self._began = np.zeros(n_envs, np.int64)  # number of each episode's first row
+
+    @classmethod
+    def of_episodes(cls, episodes: Sequence[NDArray[Any]], row: NDArray[Any]) -> ActionHistory:
+        """Return what is remembered after the actions of `episodes`, shape (steps, ...) each.
+
+        `row` is what `add` is given: an array with the actions of all environments in a step.
+        """
+        history = cls(len(episodes))
+        longest = max(len(actions) for actions in episodes)
+        rows = np.zeros((longest, *row.shape), row.dtype)
+        for env, actions in enumerate(episodes):
+            rows[longest - len(actions) :, env] = actions
+            history._began[env] = longest - len(actions)
+        history._rows.extend(rows)
+        return history
+
+    def add(self, actions: NDArray[Any]) -> None:
+        """Remember what all environments do in a step; shape (n_envs, ...)."""
+        self._rows.append(actions.copy())
+        if len(self._rows) * actions.nbytes > MOST_BYTES:
+            self._drop(self._first + 1)
+
+    def begin(self, envs: Iterable[int]) -> None:
+        """Begin episodes in some environments with the next step."""
+        self._began[list(envs)] = self._first + len(self._rows)
+        self._drop(int(self._began.min()))
+
+    def _drop(self, first: int) -> None:
+        while self._first < first:
+            self._rows.popleft()
+            self._first += 1
+
+    def of(self, env: int) -> NDArray[Any] | None:
+        """Return the actions of an environment's episode so far, shape (steps, ...); None if it goes too far back."""
+        start = int(self._began[env]) - self._first
+        if start < 0:
+            return None
+        return np.array([self._rows[place][env] for place in range(start, len(self._rows))])
+
+    def all(self) -> list[NDArray[Any] | None]:
+        """Return `of` every environment, in one go."""
+        if not self._rows:
+            return [np.zeros(0)] * len(self._began)
+        rows = np.stack(self._rows)
+        starts = (self._began - self._first).tolist()
+        return [rows[start:, env] if start >= 0 else None for env, start in enumerate(starts)]

@@ -1,0 +1,170 @@
+"""The replay buffer on disk: segments of transitions, each written once.
+
+A buffer of hours is too large to be written at every checkpoint. Transitions are numbered as they come, those of all
+environments in a step being one; a segment holds a range of them, and a checkpoint names the segments that make up the
+buffer, oldest first. Where two overlap the later one holds. Segments that no checkpoint names any more are removed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydantic
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from rlctl.errors import ArtifactError
+from rlctl.run import files
+
+Tensors = dict[str, NDArray[Any]]
+
+SEGMENT_BYTES = 8 * 2**20
+"""Segments grow to this size by being written again together: that keeps a checkpoint cheap, and segments few."""
+_FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_NAME = re.compile(r"^\d{12}-\d{12}\.safetensors$")
+
+
+class Segment(pydantic.BaseModel):
+    """Transitions from `first` up to `last`, which is not one of them, in a file."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+    first: int = pydantic.Field(ge=0, lt=10**12)
+    last: int = pydantic.Field(gt=0, lt=10**12)
+    sha256: str
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return f"{self.first:012d}-{self.last:012d}.safetensors"
+
+
+class ReplaySegments:
+    """Writes a replay buffer into a folder, segment by segment, and reads it again."""
+
+    def __init__(self, folder: Path, buffer: ReplayBuffer) -> None:
+        self.folder = folder
+        self.buffer = buffer
+        self._segments: list[Segment] = []
+        self._written = 0
+        arrays = _arrays(buffer).values()
+        self._row_bytes = sum(array[:1].nbytes for array in arrays)
+        self._most_rows = max(1, SEGMENT_BYTES // self._row_bytes)
+
+    def changed_last(self, added: int) -> None:
+        """Say that the last of `added` transitions is another one now than when it was added."""
+        self._written = min(self._written, added - 1)
+
+    def save(self, added: int) -> list[Segment]:
+        """Write what is new after `added` transitions in all; return the segments that make up the buffer."""
+        oldest = max(0, added - self.buffer.buffer_size)
+        segments = [each for each in self._segments if each.last > oldest]
+        if not all((self.folder / each.name).is_file() for each in segments):  # somebody has removed them
+            segments, self._written = [], 0
+        first = max(self._written, oldest)
+        while first < added and segments and self._worth_merging(segments[-1], first, added):
+            first = max(min(first, segments.pop().first), oldest)
+        for low in range(first, added, self._most_rows):
+            segments.append(self._write(low, min(low + self._most_rows, added)))
+        self._segments, self._written = segments, added
+        return list(segments)
+
+    def _worth_merging(self, before: Segment, first: int, last: int) -> bool:
+        # Like a binary counter: a transition is written as often as its segment doubles, and no more.
+        return before.last - before.first <= last - first and last - before.first <= self._most_rows
+
+    def _write(self, first: int, last: int) -> Segment:
+        places = np.arange(first, last) % self.buffer.buffer_size
+        content = save_tensors({name: array[places] for name, array in _arrays(self.buffer).items()})
+        segment = Segment(first=first, last=last, sha256=files.digest(content))
+        files.write_bytes(self.folder / segment.name, content)
+        return segment
+
+    def load(self, segments: Sequence[Segment], added: int) -> None:
+        """Fill the buffer with the last of `added` transitions; raises `ArtifactError` if they are not its own."""
+        buffer = self.buffer
+        reached = max(0, added - buffer.buffer_size)
+        for segment in segments:
+            if segment.first > reached:
+                break
+            self._read(segment)
+            reached = max(reached, segment.last)
+        if reached != added:
+            raise ArtifactError(f"{self.folder}: transitions after number {reached} are missing, of {added}")
+        buffer.pos, buffer.full = added % buffer.buffer_size, added >= buffer.buffer_size
+        self._segments, self._written = list(segments), added
+
+    def _read(self, segment: Segment) -> None:
+        file = self.folder / segment.name
+        places = np.arange(segment.first, segment.last) % self.buffer.buffer_size
+        try:
+            stored = load_tensors(file.read_bytes())
+            for name, array in _arrays(self.buffer).items():
+                if stored[name].shape != (len(places), *array.shape[1:]) or stored[name].dtype != array.dtype:
+                    raise ValueError(f"{name} has shape {stored[name].shape} and type {stored[name].dtype}")
+                array[places] = stored[name]
+        except (OSError, SafetensorError, KeyError, ValueError) as error:
+            raise ArtifactError(f"{file}: does not fit this recipe: {error}") from None
+
+
+def check(folder: Path, segments: Iterable[Segment]) -> None:
+    """Raise `ArtifactError` if a segment is not there, or not as it was written."""
+    for segment in segments:
+        files.check_digest(folder / segment.name, segment.sha256)
+
+
+def remove_unnamed(folder: Path, named: Iterable[Segment]) -> None:
+    """Remove the segments that no checkpoint names; other files are left alone."""
+    if not folder.is_dir():
+        return
+    names = {segment.name for segment in named}
+    for file in folder.iterdir():
+        if _NAME.match(file.name) and file.name not in names:
+            files.remove(file)
+
+
+def _arrays(buffer: ReplayBuffer) -> Tensors:
+    arrays: Tensors = {}
+    for name in _FIELDS:
+        value: Any = getattr(buffer, name)
+        parts = value if isinstance(value, dict) else {"": value}
+        arrays |= {f"{name}/{key}": part for key, part in parts.items()}
+    return arrays
+
+
+def hindsight_tensors(buffer: ReplayBuffer) -> Tensors:
+    """Return which episodes a HER buffer may sample from, (environment, start, length) each, and where each runs."""
+    if not isinstance(buffer, HerReplayBuffer):
+        return {}
+    # An episode whose first transition is written over is not sampled from any more, and one that runs not yet.
+    begins = (buffer.ep_start == np.arange(buffer.buffer_size)[:, None]) & (buffer.ep_length > 0)
+    starts, envs = np.nonzero(begins)
+    return {
+        "hindsight/episodes": np.stack([envs, starts, buffer.ep_length[starts, envs]], axis=1),
+        "hindsight/running": buffer._current_ep_start,
+    }
+
+
+def put_back_hindsight(buffer: ReplayBuffer, tensors: Tensors) -> None:
+    """Give a HER buffer, whose transitions are there, the episodes that `hindsight_tensors` returned."""
+    if not isinstance(buffer, HerReplayBuffer):
+        return
+    buffer._current_ep_start = tensors["hindsight/running"].copy()
+    for env, start in enumerate(buffer._current_ep_start.tolist()):
+        buffer.ep_start[_ring(start, buffer.pos, buffer.buffer_size), env] = start
+    for env, start, length in tensors["hindsight/episodes"].tolist():
+        places = _ring(start, start + length, buffer.buffer_size)
+        buffer.ep_start[places, env] = start
+        buffer.ep_length[places, env] = length
+
+
+def _ring(first: int, last: int, size: int) -> NDArray[np.int64]:
+    return np.arange(first, last if last >= first else last + size) % size

@@ -1,0 +1,154 @@
+"""Where a training starts: at nothing, or at the newest good checkpoint of a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlctl.errors import ArtifactError, RecipeError, UsageError
+from rlctl.run import directory
+from rlctl.run.directory import RunDirectory, RunLock
+from rlctl.run.recipe import Recipe, validate
+from rlctl.train import status
+
+if TYPE_CHECKING:
+    from rlctl.train.checkpoint import Checkpoint
+    from rlctl.train.progress import Progress
+
+_MAY_CHANGE = ("total_timesteps", "stop_success")
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """Where a training starts."""
+
+    task: str
+    recipe: Recipe
+    run: RunDirectory | None = None
+    lock: RunLock | None = None
+    checkpoint: Checkpoint | None = None
+    notes: tuple[str, ...] = ()
+    """What to tell of the checkpoint."""
+    inexact: tuple[str, ...] = ()
+    """Why the run cannot go on as if it had never stopped, as far as is known before it goes on."""
+
+    @property
+    def stage(self) -> int:
+        """Stage of the curriculum, from 1."""
+        return (self.checkpoint.progress.stage or 1) if self.checkpoint else 1
+
+    def nothing_to_do(self) -> bool:
+        """Whether the checkpoint is the end of the training."""
+        if self.checkpoint is None or not self.checkpoint.progress.done:
+            return False
+        return self.checkpoint.state.step >= self.recipe.total_timesteps or self.recipe.stop_success is not None
+
+
+def resumed(word: str | None, settings: Mapping[str, Any], root: Path, *, force: bool) -> Start:
+    """Find a run, lock it, and read its newest good checkpoint; nothing is changed yet.
+
+    `settings` are those of the recipe's that may be others now. Raises `UsageError` for any other, and unless
+    `force` is given if the task is another one than it was.
+    """
+    from rlctl.train import checkpoint
+
+    for key in settings:
+        if key not in _MAY_CHANGE:
+            raise UsageError(f"--resume goes on with the run's own recipe: {key} cannot be changed, only -n")
+    run = directory.find_run(word, root)
+    before = run.recipe()
+    lock = run.lock()  # before looking: a process that is training removes old checkpoints
+    try:
+        recipe = validate({**before.model_dump(by_alias=True), **settings}, "recipe")
+        told = run.status()
+        task = _task(told, run)
+        changes = status.task_changes(told, task)
+        if changes and not force:
+            raise UsageError(
+                f"{run.path}: {'; '.join(changes)}. What was learnt may not fit any more; --force goes on all the same"
+            )
+        run.recover()
+        found, damage = checkpoint.newest(run)
+        start = Start(task, recipe, run, lock, found, _notes(found, damage), tuple(changes))
+        return _reopened(start, before) if settings else start
+    except BaseException:
+        lock.release()
+        raise
+
+
+def _task(told: Mapping[str, Any], run: RunDirectory) -> str:
+    task = told["task"]
+    if not isinstance(task, str):
+        raise ArtifactError(f"{run.status_file}: damaged: its task is {task!r}")
+    return task
+
+
+def _notes(found: Checkpoint | None, damage: list[str]) -> tuple[str, ...]:
+    if found is None:
+        return ("no checkpoint yet: the training begins at its first step",)
+    return tuple(f"warning: {each}; going on from step {found.state.step:,}" for each in damage)
+
+
+def _reopened(start: Start, before: Recipe) -> Start:
+    """Let a training that was done go on, if it is asked for more than it was."""
+    found, recipe = start.checkpoint, start.recipe
+    if found is None or not found.progress.done:
+        return start
+    stricter = recipe.stop_success != before.stop_success
+    if found.state.step >= recipe.total_timesteps or not (stricter or recipe.total_timesteps > before.total_timesteps):
+        return start
+    progress = dataclasses.replace(found.progress, done=False, good_in_a_row=0)
+    state = found.state.model_copy(update={"progress": progress})
+    return dataclasses.replace(start, checkpoint=dataclasses.replace(found, state=state))
+
+
+def prepare(run: RunDirectory, found: Checkpoint | None, progress: Progress) -> list[str]:
+    """Put the run folder back to where the checkpoint has it; return what to tell.
+
+    Tables are cut back, checkpoints that are damaged are set aside, and the best policy stays the best there is.
+    """
+    from rlctl.run.table import Table
+    from rlctl.train.episodes import remove_after
+
+    step = found.state.step if found is not None else 0
+    for folder in run.checkpoints():
+        if int(folder.name) > step:
+            os.replace(folder, folder.with_name(f"{folder.name}.damaged"))
+    remove_after(run, step)
+    told = []
+    for file, size in ((run.metrics_file, progress.metrics_bytes), (run.evals_file, progress.evals_bytes)):
+        if not Table(file).cut_back(size):
+            told.append(f"warning: {file}: rows before step {step:,} are gone: it is shorter than the checkpoint says")
+    _take_best(run, progress)
+    return told
+
+
+def _take_best(run: RunDirectory, progress: Progress) -> None:
+    """Believe the best policy's own file: it may be newer than the checkpoint, and must not give way to a worse one."""
+    from rlctl.run.policy import read_policy
+
+    progress.best_success = progress.best_return = progress.best_step = None
+    try:
+        info, _ = read_policy(run.best_policy)
+    except ArtifactError:
+        return  # there is none yet, or it is damaged: the next evaluation writes one
+    if info.evaluation is not None:
+        progress.best_success, progress.best_return = info.evaluation.success, info.evaluation.mean_return
+        progress.best_step = info.training_steps
+
+
+def check_stop_success(recipe: Recipe, task: str, may_succeed: bool) -> None:
+    """Raise `RecipeError` where a recipe waits for success and the task does not report it."""
+    if may_succeed:
+        return
+    if recipe.stop_success is not None:
+        raise RecipeError(f"stop_success: {task} does not report success; leave it out")
+    for number, stage in enumerate(recipe.stages, start=1):
+        if stage.promote is not None and stage.promote.success is not None:
+            raise RecipeError(
+                f"stage {number} of {len(recipe.stages)}: promote.success: {task} does not report success; "
+                "promote by return: promote: {return: 50.0}"
+            )

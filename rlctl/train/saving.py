@@ -1,0 +1,108 @@
+"""What a training writes into its run folder while it goes on; a disk that does not take it stops nothing."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rlctl.run.directory import RunDirectory
+from rlctl.run.policy import PolicyInfo, save_policy
+from rlctl.run.table import Table
+from rlctl.train.checkpoint import Checkpoints
+from rlctl.train.progress import Progress
+from rlctl.train.snapshot import Tensors
+
+Packed = tuple[PolicyInfo, Tensors]
+
+TIME_FOR_CHECKPOINTS = 0.02
+"""Part of the training's time that checkpoints may take."""
+_REMIND_EVERY_S = 60.0
+
+
+class Saver:
+    """Writes tables, policies and checkpoints. What cannot be written costs a warning and is tried again."""
+
+    def __init__(
+        self,
+        run: RunDirectory,
+        checkpoints: Checkpoints,
+        warn: Callable[[str], None],
+        write_again: Callable[[], object],
+    ) -> None:
+        self.metrics = Table(run.metrics_file)
+        self.evals = Table(run.evals_file)
+        self.saved_step: int | None = None
+        """Step of the last checkpoint that is whole on the disk."""
+        self.trouble = ""
+        """What could not be written the last time, and why."""
+        self._run = run
+        self._checkpoints = checkpoints
+        self._warn = warn
+        self._write_again = write_again
+        self._next_checkpoint = time.monotonic()  # the first boundary saves one
+        self._last_bytes = 0
+        self._reminded = 0.0
+
+    def attempt(self, what: str, write: Callable[[], object]) -> bool:
+        """Write something; False, with a warning, if the disk does not take it."""
+        try:
+            if not self._run.status_file.exists():
+                self._restore_folder()
+            write()
+        except OSError as error:
+            self._tell(f"{what}: {error.strerror or error}")
+            return False
+        return True
+
+    def _restore_folder(self) -> None:
+        # What is in memory is all that is left of the run, so it is not the moment to give up.
+        os.makedirs(self._run.path, exist_ok=True)
+        self._write_again()
+        self._warn(f"warning: {self._run.path} was removed while training: made anew, without what was in it")
+
+    def _tell(self, trouble: str) -> None:
+        if trouble != self.trouble or time.monotonic() - self._reminded > _REMIND_EVERY_S:
+            self._warn(f"warning: not saved: {trouble}; training goes on")
+            self._reminded = time.monotonic()
+        self.trouble = trouble
+
+    def row(self, table: Table, row: dict[str, Any]) -> None:
+        """Add a row to a table; one that the disk does not take now is written with the next."""
+        self.attempt(table.path.name, lambda: table.add(row))
+
+    def checkpoint_is_due(self) -> bool:
+        """Whether the time that checkpoints may take allows one."""
+        return time.monotonic() >= self._next_checkpoint
+
+    def checkpoint(self, pack: Callable[[], Packed], progress: Progress, *, at_end: bool = False) -> bool:
+        """Write a checkpoint, and the last policy; False, with a warning, if the disk does not take it."""
+        began = time.monotonic()
+        packed = pack()
+        saved = self.attempt("checkpoint", lambda: self._write_checkpoint(packed, progress, at_end))
+        if saved:
+            self._tell_saved_again()
+            self.attempt("last policy", lambda: save_policy(self._run.last_policy, *packed))
+            self.attempt("old checkpoints", self._checkpoints.remove_old)
+        now = time.monotonic()
+        self._next_checkpoint = now + (now - began) / TIME_FOR_CHECKPOINTS
+        return saved
+
+    def _tell_saved_again(self) -> None:
+        if self.trouble:
+            self._warn(f"saved again, at step {self.saved_step:,}")
+        self.trouble = ""
+
+    def _write_checkpoint(self, packed: Packed, progress: Progress, at_end: bool) -> None:
+        # Every row before a checkpoint must be on the disk before it is.
+        self.metrics.flush(sync=True)
+        self.evals.flush(sync=True)
+        progress.metrics_bytes, progress.evals_bytes = self.metrics.size, self.evals.size
+        if shutil.disk_usage(self._run.path).free < 2 * self._last_bytes:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        folder = self._checkpoints.save(packed, progress, at_end=at_end)
+        self._last_bytes = sum(file.stat().st_size for file in folder.iterdir())
+        self.saved_step = packed[0].training_steps

@@ -1,0 +1,57 @@
+"""Signals that ask a training to stop, whatever it is doing."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from rlctl.errors import Interrupted
+
+if TYPE_CHECKING:
+    from rlctl.train.loop import TrainingLoop
+
+_ASKING = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopSignals:
+    """Handles SIGINT and SIGTERM as long as it is entered.
+
+    Before the training they end the process at once; while it goes on the first ends it at the next boundary and the
+    second at once; when it is done they change nothing any more.
+    """
+
+    def __init__(self) -> None:
+        self._loop: TrainingLoop | None = None
+        self._done = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignals:
+        # Python has signal handlers in the main thread only; a caller in another keeps its own.
+        if threading.current_thread() is threading.main_thread():
+            # Set even where a shell has made SIGINT ignored, as for a command in the background.
+            self._before = {number: signal.signal(number, self._handle) for number in _ASKING}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def begin(self, loop: TrainingLoop) -> None:
+        """From now on let `loop` end the training at a boundary."""
+        self._loop = loop
+
+    def end(self) -> None:
+        """The training is done and saved: it stays that, whoever asks for what."""
+        self._done = True
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        # No output here: it might come in the middle of another.
+        if self._done:
+            return
+        if self._loop is None:
+            raise Interrupted("interrupted before the training began", number)
+        if self._loop.stop_signal is not None:
+            raise Interrupted("interrupted again: stopped at once, the last checkpoint stands", number)
+        self._loop.stop_signal = number

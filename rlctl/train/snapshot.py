@@ -1,0 +1,248 @@
+"""Everything in a training's memory that decides how it goes on, as tensors and plain data, and back.
+
+The environments' part is in `vec_env.py`, the replay buffer's in `replay_segments.py`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from rlctl.errors import ArtifactError, DivergedError
+from rlctl.train.pack import observation_statistics
+
+Tensors = dict[str, NDArray[Any]]
+
+_COUNTERS = (
+    "num_timesteps", "_n_updates", "_episode_num", "_n_calls", "exploration_rate", "_current_progress_remaining",
+)  # fmt: skip
+# What gSDE explores with until it draws again.
+_EXPLORATION = ("exploration_mat", "exploration_matrices")
+
+
+def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
+    """Return the state of a model at a boundary between updates; raises `DivergedError` if it is not finite."""
+    weights, structure = _flatten(model.get_parameters(), "parameters")
+    tensors = {**weights, **_variables(model), **_normalizer_tensors(model)}
+    _check_finite(tensors, model.num_timesteps)
+    tensors |= _randomness_tensors(model) | _rollout_tensors(model)
+    plain = {
+        "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
+        "parameters": structure,
+        "randomness": {"python": _python_state(), "action_space": model.action_space.np_random.bit_generator.state},
+        "episodes": list(model.ep_info_buffer or ()),
+        "successes": [bool(each) for each in model.ep_success_buffer or ()],
+        "log": _logged(model),
+    }
+    return tensors, plain
+
+
+def put_back(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
+    """Give a model the state that `take` returned; raises `ArtifactError` if it is another kind of model."""
+    try:
+        parameters = _unflatten(plain["parameters"], tensors)
+        model.set_parameters(parameters, exact_match=True, device=model.device)
+        _put_back_variables(model, tensors)
+        _put_back_normalizer(model, tensors)
+        _put_back_rollout(model, tensors)
+        for name, value in plain["counters"].items():
+            setattr(model, name, value)
+        _put_back_log(model, plain)
+        put_back_randomness(model, tensors, plain)
+    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+        raise ArtifactError(f"does not fit this recipe: {' '.join(str(error).split())[:200]}") from None
+
+
+def _put_back_log(model: BaseAlgorithm, plain: dict[str, Any]) -> None:
+    """Give SB3 its last episodes, and the logger the values of the last update: TensorBoard goes on with them."""
+    model.ep_info_buffer = deque(plain["episodes"], maxlen=model._stats_window_size)
+    model.ep_success_buffer = deque(plain["successes"], maxlen=model._stats_window_size)
+    for key, value, exclude in plain["log"]:
+        model.logger.record(key, value, exclude=tuple(exclude))
+
+
+def _logged(model: BaseAlgorithm) -> list[Any]:
+    excluded = model.logger.name_to_excluded
+    values: dict[str, Any] = model.logger.name_to_value
+    return [
+        [key, float(value), list(excluded.get(key) or ())]
+        for key, value in values.items()
+        if isinstance(value, int | float | np.number)
+    ]
+
+
+def put_back_randomness(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
+    """Put all random generators, and what gSDE explores with, where they were."""
+    torch.set_rng_state(torch.from_numpy(tensors["randomness/torch"].copy()))
+    keys, position, has_gauss, cached = (tensors[f"randomness/numpy/{part}"] for part in _NUMPY)
+    np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(cached)))  # noqa: NPY002 (SB3 draws there)
+    version, numbers, gauss = plain["randomness"]["python"]
+    random.setstate((version, tuple(numbers), gauss))
+    model.action_space.np_random.bit_generator.state = plain["randomness"]["action_space"]
+    explorer = _explorer(model)
+    for name in _EXPLORATION:
+        if f"exploration/{name}" in tensors:
+            setattr(explorer, name, torch.from_numpy(tensors[f"exploration/{name}"].copy()).to(model.device))
+
+
+@contextlib.contextmanager
+def own_randomness(model: BaseAlgorithm, seed: int) -> Iterator[None]:
+    """Let something draw from torch's generator, beginning at `seed`, without a trace in the training."""
+    explorer = _explorer(model)
+    before = {name: getattr(explorer, name) for name in _EXPLORATION if hasattr(explorer, name)}
+    state = torch.get_rng_state()
+    torch.manual_seed(seed)
+    try:
+        yield
+    finally:
+        torch.set_rng_state(state)
+        for name, value in before.items():
+            setattr(explorer, name, value)
+
+
+_NUMPY = ("keys", "position", "has_gauss", "cached")
+
+
+def _randomness_tensors(model: BaseAlgorithm) -> Tensors:
+    name, *state = np.random.get_state()  # noqa: NPY002 (SB3 draws from it)
+    assert name == "MT19937"  # numpy's global generator has no other kind
+    tensors = {f"randomness/numpy/{part}": np.asarray(value) for part, value in zip(_NUMPY, state, strict=True)}
+    tensors["randomness/torch"] = torch.get_rng_state().numpy()
+    explorer = _explorer(model)
+    for attribute in _EXPLORATION:
+        if hasattr(explorer, attribute):
+            tensors[f"exploration/{attribute}"] = _array(getattr(explorer, attribute))
+    return tensors
+
+
+def _python_state() -> list[Any]:
+    version, numbers, gauss = random.getstate()
+    return [version, list(numbers), gauss]
+
+
+def _explorer(model: BaseAlgorithm) -> Any:
+    """Return the distribution that holds gSDE's matrices; something without them where there is none."""
+    policy: Any = model.policy
+    return getattr(getattr(policy, "actor", policy), "action_dist", None)
+
+
+def _check_finite(tensors: Tensors, steps: int) -> None:
+    for name, values in tensors.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise DivergedError(
+                f"training diverged: {name.replace('/', ' ')} is not finite at step {steps:,}. A smaller "
+                "algo_kwargs.learning_rate or a smaller reward helps most often."
+            )
+
+
+def _array(tensor: torch.Tensor) -> NDArray[Any]:
+    values: NDArray[Any] = tensor.detach().cpu().numpy()
+    return values
+
+
+def _flatten(value: Any, path: str) -> tuple[Tensors, Any]:
+    """Split nested state dicts into tensors by path, and JSON that refers to them."""
+    if isinstance(value, torch.Tensor):
+        return {path: _array(value)}, {"tensor": path}
+    if isinstance(value, dict):
+        tensors: Tensors = {}
+        entries = []
+        for key, each in value.items():
+            below, structure = _flatten(each, f"{path}/{key}")
+            tensors.update(below)
+            entries.append([key, structure])
+        return tensors, {"dict": entries}
+    if isinstance(value, list | tuple):
+        below, structure = _flatten(dict(enumerate(value)), path)
+        kind = "list" if isinstance(value, list) else "tuple"
+        return below, {kind: [each for _, each in structure["dict"]]}
+    return {}, {"value": value}
+
+
+def _unflatten(structure: Any, tensors: Tensors) -> Any:
+    ((kind, content),) = structure.items()
+    if kind == "tensor":
+        return torch.from_numpy(tensors[content].copy())
+    if kind == "dict":
+        return {key: _unflatten(each, tensors) for key, each in content}
+    if kind in ("list", "tuple"):
+        items = [_unflatten(each, tensors) for each in content]
+        return items if kind == "list" else tuple(items)
+    return content
+
+
+def _variables(model: BaseAlgorithm) -> Tensors:
+    """Return what SB3 trains beside the networks: SAC's entropy coefficient, which `get_parameters` leaves out."""
+    _, names = model._get_torch_save_params()
+    return {f"variables/{name}": _array(getattr(model, name)) for name in names}
+
+
+def _put_back_variables(model: BaseAlgorithm, tensors: Tensors) -> None:
+    _, names = model._get_torch_save_params()
+    for name in names:
+        # In place: an optimiser holds this very tensor.
+        getattr(model, name).data.copy_(torch.from_numpy(tensors[f"variables/{name}"].copy()))
+
+
+def _normalizer_tensors(model: BaseAlgorithm) -> Tensors:
+    normalizer = model.get_vec_normalize_env()
+    if normalizer is None:
+        return {}
+    tensors: Tensors = {"normalize/returns": normalizer.returns}
+    for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
+        tensors[f"normalize/{key}/mean"] = np.asarray(rms.mean)
+        tensors[f"normalize/{key}/var"] = np.asarray(rms.var)
+        tensors[f"normalize/{key}/count"] = np.asarray(rms.count)
+    return tensors
+
+
+def _put_back_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
+    normalizer = model.get_vec_normalize_env()
+    if normalizer is None:
+        return
+    normalizer.returns = tensors["normalize/returns"].copy()
+    for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
+        rms.mean = tensors[f"normalize/{key}/mean"].copy()
+        rms.var = tensors[f"normalize/{key}/var"].copy()
+        rms.count = float(tensors[f"normalize/{key}/count"])
+
+
+_OBSERVED = ("_last_obs", "_last_original_obs")
+
+
+def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
+    """Return what the next step is chosen from."""
+    tensors: Tensors = {"rollout/starts": np.asarray(model._last_episode_starts)}
+    for name in _OBSERVED:
+        value: Any = getattr(model, name)
+        if value is not None:
+            parts = value if isinstance(value, dict) else {"": value}
+            tensors |= {f"rollout/{name}/{key}": np.asarray(part) for key, part in parts.items()}
+    states: Any = getattr(model, "_last_lstm_states", None)
+    for kind, pair in zip(("pi", "vf"), states or (), strict=False):
+        for place, each in enumerate(pair):
+            tensors[f"rollout/lstm/{kind}/{place}"] = _array(each)
+    return tensors
+
+
+def _put_back_rollout(model: BaseAlgorithm, tensors: Tensors) -> None:
+    model._last_episode_starts = tensors["rollout/starts"].copy()
+    for name in _OBSERVED:
+        prefix = f"rollout/{name}/"
+        parts = {key[len(prefix) :]: value.copy() for key, value in tensors.items() if key.startswith(prefix)}
+        setattr(model, name, parts.get("", parts or None))
+    if getattr(model, "_last_lstm_states", None) is not None:
+        pairs = [
+            tuple(torch.from_numpy(tensors[f"rollout/lstm/{kind}/{place}"].copy()).to(model.device) for place in (0, 1))
+            for kind in ("pi", "vf")
+        ]
+        model._last_lstm_states = RNNStates(*pairs)  # type: ignore[attr-defined]

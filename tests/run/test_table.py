@@ -1,0 +1,81 @@
+import errno
+import os
+
+import pytest
+
+from rlctl.run import files
+from rlctl.run.table import Table
+
+
+@pytest.fixture
+def table(tmp_path):
+    return Table(tmp_path / "metrics.csv")
+
+
+class FullDisk:
+    """Takes `room` bytes of each write, and none after that."""
+
+    def __init__(self, room):
+        self.room = room
+
+    def __getattr__(self, name):
+        return getattr(os, name)
+
+    def write(self, descriptor, content):
+        if self.room == 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        taken, self.room = os.write(descriptor, content[: self.room]), 0
+        return taken
+
+
+def test_rows_under_a_header(table):
+    table.add({"steps": 64, "success": None})
+    table.add({"steps": 128, "success": 0.5})
+    assert table.path.read_text() == "steps,success\n64,\n128,0.5\n"
+    assert table.size == len("steps,success\n64,\n128,0.5\n")
+
+
+def test_going_on_with_a_table_that_is_there(table):
+    table.add({"steps": 64, "success": 1})
+    again = Table(table.path)
+    again.add({"success": 0, "steps": 128, "new": 3})
+    assert table.path.read_text() == "steps,success\n64,1\n128,0\n"
+
+
+def test_cutting_back(table):
+    table.add({"steps": 64})
+    size = table.size
+    table.add({"steps": 128})
+    again = Table(table.path)
+    assert again.cut_back(size)
+    again.add({"steps": 128})
+    assert table.path.read_text() == "steps\n64\n128\n"
+    assert not Table(table.path).cut_back(10_000)
+
+
+@pytest.mark.parametrize("room", [0, 1, 3])
+def test_a_full_disk_leaves_no_half_row_and_loses_none(table, monkeypatch, room):
+    table.add({"steps": 64})
+    monkeypatch.setattr(files, "os", FullDisk(room))
+    for steps in (128, 192):
+        with pytest.raises(OSError, match="No space left"):
+            table.add({"steps": steps})
+    assert table.path.read_text() == "steps\n64\n"
+    monkeypatch.undo()
+    table.flush()
+    assert table.path.read_text() == "steps\n64\n128\n192\n"
+
+
+def test_a_half_row_that_could_not_be_cut_back_is_written_over(table):
+    table.add({"steps": 64})
+    with table.path.open("a") as file:
+        file.write("12,half a row,")
+    table.add({"steps": 128})
+    assert table.path.read_text() == "steps\n64\n128\n"
+
+
+def test_a_file_that_was_removed_begins_anew(table):
+    table.add({"steps": 64})
+    table.path.unlink()
+    table.add({"steps": 128})
+    assert table.path.read_text() == "steps\n128\n"

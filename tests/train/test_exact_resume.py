@@ -1,0 +1,104 @@
+"""A run that was killed and resumed is the run that was never stopped, bit for bit."""
+
+import itertools
+
+import pytest
+
+from rlctl.run import recipe as recipes
+from rlctl.train import saving
+from rlctl.train.vec_env import WorkerVecEnv
+from tests.train.comparing import Killed, assert_same_run
+from tests.train.conftest import SMALL
+
+ON_POLICY = {"ppo": {"n_steps": 16, "batch_size": 32, "n_epochs": 2}, "a2c": {"n_steps": 16}}
+ON_POLICY["recurrent_ppo"] = ON_POLICY["ppo"]
+OFF_POLICY = {"learning_starts": 40, "batch_size": 16, "buffer_size": 200}
+
+
+def settings(algo, **changes):
+    kwargs = ON_POLICY.get(algo, OFF_POLICY)
+    return recipes.merge({**SMALL, "algo": algo, "algo_kwargs": kwargs}, changes)
+
+
+SDE = {"algo_kwargs": {"use_sde": True}}
+NORMALIZED = {"normalize": {"observation": True, "reward": True}}
+STAGES = {
+    "stages": [{"task": {"tolerance": 0.5}, "promote": {"success": 0.5, "window": 6}}, {"task": {"tolerance": 0.3}}]
+}
+CASES = {
+    "ppo": ("Line", settings("ppo")),
+    "ppo with gSDE": ("Line", settings("ppo", **SDE)),
+    "ppo, resampled gSDE": ("Line", settings("ppo", algo_kwargs={"use_sde": True, "sde_sample_freq": 4})),
+    "ppo, falling rate": ("Line", settings("ppo", algo_kwargs={"learning_rate": "lin_1e-3", "clip_range": "lin_0.2"})),
+    "ppo, discrete": ("Discrete", settings("ppo")),
+    "ppo, dict": ("DictObservation", settings("ppo")),
+    "ppo, image": ("Image", settings("ppo", total_timesteps=192)),
+    "ppo, frame stack": ("Line", settings("ppo", frame_stack=3)),
+    "ppo, curriculum": ("Staged", settings("ppo", **STAGES)),
+    "ppo, stochastic evaluation": ("Line", settings("ppo", eval={"deterministic": False}, **SDE)),
+    "ppo, on reach": ("reach", settings("ppo")),
+    "a2c": ("Line", settings("a2c")),
+    "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
+    "sac": ("Line", settings("sac")),
+    "sac with gSDE": ("Line", settings("sac", **SDE)),
+    "sac, normalised": ("Line", settings("sac", **NORMALIZED)),
+    "sac, dict": ("DictObservation", settings("sac", **NORMALIZED)),
+    "sac, curriculum": ("Staged", settings("sac", **STAGES)),
+    "sac, several steps": ("Line", settings("sac", algo_kwargs={"n_steps": 3})),
+    "sac, one environment": ("Line", settings("sac", n_envs=1, algo_kwargs={"train_freq": [1, "episode"]})),
+    "td3": ("Line", settings("td3")),
+    "ddpg": ("Line", settings("ddpg")),
+    "dqn": ("Discrete", settings("dqn", algo_kwargs={"target_update_interval": 20})),
+    "tqc": ("Line", settings("tqc")),
+    "crossq": ("Line", settings("crossq")),
+}
+
+
+@pytest.fixture
+def every_boundary(monkeypatch):
+    """Write a checkpoint at every boundary, whatever it costs."""
+    monkeypatch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e9)
+
+
+@pytest.fixture
+def kill_after(monkeypatch):
+    """End the training in the middle of a step, so many steps after it began."""
+
+    def kill(steps):
+        counter = itertools.count(1)
+        original = WorkerVecEnv.step_wait
+
+        def step_wait(env):
+            if next(counter) > steps:
+                raise Killed
+            return original(env)
+
+        monkeypatch.setattr(WorkerVecEnv, "step_wait", step_wait)
+        return lambda: monkeypatch.setattr(WorkerVecEnv, "step_wait", original)
+
+    return kill
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.usefixtures("every_boundary")
+def test_killed_and_resumed(train, resume, kill_after, case):
+    env, given = CASES[case]
+    whole = train(env, given).run
+    undo = kill_after(37)
+    with pytest.raises(Killed):
+        train(env, given)
+    undo()
+    run = newest_other_than(whole)
+    undo = kill_after(11)
+    with pytest.raises(Killed):
+        resume(run)
+    undo()
+    resume(run)
+    assert_same_run(whole, run)
+
+
+def newest_other_than(run):
+    from rlctl.run.directory import RunDirectory
+
+    (other,) = (each for each in run.path.parent.iterdir() if each != run.path)
+    return RunDirectory(other)
