@@ -42,6 +42,8 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
         "episodes": list(model.ep_info_buffer or ()),
         "successes": [bool(each) for each in model.ep_success_buffer or ()],
         "log": _logged(model),
+        # Images lie in memory with their channels last, and convolutions of another layout round differently.
+        "axes": {name: _axes(values) for name, values in _observed(model).items()},
     }
     return tensors, plain
 
@@ -53,7 +55,7 @@ def put_back(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> N
         model.set_parameters(parameters, exact_match=True, device=model.device)
         _put_back_variables(model, tensors)
         _put_back_normalizer(model, tensors)
-        _put_back_rollout(model, tensors)
+        _put_back_rollout(model, tensors, plain["axes"])
         for name, value in plain["counters"].items():
             setattr(model, name, value)
         _put_back_log(model, plain)
@@ -219,14 +221,29 @@ def _put_back_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
 _OBSERVED = ("_last_obs", "_last_original_obs")
 
 
+def _observed(model: BaseAlgorithm) -> Tensors:
+    found: Tensors = {}
+    for name in _OBSERVED:
+        value: Any = getattr(model, name)
+        parts = value if isinstance(value, dict) else {"": value}
+        found |= {f"rollout/{name}/{key}": part for key, part in parts.items() if part is not None}
+    return found
+
+
+def _axes(array: NDArray[Any]) -> list[int]:
+    """Return the axes in the order in which they lie in memory, the slowest first."""
+    return sorted(range(array.ndim), key=lambda axis: -array.strides[axis])
+
+
+def _laid_out(values: NDArray[Any], axes: list[int]) -> NDArray[Any]:
+    """Copy an array into memory in the order of `axes`."""
+    return values.transpose(axes).copy().transpose(np.argsort(axes))
+
+
 def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
     """Return what the next step is chosen from."""
     tensors: Tensors = {"rollout/starts": np.asarray(model._last_episode_starts)}
-    for name in _OBSERVED:
-        value: Any = getattr(model, name)
-        if value is not None:
-            parts = value if isinstance(value, dict) else {"": value}
-            tensors |= {f"rollout/{name}/{key}": np.asarray(part) for key, part in parts.items()}
+    tensors |= {name: np.asarray(part) for name, part in _observed(model).items()}
     states: Any = getattr(model, "_last_lstm_states", None)
     for kind, pair in zip(("pi", "vf"), states or (), strict=False):
         for place, each in enumerate(pair):
@@ -234,11 +251,13 @@ def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
     return tensors
 
 
-def _put_back_rollout(model: BaseAlgorithm, tensors: Tensors) -> None:
+def _put_back_rollout(model: BaseAlgorithm, tensors: Tensors, axes: dict[str, list[int]]) -> None:
     model._last_episode_starts = tensors["rollout/starts"].copy()
     for name in _OBSERVED:
         prefix = f"rollout/{name}/"
-        parts = {key[len(prefix) :]: value.copy() for key, value in tensors.items() if key.startswith(prefix)}
+        parts = {
+            key[len(prefix) :]: _laid_out(value, axes[key]) for key, value in tensors.items() if key.startswith(prefix)
+        }
         setattr(model, name, parts.get("", parts or None))
     if getattr(model, "_last_lstm_states", None) is not None:
         pairs = [

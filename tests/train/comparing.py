@@ -38,9 +38,7 @@ def assert_same_run(one: RunDirectory, other: RunDirectory) -> None:
     (ours, _), (theirs, _) = checkpoint.newest(one), checkpoint.newest(other)
     assert ours.state.step == theirs.state.step
     assert ours.tensors.keys() == theirs.tensors.keys()
-    different = [
-        name for name, values in ours.tensors.items() if values.tobytes() != theirs.tensors[name].tobytes()
-    ]
+    different = [name for name, values in ours.tensors.items() if values.tobytes() != theirs.tensors[name].tobytes()]
     assert different == []
     assert repr(ours.state.model) == repr(theirs.state.model)
     timeless = {"seconds": 0.0, "metrics_bytes": 0, "evals_bytes": 0}
