@@ -154,7 +154,7 @@ class TrainingLoop(BaseCallback):
         stage_done = self.curriculum.is_due(steps)
         self._write_metrics_if_due(steps, True)
         if stage_done:  # for a resume that makes the run longer
-            self.display.stage(*self.curriculum.go_on(steps))
+            self._begin_next_stage(steps)
         if self.progress.last_eval < steps:
             self.evaluate(at_end=True)
         self.logger.dump(steps)

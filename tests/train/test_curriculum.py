@@ -4,7 +4,6 @@ import csv
 import io
 import json
 
-import numpy as np
 import pytest
 from rich.console import Console
 
@@ -17,10 +16,12 @@ from rlctl.rollout.workers import EpisodeResult
 from rlctl.run.episode import load_episode
 from rlctl.run.policy import load_policy
 from rlctl.run.recipe import validate
+from rlctl.train import checkpoint
 from rlctl.train.curriculum import Curriculum
 from rlctl.train.display import LiveDisplay
 from rlctl.train.progress import Progress
 from rlctl.train.request import TrainRequest, run_training
+from tests.train.comparing import replay_buffer
 from tests.train.conftest import ENVS, SMALL, SMALL_PPO
 
 # Four environments, episodes of 10 steps, updates every 16: by step 64, 128, 192, 256 of the training
@@ -38,8 +39,8 @@ def column(path, name, kind=int):
     return [kind(row[name]) for row in rows(path)]
 
 
-def progress(run, place=-1):
-    return json.loads((run.checkpoints()[place] / "state.json").read_text())["progress"]
+def saved(run):
+    return checkpoint.newest(run)[0]
 
 
 @pytest.fixture(scope="module")
@@ -115,11 +116,11 @@ def test_evaluation_is_always_in_the_last_stage(staged):
 
 
 def test_checkpoints_know_the_stage_and_addresses_go_on(staged):
-    first, last = progress(staged.run, 0), progress(staged.run)
-    assert (first["stage"], first["stage_began"], first["stage_episodes"]) == (2, 128, [])
+    found = saved(staged.run)
+    assert (found.progress.stage, found.progress.stage_began, found.progress.stage_episodes) == (2, 128, [])
     # 32 steps: three episodes ended, the fourth was left; the fifth begins the stage. Then three ended again.
-    assert first["episodes_started"] == [5] * 4
-    assert last["episodes_started"] == [8] * 4
+    assert found.tensors["environments/episodes_started"].tolist() == [8] * 4
+    assert found.tensors["environments/steps"].tolist() == [2] * 4
 
 
 def test_tensorboard_has_the_stage(staged):
@@ -210,11 +211,11 @@ def test_resume_goes_on_in_the_middle_of_a_stage(train, resume, small_ppo):
         {"task": HARD},
     ]
     result = train("Staged", {**small_ppo, "total_timesteps": 192, "stages": stages})
-    saved = progress(result.run)
+    progress = saved(result.run).progress
     # Stage 2 began at 64; 32 steps later three episodes of each environment are over.
-    assert (saved["stage"], saved["stage_began"], saved["stage_episodes"]) == (2, 64, [1.0] * 12)
+    assert (progress.stage, progress.stage_began, progress.stage_episodes) == (2, 64, [1.0] * 12)
     resume(result, total_timesteps=384)
-    # A resume begins fresh episodes: 16 steps later each environment has one more, and 16 fill the window of 14.
+    # 16 steps later the fourth is over too, and 16 fill the window of 14.
     assert column(result.run.metrics_file, "steps") == [64, 128, 192, 256, 320, 384]
     assert column(result.run.metrics_file, "stage") == [1, 2, 2, 2, 3, 3]
     assert column(result.run.metrics_file, "success", float) == [1.0, 1.0, 1.0, 1.0, 0.0, 0.0]
@@ -223,7 +224,7 @@ def test_resume_goes_on_in_the_middle_of_a_stage(train, resume, small_ppo):
 def test_a_stage_that_is_done_with_the_training_is_left_by_its_resume(train, resume, small_ppo):
     stages = [{"task": EASY, "promote": {"success": 1.0, "window": 4}}, {"task": HARD}]
     result = train("Staged", {**small_ppo, "total_timesteps": 64, "stages": stages})
-    assert (result.stage, progress(result.run)["stage_began"]) == (2, 64)
+    assert (result.stage, saved(result.run).progress.stage_began) == (2, 64)
     resume(result, total_timesteps=128)
     assert column(result.run.metrics_file, "stage") == [1, 2]
     assert column(result.run.metrics_file, "success", float) == [1.0, 0.0]
@@ -236,11 +237,11 @@ def test_an_off_policy_algorithm_keeps_its_replay_buffer(train):
     ]
     settings = {**SMALL, "algo": "sac", "algo_kwargs": {"learning_starts": 32, "batch_size": 16}, "stages": stages}
     result = train("Staged", {**settings, "total_timesteps": 128})
-    buffer = np.load(result.run.checkpoints()[-1] / "replay.npz")
-    # Updates come after each step of the four: 48 steps are rows 0 to 11, 128 are 32.
-    assert buffer["rewards"][:, 0].tolist() == [-1.0] * 12 + [-2.0] * 20
-    # Time limits at the tenth step; the episode left at row 11 is cut there as well.
-    assert np.flatnonzero(buffer["timeouts"][:, 0]).tolist() == [9, 11, 21, 31]
+    buffer = replay_buffer(result.run, saved(result.run).state.segments)
+    # Updates come after each step of the four: 48 steps are transitions 0 to 11, 128 are 32.
+    assert [buffer[number]["rewards/"][0] for number in range(32)] == [-1.0] * 12 + [-2.0] * 20
+    # Time limits at the tenth step; the episode left at transition 11 is cut there as well.
+    assert [number for number in range(32) if buffer[number]["timeouts/"][0]] == [9, 11, 21, 31]
     steps, stage = (column(result.run.metrics_file, name) for name in ("steps", "stage"))
     assert dict(zip(steps, stage, strict=True))[48] == 1
     assert {stage for step, stage in zip(steps, stage, strict=True) if step > 48} == {2}

@@ -8,6 +8,7 @@ from rlctl.errors import DivergedError, RecipeError, TaskError, UsageError
 from rlctl.run import recipe as recipes
 from rlctl.run.episode import load_episode
 from rlctl.run.policy import load_policy
+from rlctl.train import checkpoint
 from tests.train.conftest import ENVS, SMALL
 
 
@@ -25,7 +26,7 @@ def test_run_folder_holds_everything(train, small_ppo):
     assert run.recipe().algo_kwargs["n_steps"] == 16
     assert run.best_policy.is_file()
     assert run.last_policy.is_file()
-    assert [int(folder.name) for folder in run.checkpoints()] == [128, 256]
+    assert int(run.checkpoints()[-1].name) == 256
     assert list(run.tensorboard.iterdir())
     metrics = rows(run.metrics_file)
     assert [int(row["steps"]) for row in metrics] == [64, 128, 192, 256]
@@ -86,23 +87,23 @@ def test_every_algorithm_trains_resumes_and_loads(train, resume, algo, env):
 
 
 def test_resume_goes_on_with_weights_optimiser_normalisation_and_counters(train, resume, small_ppo):
-    from safetensors.numpy import load_file
-
     first = train("Line", small_ppo)
-    before = load_file(first.run.checkpoints()[-1] / "state.safetensors")
-    count = float(before["normalize//count"])
+    before, _ = checkpoint.newest(first.run)
+    count = float(before.tensors["normalize//count"])
     # VecNormalize starts at 1e-4 and counts every observation once, resets included: 256 + 4.
     assert count == pytest.approx(260, abs=0.01)
     resume(first, total_timesteps=320)
-    state = json.loads((first.run.checkpoints()[-1] / "state.json").read_text())
-    after = load_file(first.run.checkpoints()[-1] / "state.safetensors")
-    assert state["counters"]["num_timesteps"] == 320
-    assert state["counters"]["_n_updates"] == 2 * 5  # epochs x rollouts
-    # 64 more, and 4 for the fresh episodes that a resume begins.
-    assert float(after["normalize//count"]) == pytest.approx(count + 68, abs=0.01)
-    adam_steps = {float(value) for key, value in after.items() if key.endswith("/step")}
+    after, _ = checkpoint.newest(first.run)
+    counters = after.state.model["counters"]
+    assert counters["num_timesteps"] == after.state.step == 320
+    assert counters["_n_updates"] == 2 * 5  # epochs x rollouts
+    # 64 more: the episodes that were running are lived on, without a reset that would count.
+    assert float(after.tensors["normalize//count"]) == pytest.approx(count + 64, abs=0.01)
+    adam_steps = {float(value) for key, value in after.tensors.items() if key.endswith("/step")}
     assert adam_steps == {2.0 * 2 * 5}  # minibatches x epochs x rollouts
-    assert state["progress"]["episodes_started"] == [9] * 4  # 64 steps: 6 ended, 7 begun; then 1 + 1 more
+    # 80 steps an environment: eight episodes of ten ended, the ninth has just begun.
+    assert after.tensors["environments/episodes_started"].tolist() == [9] * 4
+    assert after.tensors["environments/steps"].tolist() == [0] * 4
 
 
 def test_resuming_a_finished_run_does_nothing(train, resume, small_ppo):
@@ -118,13 +119,17 @@ def test_resume_takes_no_other_recipe(train, resume, small_ppo):
         resume(first, algo="sac")
 
 
-def test_resume_falls_back_to_the_checkpoint_before_a_damaged_one(train, resume, small_ppo):
+def test_resume_falls_back_to_the_checkpoint_before_a_damaged_one(train, resume, small_ppo, capsys):
     first = train("Line", small_ppo)
     newest = first.run.checkpoints()[-1] / "state.safetensors"
     content = bytearray(newest.read_bytes())
     content[-1] ^= 1
     newest.write_bytes(bytes(content))
     resume(first)
+    assert f"warning: {newest}: damaged: its sha256 is not the one it was saved with; going on from step " in (
+        capsys.readouterr().err
+    )
+    assert (newest.parent.parent / "000000256.damaged").is_dir()
     assert [int(row["steps"]) for row in rows(first.run.metrics_file)] == [64, 128, 192, 256]
     assert [int(row["steps"]) for row in rows(first.run.evals_file)] == [128, 256]
 
