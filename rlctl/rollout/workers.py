@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from rlctl import errors
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError, TaskError
+from rlctl.rollout import goal_rewards
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
 from rlctl.run.env_info import EnvInfo
 
@@ -200,6 +201,17 @@ class Workers:
                 )
         return ended
 
+    def compute_rewards(self, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.float64]:
+        """Return what environment 0 says steps are worth that reached one goal and wanted another.
+
+        Goals of shape (n, *goal), rewards (n,). Raises `TaskError`, which names compute_reward, if it raises, hangs, or
+        does not return n finite numbers.
+        """
+        self._wait_until_built()
+        self._send(0, goal_rewards.question(achieved, desired))
+        answers = self._answers([0], self.timeout_s, "in compute_reward")
+        return np.array(answers[0]["rewards"], np.float64)
+
     def observations(self, rows: Any = slice(None)) -> Observations:
         """Return a copy of the current observations, shape (rows, ...) or a dict of such."""
         return _picked(self.arrays.observation, rows)
@@ -258,8 +270,7 @@ class Workers:
         kind = getattr(errors, error["kind"], TaskError) if error["kind"] else TaskError
         if kind is TaskError and self._spec.task not in message.partition("\n")[0]:
             message = f"task {self._spec.task!r}: {message}"
-        details = None if error["kind"] else error["traceback"]
-        result: RlctlError = kind(message, details=details)
+        result: RlctlError = kind(message, details=error["traceback"])
         return result
 
     def _place(self, env: int, seed: int, step: int) -> str:
