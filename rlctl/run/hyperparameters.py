@@ -20,6 +20,7 @@ class Range:
     """Also as SB3's pair of a number and a unit, such as [1, episode]."""
 
     def check(self, name: str, value: Any) -> None:
+        """Raise `ValueError`, which names the parameter and the range, for a value outside it."""
         if self.with_unit and isinstance(value, list) and value:
             value = value[0]
         if isinstance(value, str) and value.startswith(self.text or ("\0",)):

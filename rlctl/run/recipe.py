@@ -23,6 +23,8 @@ from rlctl.run.stages import Promotion, Stage, check_promotions
 Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
+IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
+"""What can learn in hindsight: what has a replay buffer, except crossq, which has no network for Dict spaces."""
 
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
 
@@ -47,6 +49,13 @@ class Evaluation(_Section):
     episodes: int = Field(100, ge=1)
 
 
+class Hindsight(_Section):
+    """Hindsight experience replay, by the names of SB3's `HerReplayBuffer`; see `rlctl.train.hindsight`."""
+
+    n_sampled_goal: int = Field(4, ge=1)
+    goal_selection_strategy: Literal["future", "final", "episode"] = "future"
+
+
 class Checkpoints(_Section):
     keep: int = Field(3, ge=1)
 
@@ -61,6 +70,7 @@ class Recipe(_Section):
     algo: Algorithm = "ppo"
     algo_kwargs: dict[str, Any] = {}
     policy_kwargs: dict[str, Any] = {}
+    her: Hindsight | None = None
     normalize: Normalize | None = None
     frame_stack: int = Field(1, ge=1)
     n_envs: int = Field(8, ge=1)
@@ -78,6 +88,14 @@ class Recipe(_Section):
             if name in RANGES:
                 RANGES[name].check(name, value)
         return values
+
+    @pydantic.field_validator("her")
+    @classmethod
+    def _has_replay(cls, value: Hindsight | None, others: pydantic.ValidationInfo) -> Hindsight | None:
+        algo = others.data.get("algo")  # not there if it is wrong itself, which is then told
+        if value is not None and algo is not None and algo not in IN_HINDSIGHT:
+            raise ValueError(f"{algo} cannot learn in hindsight; {', '.join(IN_HINDSIGHT)} can")
+        return value
 
     @pydantic.field_validator("stages")
     @classmethod
@@ -159,7 +177,7 @@ def resolve(
     return with_defaults(validate(merged, source))
 
 
-_OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "normalize", "n_envs", "total_timesteps")
+_OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
 
 
 def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -197,6 +215,7 @@ def _explain(problem: Any) -> str:
 
 
 _SECTIONS: dict[str, type[pydantic.BaseModel]] = {
+    "her": Hindsight,
     "normalize": Normalize,
     "eval": Evaluation,
     "checkpoint": Checkpoints,
