@@ -24,6 +24,7 @@ from gymnasium import spaces
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError
+from rlctl.rollout import goal_rewards
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
 from rlctl.run.env_info import describe
 from rlctl.task.env import TaskEnv
@@ -203,7 +204,7 @@ def _error(error: BaseException) -> dict[str, Any]:
     return {
         "message": str(cause) if ours else f"{type(cause).__name__}: {cause}",
         "kind": type(cause).__name__ if ours else None,
-        "traceback": "".join(traceback.format_exception(cause)),
+        "traceback": cause.details if isinstance(cause, RlctlError) else "".join(traceback.format_exception(cause)),
         **where,
     }
 
@@ -258,6 +259,9 @@ def _serve(job: dict[str, Any]) -> None:
             elif message == b"attach":
                 worker.attach()
                 ended = []
+            elif message.startswith(goal_rewards.QUESTION):
+                answer(rewards=goal_rewards.answer(worker.episodes[0].env, message))
+                continue
             elif message.startswith(b"{"):
                 worker.close()
                 gc.unfreeze()

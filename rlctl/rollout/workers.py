@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from rlctl import errors
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
+from rlctl.rollout import goal_rewards
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
 from rlctl.run.env_info import EnvInfo
 
@@ -217,6 +218,17 @@ class Workers:
                 )
         return ended
 
+    def compute_rewards(self, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.float64]:
+        """Return what environment 0 says steps are worth that reached one goal and wanted another.
+
+        Goals of shape (n, *goal), rewards (n,). Raises `TaskError`, which names compute_reward, if it raises, hangs, or
+        does not return n finite numbers.
+        """
+        self._wait_until_built()
+        self._send(0, goal_rewards.question(achieved, desired))
+        answers = self._answers([0], self.timeout_s, "in compute_reward")
+        return np.array(answers[0]["rewards"], np.float64)
+
     def observations(self, rows: Any = slice(None)) -> Observations:
         """Return a copy of the current observations, shape (rows, ...) or a dict of such."""
         return _picked(self.arrays.observation, rows)
@@ -272,7 +284,7 @@ class Workers:
         message = error["message"]
         kind = getattr(errors, error["kind"], TaskError) if error["kind"] else TaskError
         place = (error["env"], error["seed"], error["step"]) if "env" in error else None
-        details = None if error["kind"] else error["traceback"]
+        details = error["traceback"]
         if kind is TaskError and self._spec.task not in message.partition("\n")[0]:
             message = f"task {self._spec.task!r}: {message}"
         if place is not None:

@@ -25,6 +25,8 @@ class EnvInfo(pydantic.BaseModel):
     """Time between two actions [s]."""
     reward_weights: dict[str, float] = {}
     has_success: bool = False
+    has_compute_reward: bool = False
+    """Whether it can say what a step would have been worth, had another goal been wanted."""
     max_steps: int | None = None
     robot: str = ""
 
@@ -53,9 +55,10 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
     from rlctl.task.env import TaskEnv
 
     inner = env.unwrapped
-    common = {
+    common: dict[str, Any] = {
         "observation_space": space_to_json(env.observation_space),
         "action_space": space_to_json(env.action_space),
+        "has_compute_reward": callable(getattr(inner, "compute_reward", None)),
     }
     if isinstance(inner, TaskEnv):
         task = inner.task

@@ -6,7 +6,6 @@ A recipe is made from the task's packaged YAML, then `--config`, then `--set` an
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -18,11 +17,14 @@ from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean
 from rlctl.run import yaml_text
+from rlctl.run.hyperparameters import RANGES
 from rlctl.run.stages import Promotion, Stage, check_promotions
 
 Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
+IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
+"""What can learn in hindsight: what has a replay buffer, except crossq, which has no network for Dict spaces."""
 
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
 
@@ -49,6 +51,13 @@ class Evaluation(_Section):
     """Whether to take the mean action, and not a sample."""
 
 
+class Hindsight(_Section):
+    """Hindsight experience replay, by the names of SB3's `HerReplayBuffer`; see `rlctl.train.hindsight`."""
+
+    n_sampled_goal: int = Field(4, ge=1)
+    goal_selection_strategy: Literal["future", "final", "episode"] = "future"
+
+
 class Checkpoints(_Section):
     keep: int = Field(3, ge=1)
 
@@ -63,6 +72,7 @@ class Recipe(_Section):
     algo: Algorithm = "ppo"
     algo_kwargs: dict[str, Any] = {}
     policy_kwargs: dict[str, Any] = {}
+    her: Hindsight | None = None
     normalize: Normalize | None = None
     frame_stack: int = Field(1, ge=1)
     n_envs: int = Field(8, ge=1)
@@ -77,9 +87,17 @@ class Recipe(_Section):
     @classmethod
     def _in_range(cls, values: dict[str, Any]) -> dict[str, Any]:
         for name, value in values.items():
-            if name in _RANGES:
-                _RANGES[name].check(name, value)
+            if name in RANGES:
+                RANGES[name].check(name, value)
         return values
+
+    @pydantic.field_validator("her")
+    @classmethod
+    def _has_replay(cls, value: Hindsight | None, others: pydantic.ValidationInfo) -> Hindsight | None:
+        algo = others.data.get("algo")  # not there if it is wrong itself, which is then told
+        if value is not None and algo is not None and algo not in IN_HINDSIGHT:
+            raise ValueError(f"{algo} cannot learn in hindsight; {', '.join(IN_HINDSIGHT)} can")
+        return value
 
     @pydantic.field_validator("stages")
     @classmethod
@@ -105,65 +123,6 @@ class Recipe(_Section):
     def to_yaml(self) -> str:
         """Return the recipe as YAML that is itself valid for `--config`."""
         return yaml_text.dump(self.model_dump(mode="json", by_alias=True))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Range:
-    """Where a numeric hyperparameter makes sense; `text` values such as SAC's `auto` pass where allowed."""
-
-    low: float
-    high: float = math.inf
-    integer: bool = False
-    text: tuple[str, ...] = ()
-    open_low: bool = False
-    with_unit: bool = False
-    """Also as SB3's pair of a number and a unit, such as [1, episode]."""
-
-    def check(self, name: str, value: Any) -> None:
-        if self.with_unit and isinstance(value, list) and value:
-            value = value[0]
-        if isinstance(value, str) and value.startswith(self.text or ("\0",)):
-            return
-        kind = "a whole number" if self.integer else "a number"
-        good = isinstance(value, int | float) and not isinstance(value, bool)
-        if good and self.integer:
-            good = float(value).is_integer()
-        if not good:
-            raise ValueError(f"{name}: expected {kind}, got {value!r}")
-        if not (self.low < value if self.open_low else self.low <= value) or not value <= self.high:
-            raise ValueError(f"{name}: {value} is not in {self}")
-
-    def __str__(self) -> str:
-        return f"{'(' if self.open_low else '['}{self.low:g}, {self.high:g}]"
-
-
-_COUNT = _Range(1, integer=True)
-_FRACTION = _Range(0, 1)
-_PART = _Range(0, 1, open_low=True)
-_RANGES = {
-    "learning_rate": _Range(0, 1, text=("lin_",), open_low=True),
-    "n_steps": _COUNT,
-    "batch_size": _Range(2, integer=True),
-    "n_epochs": _COUNT,
-    "gamma": _PART,
-    "gae_lambda": _FRACTION,
-    "clip_range": _Range(0, 10, text=("lin_",), open_low=True),
-    "ent_coef": _Range(0, text=("auto",)),
-    "vf_coef": _Range(0),
-    "max_grad_norm": _Range(0, open_low=True),
-    "target_kl": _Range(0, open_low=True),
-    "buffer_size": _COUNT,
-    "learning_starts": _Range(0, integer=True),
-    "train_freq": _Range(1, integer=True, with_unit=True),
-    "gradient_steps": _Range(-1, integer=True),
-    "tau": _PART,
-    "target_update_interval": _COUNT,
-    "policy_delay": _COUNT,
-    "exploration_fraction": _FRACTION,
-    "exploration_initial_eps": _FRACTION,
-    "exploration_final_eps": _FRACTION,
-    "top_quantiles_to_drop_per_net": _Range(0, integer=True),
-}
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -220,7 +179,7 @@ def resolve(
     return with_defaults(validate(merged, source))
 
 
-_OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "normalize", "n_envs", "total_timesteps")
+_OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
 
 
 def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -258,6 +217,7 @@ def _explain(problem: Any) -> str:
 
 
 _SECTIONS: dict[str, type[pydantic.BaseModel]] = {
+    "her": Hindsight,
     "normalize": Normalize,
     "eval": Evaluation,
     "checkpoint": Checkpoints,

@@ -16,7 +16,7 @@ from rlctl.errors import RecipeError, TaskError, did_you_mean
 from rlctl.task.events import EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
 from rlctl.task.sim import Sim
-from rlctl.task.task import Task, has_success
+from rlctl.task.task import Task, has_compute_reward, has_success
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
@@ -46,6 +46,9 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.reward_weights = _weights(task, reward_weights or {})
         self.events = (events or EventSettings()).apply(task.events)
         self.has_success = has_success(task)
+        if has_compute_reward(task):
+            # Only then: who wants to exchange goals looks whether an environment has it.
+            self.compute_reward = task.compute_reward
         self.max_steps = task.max_steps
         # A space holds a random generator: one on the class would be shared by every instance.
         self.action_space = copy.deepcopy(task.action_space)

@@ -87,6 +87,15 @@ class Task:
         """Say whether the episode is over for a reason of its own (a fall); never for time. Optional."""
         return False
 
+    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> NDArray[Any]:
+        """Return what steps would have been rewarded, had other goals been wanted: both (n, size) -> (n,). Optional.
+
+        Hindsight replay (`her` in a recipe) asks for it. Observe `observation`, `achieved_goal` and `desired_goal` in
+        the layout "dict". The result is the weighted sum of `rewards`, of the goals alone: `info` is empty. Write it
+        along the last axis, so that of a single pair of goals, shape (size,), it is one number.
+        """
+        raise NotImplementedError
+
     def markers(self) -> dict[str, NDArray[np.float64]]:
         """Return points worth drawing, such as the goal: name -> world position of shape (3,) [m]. Optional."""
         return {}
@@ -107,3 +116,8 @@ class Task:
 def has_success(task: Task) -> bool:
     """Say whether the task defines success."""
     return type(task).is_success is not Task.is_success
+
+
+def has_compute_reward(task: Task) -> bool:
+    """Say whether the task defines `compute_reward`."""
+    return type(task).compute_reward is not Task.compute_reward

@@ -17,6 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from rlctl.errors import RecipeError, UsageError, did_you_mean
 from rlctl.run.recipe import Normalize, Recipe
 from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
+from rlctl.train.hindsight import replay_arguments
+from rlctl.train.vec_env import WorkerVecEnv
 
 # Set by rlctl itself, or not plain data.
 _NOT_FOR_RECIPES = frozenset(
@@ -34,19 +36,23 @@ _NOT_FOR_POLICIES = frozenset(
 _DETERMINISTIC_EXPLORERS = frozenset({"td3", "ddpg"})
 
 
-def build_model(recipe: Recipe, env: VecEnv, device: str) -> BaseAlgorithm:
+def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm:
     """Build the model of a recipe on vector environments; raises `RecipeError` for what does not fit."""
     _check_device(device)
     cls = ALGORITHMS[recipe.algo]
     kwargs = _algorithm_kwargs(recipe, cls, env.action_space)
-    env = normalized(env, recipe.normalize, kwargs.get("gamma", 0.99))
+    if recipe.her is not None:
+        kwargs = {**replay_arguments(recipe, recipe.her, env.workers.info), **kwargs}
     name = policy_name(recipe.algo, env.observation_space)
+    if name not in cls.policy_aliases:
+        kind = "dictionaries" if isinstance(env.observation_space, spaces.Dict) else "images"
+        raise RecipeError(f"{recipe.algo} cannot be used here: it has no network for {kind}")
     policy_kwargs = _policy_kwargs(recipe, cls.policy_aliases[name])
     _check_rollout(recipe, env.num_envs)
     try:
         return cls(
             name,
-            env,
+            normalized(env, recipe.normalize, kwargs.get("gamma", 0.99)),
             policy_kwargs=policy_kwargs,
             seed=recipe.seed,
             device=device,

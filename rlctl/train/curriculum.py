@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from rlctl.env_spec import EnvSpec
@@ -16,6 +17,7 @@ from rlctl.rollout.workers import EpisodeResult, Workers
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.stages import Stage, StageContent, title
 from rlctl.train.display import percent
+from rlctl.train.hindsight import HindsightBuffer
 from rlctl.train.progress import Progress
 
 
@@ -146,9 +148,18 @@ def begin_next_episodes(model: BaseAlgorithm) -> None:
     """Leave the running episodes and begin the next ones, as SB3 does at the start of a training."""
     env: Any = model.env
     if isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
-        # Cut short but not over: a return over several steps must not reach into the next stage.
-        model.replay_buffer.timeouts[model.replay_buffer.pos - 1] = 1.0
+        _cut_episodes(model.replay_buffer)
     model._last_obs = env.reset()
     model._last_episode_starts = np.ones(env.num_envs, np.bool_)
     if (normalizer := model.get_vec_normalize_env()) is not None:
         model._last_original_obs = normalizer.get_original_obs()
+
+
+def _cut_episodes(buffer: ReplayBuffer) -> None:
+    """Mark the running episodes as cut short but not over: no return, and no goal, reaches into the next stage."""
+    if isinstance(buffer, HindsightBuffer):
+        buffer.truncate_last_trajectory()
+        return
+    last = buffer.pos - 1
+    running = buffer.dones[last] == 0.0  # the others have said themselves how they ended
+    buffer.timeouts[last, running] = 1.0

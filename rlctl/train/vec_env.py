@@ -112,6 +112,9 @@ class WorkerVecEnv(VecEnv):
         raise AttributeError(f"worker environments take no attributes: {attr_name}")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        if method_name == "compute_reward":  # of SB3's hindsight replay; its infos are empty
+            rewards = self.workers.compute_rewards(*method_args[:2])
+            return [rewards for _ in self._get_indices(indices)]
         raise AttributeError(f"worker environments hand out no methods: {method_name}")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:

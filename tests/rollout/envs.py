@@ -116,6 +116,34 @@ class Spaces(gymnasium.Env):
         return self.observe(), float(np.sum(action)), False, self.steps == 3, {}
 
 
+class Goals(Walk):
+    """Says what goals are worth, minus their distance times `scale`; what `fault` names happens instead."""
+
+    def __init__(self, fault="", scale=1.0):
+        super().__init__()
+        self.goals_fault, self.scale = fault, scale
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        assert info == [{}] * len(achieved_goal)
+        rewards = -self.scale * np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+        if self.goals_fault == "raise":
+            raise RuntimeError("the goal has gone")
+        if self.goals_fault == "nan":
+            rewards[2] = np.nan
+        if self.goals_fault == "exit":
+            sys.exit("done here")
+        if self.goals_fault == "_exit":
+            os._exit(4)
+        if self.goals_fault == "hang":
+            time.sleep(600)
+        return {
+            "column": rewards[:, None],
+            "number": rewards[0],
+            "text": rewards.astype(str),
+            "list": list(rewards),
+        }.get(self.goals_fault, rewards)
+
+
 @dataclass
 class Counting(Task):
     """A task without physics: a number is counted."""

@@ -54,6 +54,15 @@ def test_another_algorithm_takes_nothing_of_the_packaged_ones(packaged):
     assert not result.normalize.observation
 
 
+def test_another_algorithm_takes_no_hindsight_of_the_packaged_one(packaged, tmp_path):
+    (tmp_path / "my_env.yaml").write_text("algo: sac\nher: {n_sampled_goal: 2}\n")
+    assert resolve(packaged, None, {}).her == recipe.Hindsight(n_sampled_goal=2, goal_selection_strategy="future")
+    assert resolve(packaged, None, parse_settings(["her=null"])).her is None
+    assert resolve(packaged, None, {"algo": "ppo"}).her is None
+    assert resolve(packaged, None, {"algo": "td3"}).her is None
+    assert resolve(packaged, None, {"algo": "td3", "her": {}}).her == recipe.Hindsight()
+
+
 def test_the_same_algorithm_named_again_keeps_them(packaged):
     assert resolve(packaged, None, {"algo": "ppo"}).algo_kwargs["n_steps"] == 100
 
@@ -90,6 +99,19 @@ def test_a_resolved_recipe_is_a_config(packaged, config):
         ({"alog": "ppo"}, "no key 'alog'. Did you mean 'algo'? Keys here: task, reward_weights, "),
         ({"eval": {"episode": 3}}, "no key 'eval.episode'. Did you mean 'episodes'? Keys here: every_steps, episodes."),
         ({"checkpoint": {"kep": 3}}, "no key 'checkpoint.kep'. Did you mean 'keep'? Keys here: keep."),
+        (
+            {"algo": "sac", "her": {"n_sampled_goals": 3}},
+            "no key 'her.n_sampled_goals'. Did you mean 'n_sampled_goal'? Keys here: n_sampled_goal, "
+            "goal_selection_strategy.",
+        ),
+        ({"algo": "sac", "her": {"n_sampled_goal": 0}}, "her.n_sampled_goal: should be greater than or equal to 1, "),
+        (
+            {"algo": "sac", "her": {"goal_selection_strategy": "past"}},
+            "her.goal_selection_strategy: should be 'future', 'final' or 'episode', got 'past'",
+        ),
+        ({"her": {}}, "her: ppo cannot learn in hindsight; sac, td3, ddpg, dqn, tqc can"),
+        ({"algo": "crossq", "her": {}}, "her: crossq cannot learn in hindsight; sac, td3, ddpg, dqn, tqc can"),
+        ({"algo": "sacc", "her": {}}, "algo: should be 'ppo', 'a2c', "),
         ({"n_envs": "many"}, "n_envs: should be a valid integer, unable to parse string as an integer, got 'many'"),
         ({"n_envs": 0}, "n_envs: should be greater than or equal to 1, got 0"),
         ({"task": 3}, "task: should be a valid dictionary, got 3"),

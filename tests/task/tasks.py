@@ -77,6 +77,39 @@ class ByName(Slider):
     observation_layout = "dict"
 
 
+@dataclass
+class Place(Task):
+    """A point in a square is moved to a goal; 1 is lost at every step that ends away from it. No physics."""
+
+    tolerance: float = 0.1
+
+    control_dt, episode_s = 0.1, 1.0
+    action_space = Box(-1.0, 1.0, (2,), np.float32)
+    observation_layout = "dict"
+    reward_weights = {"away": -1.0}
+
+    def build(self, sim: Sim) -> None:
+        self.place = self.goal = np.zeros(2)
+
+    def reset(self, rng):
+        self.place, self.goal = np.zeros(2), rng.uniform(-1, 1, 2)
+
+    def act(self, action):
+        self.place = np.clip(self.place + 0.1 * action, -1, 1)
+
+    def observe(self):
+        return {"observation": self.place, "achieved_goal": self.place, "desired_goal": self.goal}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -1.0 * (np.linalg.norm(achieved_goal - desired_goal, axis=-1) > self.tolerance)
+
+    def rewards(self, action):
+        return {"away": -float(self.compute_reward(self.place, self.goal, {}))}
+
+    def is_success(self):
+        return bool(np.linalg.norm(self.place - self.goal) <= self.tolerance)
+
+
 class Buttons(Slider):
     """Two buttons."""
 

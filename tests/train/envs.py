@@ -144,3 +144,76 @@ class Staged(Line):
     def step(self, action):
         observation, _, terminated, truncated, _ = super().step(action)
         return observation, -self.cost, terminated, truncated, {"is_success": abs(self.x) < self.tolerance}
+
+
+class Plane(gymnasium.Env):
+    """A point in a square is moved to a goal; -1 at every step that ends more than `tolerance` away from it."""
+
+    def __init__(self, steps: int = 25, tolerance: float = 0.1, fault: str = ""):
+        self.limit, self.tolerance, self.fault = steps, tolerance, fault
+        place = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.observation_space = spaces.Dict({"observation": place, "achieved_goal": place, "desired_goal": place})
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        self.place = np.zeros(2, np.float32)
+        self.goal = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return self._observation(), {}
+
+    def _observation(self):
+        return {"observation": self.place.copy(), "achieved_goal": self.place.copy(), "desired_goal": self.goal.copy()}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        if self.fault == "raise":
+            raise RuntimeError("goals have gone")
+        far = np.linalg.norm(achieved_goal - desired_goal, axis=-1) > self.tolerance
+        return -far.astype(np.float32)
+
+    def step(self, action):
+        self.steps += 1
+        self.place = np.clip(self.place + 0.1 * np.asarray(action, np.float32), -1, 1)
+        reached = bool(np.linalg.norm(self.place - self.goal) <= self.tolerance)
+        return self._observation(), reached - 1.0, False, self.steps >= self.limit, {"is_success": reached}
+
+
+class Corridor(Plane):
+    """The same, with four actions: a step to each side."""
+
+    def __init__(self, steps: int = 25):
+        super().__init__(steps)
+        self.action_space = spaces.Discrete(4)
+
+    def step(self, action):
+        return super().step([(1, 0), (-1, 0), (0, 1), (0, -1)][action])
+
+
+class NoRewards(Plane):
+    """The same, without a word on other goals."""
+
+    compute_reward = None
+
+
+class NoWish(Plane):
+    """The same, and nobody sees the goal."""
+
+    def __init__(self):
+        super().__init__()
+        del self.observation_space.spaces["desired_goal"]
+
+
+class OtherGoal(Plane):
+    """The same, with a goal of another shape than what is reached."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space["desired_goal"] = spaces.Box(-1.0, 1.0, (3,), np.float32)
+
+
+class Ending(Line):
+    """Ends at the fifth step if it starts on the left, and by the time limit at the tenth."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, self.x < 0 and self.steps == 5, truncated, info
