@@ -162,6 +162,12 @@ class RunLock:
             os.close(self._descriptor)
         self._descriptor = -1
 
+    def __enter__(self) -> RunLock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
 
 def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
     """Make a new run folder, `<root>/<task>/<time>_s<seed>`, and point `<root>/latest` to it."""

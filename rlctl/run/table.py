@@ -30,9 +30,8 @@ class Table:
         return self.size == size
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Add a row and write it; None becomes an empty field. Raises `OSError`, and keeps the row, if it cannot."""
+        """Add a row, which the next `flush` writes; None becomes an empty field."""
         self._waiting.append({key: "" if value is None else value for key, value in row.items()})
-        self.flush()
 
     def flush(self, *, sync: bool = False) -> None:
         """Write the rows that wait; with `sync` down to the disk itself. All of them, or `OSError` and none."""

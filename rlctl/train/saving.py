@@ -72,7 +72,8 @@ class Saver:
 
     def row(self, table: Table, row: dict[str, Any]) -> None:
         """Add a row to a table; one that the disk does not take now is written with the next."""
-        self.attempt(table.path.name, lambda: table.add(row))
+        table.add(row)
+        self.attempt(table.path.name, table.flush)
 
     def checkpoint_is_due(self) -> bool:
         """Whether the time that checkpoints may take allows one."""
