@@ -198,7 +198,7 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> tup
     """Return the policy file for a user's word, which may be a policy file itself, and its run if it has one."""
     if text is not None and Path(text).suffix in (".safetensors", ".onnx"):
         path = Path(text)
-        if not path.is_file():
+        if not path.exists():
             raise ArtifactError(f"{path}: no such file")
         owner = path.parent.parent
         return path, RunDirectory(owner) if (owner / "run.json").is_file() else None

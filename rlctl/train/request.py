@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import Interrupted, RecipeError, TaskError, UsageError
+from rlctl.named_task import RUN
 from rlctl.rollout.workers import Workers
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory, RunLock
@@ -96,7 +97,7 @@ def run_training(request: TrainRequest) -> TrainResult:
 def _run(request: TrainRequest, start: _Start) -> TrainResult:
     if start.state and start.state["counters"]["num_timesteps"] >= start.recipe.total_timesteps:
         return _nothing_to_do(start)
-    specs = start.recipe.env_specs(start.task)
+    specs = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")
     title = f"{'resume' if start.state else 'train'} {start.task} ({start.recipe.algo})"
     with make_display(title, start.recipe.total_timesteps) as display:
         # The workers build their environments, and the check runs, while this process imports torch.
