@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import registry
-from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.errors import ArtifactError, UsageError, did_you_mean, shown
 from rlctl.run import files
 from rlctl.run.recipe import Recipe, read, validate
 
 ROOT = Path("runs")
+_DIGITS = 18  # of a training step
 
 
 class RunDirectory:
@@ -70,7 +71,7 @@ class RunDirectory:
         folder = self.path / "checkpoints"
         if not folder.is_dir():
             return []
-        return sorted(each for each in folder.iterdir() if each.name.isdigit())
+        return sorted(each for each in folder.iterdir() if each.name.isdecimal())
 
     def episode_file(self, number: int) -> Path:
         """Return the file of a recorded episode."""
@@ -78,7 +79,7 @@ class RunDirectory:
 
     def next_episode_number(self) -> int:
         """Return the number after the highest one there is."""
-        numbers = [int(each.stem) for each in self.episodes.glob("*.npz") if each.stem.isdigit()]
+        numbers = [int(each.stem) for each in self.episodes.glob("*.npz") if each.stem.isdecimal()]
         return max(numbers, default=-1) + 1
 
     def recipe(self) -> Recipe:
@@ -88,7 +89,7 @@ class RunDirectory:
     def status(self) -> dict[str, Any]:
         """Read `run.json`."""
         status = files.read_json(self.status_file)
-        if not isinstance(status, dict) or "task" not in status:
+        if not isinstance(status, dict) or not isinstance(status.get("task"), str):
             raise ArtifactError(f"{self.status_file}: not a run of rlctl: it names no task")
         return status
 
@@ -105,8 +106,8 @@ class RunDirectory:
                 hint = "train longer, or use --checkpoint last" if which == "best" else "it saved none"
                 raise ArtifactError(f"{self.path}: no {which} policy yet; {hint}")
             return file
-        if not which.isdigit():
-            raise UsageError(f"--checkpoint {which!r}: give best, last, or the step of a checkpoint")
+        if not which.isdecimal() or len(which) > _DIGITS:
+            raise UsageError(f"--checkpoint {shown(which)!r}: give best, last, or the step of a checkpoint")
         file = self.checkpoint(int(which)) / "policy.safetensors"
         if not file.is_file():
             steps = ", ".join(str(int(each.name)) for each in self.checkpoints())
@@ -122,7 +123,14 @@ class RunDirectory:
                 place.unlink()
 
     def lock(self) -> RunLock:
-        """Claim the folder for writing until the lock is released or the process ends."""
+        """Claim the folder for writing until the lock is released or the process ends.
+
+        Raises `ArtifactError` for a folder with a link out of it: what is written must stay in the run.
+        """
+        own = self.path.resolve()
+        for place in self.path.rglob("*"):
+            if place.is_symlink() and not place.resolve().is_relative_to(own):
+                raise ArtifactError(f"{place}: a link out of the run's folder; nothing is written through it")
         return RunLock(self.path)
 
 

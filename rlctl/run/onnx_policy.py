@@ -55,17 +55,8 @@ class OnnxPolicy(Policy):
     @classmethod
     def load(cls, path: Path) -> OnnxPolicy:
         """Read an exported file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
-        content = untrusted.read_bytes(path, _LARGEST)
-        try:
-            onnx_file.check(content)
-            _limit_memory()
-            session = onnxruntime.InferenceSession(content, _options(), providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's own errors have no public base class
-            raise ArtifactError(
-                f"{path}: damaged, or not an ONNX file that onnxruntime {onnxruntime.__version__} can read: "
-                f"{shown(str(error), 200)}"
-            ) from None
-        text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        session, metadata = _opened(path)
+        text = metadata.get(METADATA_KEY)
         if text is None:
             raise ArtifactError(
                 f"{path}: not an ONNX file of rlctl: its metadata has no {METADATA_KEY!r} entry; "
@@ -130,6 +121,21 @@ class OnnxPolicy(Policy):
             return None
         layers, hidden = self._state_size
         return tuple(np.zeros((layers, rows, hidden), np.float32) for _ in STATE_INPUTS)
+
+
+def _opened(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
+    """Return a session on a file, and the file's metadata."""
+    content = untrusted.read_bytes(path, _LARGEST)
+    try:
+        onnx_file.check(content)
+        _limit_memory()
+        session = onnxruntime.InferenceSession(content, _options(), providers=["CPUExecutionProvider"])
+        return session, session.get_modelmeta().custom_metadata_map
+    except Exception as error:  # onnxruntime's own errors have no public base class
+        raise ArtifactError(
+            f"{path}: damaged, or not an ONNX file that onnxruntime {onnxruntime.__version__} can read: "
+            f"{shown(str(error), 200)}"
+        ) from None
 
 
 def _fields(space: spaces.Space[Any]) -> dict[str, tuple[tuple[int, ...], Any]]:

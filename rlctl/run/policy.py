@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import os
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -25,7 +24,7 @@ import rlctl
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, shown
 from rlctl.named_task import POLICY
-from rlctl.run import files, memory, untrusted
+from rlctl.run import files, untrusted
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.stages import StageContent
 
@@ -129,7 +128,7 @@ def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
     """Read a policy file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
     from safetensors import SafetensorError, safe_open
 
-    _check_size(path)
+    untrusted.check_safetensors(path)
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
@@ -141,17 +140,6 @@ def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
         if not np.isfinite(values).all():
             raise ArtifactError(f"{path}: damaged: {shown(name)} is not finite")
     return info, tensors
-
-
-def _check_size(path: Path) -> None:
-    """Raise `ArtifactError` for what is no regular file, or would take more memory than it may."""
-    with untrusted.opened(path) as file:
-        if (problem := untrusted.too_large(os.fstat(file.fileno()).st_size)) is not None:
-            raise ArtifactError(f"{path}: too large: {problem}")
-        header = int.from_bytes(file.read(8), "little")  # the format: a length, and as much JSON
-        if header > untrusted.JSON_LIMIT:
-            told = f"{memory.told(header)}, at most {memory.told(untrusted.JSON_LIMIT)} are read"
-            raise ArtifactError(f"{path}: damaged, or not a .safetensors file: header too large: {told}")
 
 
 def parse_info(text: str | None, path: Path) -> PolicyInfo:

@@ -67,6 +67,17 @@ def too_large(size: int) -> str | None:
     return f"it needs {memory.told(size)} of memory, and {memory.told(there)} are free"
 
 
+def check_safetensors(path: Path) -> None:
+    """Raise `ArtifactError` for what is no regular file, or would take more memory than a policy may."""
+    with opened(path) as file:
+        if (problem := too_large(os.fstat(file.fileno()).st_size)) is not None:
+            raise ArtifactError(f"{path}: too large: {problem}")
+        header = int.from_bytes(file.read(8), "little")  # the format: a length, and as much JSON
+    if header > JSON_LIMIT:
+        told = f"{memory.told(header)}, at most {memory.told(JSON_LIMIT)} are read"
+        raise ArtifactError(f"{path}: damaged, or not a .safetensors file: header too large: {told}")
+
+
 def parse_json(text: str | bytes) -> Any:
     """Parse JSON; raises `ValueError` for what is damaged, nested too deeply or has a number too large to be one."""
     try:
