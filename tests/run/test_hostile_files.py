@@ -9,7 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from rlctl.errors import ArtifactError
+from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files
 from rlctl.run.directory import RunDirectory, find_policy
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
@@ -205,7 +205,7 @@ def test_json_that_is_too_large(tmp_path):
         files.read_json(path)
 
 
-@pytest.mark.timeout(30)
+@pytest.mark.timeout(120)
 @pytest.mark.parametrize("suffix", [".json", ".npz", ".safetensors", ".onnx"])
 @pytest.mark.parametrize("kind", ["pipe", "folder", "missing", "device"])
 def test_what_is_no_file(kind, suffix, tmp_path):
@@ -246,6 +246,15 @@ def test_a_run_with_a_link_out_of_it_is_not_written(name, tmp_path):
     with pytest.raises(ArtifactError, match=rf"{name}: a link out of the run's folder; nothing is written through it$"):
         RunDirectory(tmp_path / "run").lock()
     assert outside.read_text() == "kept"
+
+
+@pytest.mark.parametrize("step", ["²", "9" * 5000, "-1", "../../x", ""])
+def test_a_checkpoint_that_is_no_step(step, tmp_path):
+    (tmp_path / "checkpoints" / "²").mkdir(parents=True)
+    run = RunDirectory(tmp_path)
+    assert run.checkpoints() == []
+    with pytest.raises(UsageError, match=r": give best, last, or the step of a checkpoint$"):
+        run.policy_file(step)
 
 
 def test_a_run_with_a_link_within_is_written(tmp_path):
