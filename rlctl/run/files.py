@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError
+from rlctl.run import untrusted
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -55,9 +56,7 @@ def write_json(path: Path, content: Any) -> None:
 def read_json(path: Path) -> Any:
     """Read JSON; raises `ArtifactError` if the file is missing or damaged."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ArtifactError(f"{path}: {error.strerror or error}") from None
+        return untrusted.parse_json(untrusted.read_bytes(path, untrusted.JSON_LIMIT).decode())
     except ValueError as error:
         raise ArtifactError(f"{path}: damaged: {error}") from None
 
@@ -72,10 +71,9 @@ def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """Read a `.npz` without pickle; raises `ArtifactError` if it is missing, damaged or of another kind."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError:
-        raise ArtifactError(f"{path}: no such file") from None
+        return untrusted.read_arrays(path)
+    except ArtifactError:
+        raise
     except Exception as error:  # numpy raises whatever zipfile, zlib and its own parser raise
         raise ArtifactError(f"{path}: damaged, or not an .npz file: {error}") from None
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
+from rlctl.named_task import RUN
 from rlctl.rollout.workers import Workers
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory, RunLock
@@ -97,7 +98,7 @@ def _resumed(request: TrainRequest) -> Start:
 def _run(request: TrainRequest, start: Start, signals: StopSignals) -> TrainResult:
     if start.checkpoint is not None and start.checkpoint.progress.done:
         return _nothing_to_do(start, start.checkpoint)
-    specs = start.recipe.env_specs(start.task)
+    specs = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")
     title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
     with make_display(title, start.recipe.total_timesteps) as display:
         # The workers build their environments, and the check runs, while this process imports torch.
