@@ -6,6 +6,7 @@ import difflib
 import traceback
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 _LONGEST = 400  # characters of somebody else's message
 _MOST_LINES = 80  # of somebody else's traceback
@@ -64,6 +65,8 @@ class EpisodeFailed(TaskError):
         self.seed = seed
         self.step = step
         """Number of the step that failed, from 1; 0 for the reset."""
+        self.actions: Any = None
+        """The actions of the episode, that of the failed step last, shape (step, ...); None if nobody knows them."""
 
 
 class DivergedError(RlctlError):

@@ -138,6 +138,11 @@ class Workers:
         self._connections.append(Connection(ours.detach()))
 
     @property
+    def spec(self) -> EnvSpec:
+        """What the environments are made from."""
+        return self._spec
+
+    @property
     def info(self) -> EnvInfo:
         """What the environments are; waits until they are built."""
         self._wait_until_built()

@@ -18,6 +18,7 @@ from rlctl.run.env_info import EnvInfo
 from rlctl.run.recipe import Recipe, resolve
 from rlctl.train import status
 from rlctl.train.display import Display, make_display
+from rlctl.train.importing import undisturbed
 from rlctl.train.precheck import Precheck
 from rlctl.train.resuming import Start, check_stop_success, prepare, resumed
 from rlctl.train.signals import StopSignals
@@ -82,7 +83,8 @@ def run_training(request: TrainRequest) -> TrainResult:
 
 def _new(request: TrainRequest) -> Start:
     task = request.task or ""
-    constructor: Any = registry.load(task)
+    with undisturbed():
+        constructor: Any = registry.load(task)
     stages = constructor.stages if registry.is_task(constructor) else ()
     return Start(task, resolve(task, request.config, request.settings, stages))
 
@@ -122,6 +124,7 @@ def _nothing_to_do(start: Start, checkpoint: Checkpoint) -> TrainResult:
     assert start.run is not None  # the checkpoint is in it
     if start.run.status().get("status") == "running":  # killed after all was done
         status.write_end(start.run, checkpoint.state.step, checkpoint.progress)
+    _tell_failed_evaluations(start.run, checkpoint.progress)
     note = "this run is finished already: nothing to do; -n makes it longer"
     return _result(start.run, start, checkpoint.state.step, checkpoint.progress, [], note)
 
@@ -147,6 +150,7 @@ def _train(
     from rlctl.train.loop import TrainingLoop
     from rlctl.train.progress import Progress
     from rlctl.train.saving import Saver
+    from rlctl.train.space_watch import summary
     from rlctl.train.tensorboard import make_logger, writer_errors
     from rlctl.train.vec_env import WorkerVecEnv
 
@@ -177,14 +181,17 @@ def _train(
     write_start()
     evaluator = Evaluator(recipe, lambda: _workers(specs[-1], min(recipe.eval.episodes, _EVAL_ENVS), request, display))
     saver = Saver(run, checkpoints, display.message, write_start)
+    saver.saved_step = checkpoint.state.step if checkpoint is not None else None
     loop = TrainingLoop(model, run, recipe, env, evaluator, saver, progress, display, curriculum, checkpoint)
     if recipe.stages:
         display.stage(curriculum.title)
     signals.begin(loop)
     try:
-        with writer_errors(display.message):
+        with writer_errors():
             _learn(model, loop, recipe)
         signals.end()
+        if warning := summary(progress):
+            display.message(warning)
         saver.attempt("run.json", lambda: status.write_end(run, model.num_timesteps, progress))
         recordings = _record(loop, request.record)
     except BaseException as error:
