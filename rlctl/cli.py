@@ -408,7 +408,7 @@ def run(arguments: list[str]) -> int:
 def _flush() -> None:
     from rlctl import output
 
-    if sys.stdout is not None:
+    if sys.stdout is not None and not sys.stdout.closed:  # a plugin may have closed it
         sys.stdout.flush()
     if output.results.cache_info().currsize:
         output.results().flush()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import os
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -92,6 +93,17 @@ def make(
 ) -> gymnasium.Env[Any, Any]:
     """Return the Gymnasium environment of a task; keywords are the task's parameters."""
     return EnvSpec(task, parameters).make(render_mode)
+
+
+def make_several(spec: EnvSpec, count: int) -> list[gymnasium.Env[Any, Any]]:
+    """Build environments; a constructor that changes the working directory does not change it for the next."""
+    load(spec.task)
+    folder = os.getcwd()
+    envs = []
+    for _ in range(count):
+        os.chdir(folder)
+        envs.append(spec.make())
+    return envs
 
 
 def _check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import traceback
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+_LONGEST = 400  # characters of somebody else's message
+_MOST_LINES = 80  # of somebody else's traceback
+_OURS = Path(__file__).parent
 
 
 class RlctlError(Exception):
@@ -58,6 +65,8 @@ class EpisodeFailed(TaskError):
         self.seed = seed
         self.step = step
         """Number of the step that failed, from 1; 0 for the reset."""
+        self.actions: Any = None
+        """The actions of the episode, that of the failed step last, shape (step, ...); None if nobody knows them."""
 
 
 class DivergedError(RlctlError):
@@ -78,6 +87,32 @@ class Interrupted(RlctlError):
     def __init__(self, message: str, signal_number: int) -> None:
         super().__init__(message)
         self.exit_code = 128 + signal_number
+
+
+def in_words(error: BaseException) -> str:
+    """Return `RuntimeError: the gripper fell off`: a line, not too long, of whatever somebody else's code raised."""
+    name = type(error).__name__
+    try:
+        text = " ".join(str(error).split())
+    except Exception as another:
+        text = f"(its text cannot be had: {type(another).__name__})"
+    if len(text) > _LONGEST:
+        text = f"{text[:_LONGEST]}..."
+    return f"{name}: {text}" if text else name
+
+
+def their_traceback(error: BaseException) -> str:
+    """Return a traceback that begins where rlctl calls somebody else's code; empty if it never does."""
+    frames = error.__traceback__
+    while frames is not None and Path(frames.tb_frame.f_code.co_filename).is_relative_to(_OURS):
+        frames = frames.tb_next
+    if frames is None:
+        return ""
+    lines = "".join(traceback.format_exception(type(error), error, frames)).splitlines(keepends=True)
+    left_out = len(lines) - _MOST_LINES
+    if left_out > 0:  # functions that call each other until the stack is full
+        lines[_MOST_LINES // 2 : -_MOST_LINES // 2] = [f"  ... {left_out} lines left out ...\n"]
+    return "".join(lines)
 
 
 def did_you_mean(word: str, options: Iterable[str]) -> str:

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rlctl import errors
 from rlctl.errors import NoSuchClassError, OldGymError, TaskError, UsageError, did_you_mean
 
 GROUP = "rlctl.tasks"
@@ -216,7 +217,7 @@ def _import_module(task: str, name: str) -> Any:
 
 
 def _import_file(task: str, file: Path) -> Any:
-    file = file.expanduser().resolve()
+    file = _where_it_was(file.expanduser())
     if not file.is_file():
         raise UsageError(f"task {task!r}: no file {file}")
     for loaded, known in list(sys.modules.items()):
@@ -240,6 +241,13 @@ def _import_file(task: str, file: Path) -> Any:
         sys.modules.pop(name, None)
         raise
     return module
+
+
+def _where_it_was(file: Path) -> Path:
+    """Return a file's whole path, even if the working directory is not the one any more in which it was loaded."""
+    loaded = (getattr(module, "__file__", None) or "" for module in list(sys.modules.values()))
+    before = None if file.exists() else next((path for path in loaded if Path(path).match(str(file))), None)
+    return Path(before or file).resolve()
 
 
 def _load_gymnasium(task: str) -> Callable[..., Any]:
@@ -275,11 +283,9 @@ def _of_old_gym(name: str) -> bool:
 
 def guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:
     """Run a plugin's code; whatever it raises, `SystemExit` included, becomes a `TaskError`."""
-    from rlctl.errors import RlctlError
-
     try:
         return call()
-    except (RlctlError, KeyboardInterrupt):
+    except (errors.RlctlError, KeyboardInterrupt):
         raise
     except BaseException as error:
         where = ""
@@ -288,5 +294,5 @@ def guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:
         if frames and not own and not frames[-1].filename.startswith("<frozen"):  # a syntax error names its place
             where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})"
         raise TaskError(
-            f"task {task!r}: {doing}{type(error).__name__}: {error}{where}", details=traceback.format_exc()
+            f"task {task!r}: {doing}{errors.in_words(error)}{where}", details=errors.their_traceback(error) or None
         ) from error

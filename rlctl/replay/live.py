@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import ArtifactError, RlctlError, TaskError
+from rlctl.errors import ArtifactError, RlctlError, TaskError, in_words, their_traceback
 from rlctl.run.env_info import EnvInfo, describe
 from rlctl.run.episode import EpisodeInfo, Observations, RecordedEpisode
 from rlctl.run.policy import versions
@@ -118,9 +117,9 @@ def _blaming(task: str, seed: int, diary: _Diary) -> Iterator[None]:
         raise
     except BaseException as error:
         ours = isinstance(error, RlctlError)
-        what = str(error) if ours else f"{type(error).__name__}: {error}"
+        what = str(error) if ours else in_words(error)
         where = f"in the episode with seed {seed}, step {diary.next_step}; to see it alone: rlctl check-env {task}"
-        details = None if ours else traceback.format_exc()
+        details = None if ours else their_traceback(error) or None
         raise TaskError(f"task {task!r}: {what}\n{where}", details=details) from error
 
 

@@ -10,6 +10,7 @@ from rlctl.replay.difference import find_difference
 from rlctl.replay.live import Lived, live, present_versions, recorded_actions
 from rlctl.replay.report import Verification
 from rlctl.replay.watching import Tell, watch, watched_env
+from rlctl.rollout.workers import Workers
 from rlctl.run.episode import RecordedEpisode
 
 
@@ -21,11 +22,14 @@ def tell(message: str) -> None:
 def record_episode(episode: RecordedEpisode, path: Path, *, title: str, tell: Tell = tell) -> Lived:
     """Live a recorded episode again in an environment of its own and write what it looks like to `path`, an `.rrd`.
 
-    `tell` hears if it went another way than recorded; the file is written all the same. Returns the new life.
+    `tell` hears if it went another way than recorded; the file is written all the same. Returns the new life. Raises
+    `TaskError` for an episode that failed, and fails again.
     """
     from rlctl.replay.rrd import write_rrd
 
     info, spec = episode.info, episode.info.env_spec()
+    if info.failure:
+        live_failed(episode)
     with watched_env(spec, tell) as env:
         choose = recorded_actions(episode, env)
         watched = watch(env, spec, info.seed, choose, policy=info.policy, tell=tell)
@@ -35,6 +39,20 @@ def record_episode(episode: RecordedEpisode, path: Path, *, title: str, tell: Te
         tell(f"warning: {title}: lived again it is not what was recorded; {difference}")
     write_rrd(path, watched, title=title, tell=tell)
     return watched.lived
+
+
+def live_failed(episode: RecordedEpisode) -> None:
+    """Live an episode that failed again as a training does, in a worker: it may hang or end its process.
+
+    Raises the `TaskError` that it failed with if it fails again.
+    """
+    with Workers(episode.info.env_spec(), 1) as workers:
+        workers.arrays.next_seed[:] = -1
+        workers.reset({0: episode.info.seed})
+        for action in episode.actions:
+            workers.arrays.action[0] = action
+            if workers.step():
+                return
 
 
 def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Lived, Verification]:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.errors import EpisodeFailed
 from rlctl.rollout.workers import EpisodeResult, Observations, Workers
 
 
@@ -87,7 +88,12 @@ def run_episodes(
         actions = actor.act(observations, rows, starts[rows])
         arrays.action[rows] = actions
         starts[rows] = False
-        ended = workers.step()
+        try:
+            ended = workers.step()
+        except EpisodeFailed as error:
+            if error.env in recorders and record:
+                error.actions = recorders[error.env].actions(arrays.action[error.env])[: error.step]
+            raise
         if record:
             for place, env in enumerate(rows.tolist()):
                 recorders[env].add(_row(observations, place), actions[place], arrays, env)
@@ -116,6 +122,10 @@ class _Recorder:
         self._actions.append(np.array(action))
         self._rewards.append(float(arrays.reward[env]))
         self._terms.append(arrays.terms[env].copy())
+
+    def actions(self, now: Any) -> NDArray[Any]:
+        """Return the actions up to `now`, that of a step that was not done."""
+        return np.stack([*self._actions, np.array(now)])
 
     def trajectory(self, last: Any) -> Trajectory:
         steps = [*self._observations, last]

@@ -5,14 +5,13 @@ The question is a short word and both arrays as safetensors; the answer, numbers
 
 from __future__ import annotations
 
-import traceback
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load, save
 
-from rlctl.errors import TaskError
+from rlctl.errors import TaskError, in_words, their_traceback
 
 QUESTION = b"rewards "
 """How the message begins."""
@@ -33,8 +32,7 @@ def answer(env: Any, message: bytes) -> list[float]:
     try:
         rewards = np.asarray(env.unwrapped.compute_reward(goals["achieved"], goals["desired"], infos))
     except BaseException as error:  # a plugin may raise anything, SystemExit too
-        told = f"compute_reward raised {type(error).__name__}: {error}"
-        raise TaskError(told, details=traceback.format_exc()) from error
+        raise TaskError(f"compute_reward raised {in_words(error)}", details=their_traceback(error)) from error
     if rewards.dtype.kind not in "fiub":
         raise TaskError(f"compute_reward returned an array of {rewards.dtype}, not of numbers")
     if rewards.shape != (count,):

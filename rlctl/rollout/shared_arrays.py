@@ -55,6 +55,7 @@ class SharedArrays:
             "inside": ((2,), np.dtype(np.int64)),
             "terms": ((terms,), np.dtype(np.float64)),
             "record": ((), np.dtype(np.bool_)),
+            "cast": ((3,), np.dtype(np.int64)),
         }
         for key, field in observation.items():
             layout[f"observation/{key}"] = field
@@ -83,6 +84,9 @@ class SharedArrays:
         self.terms = arrays["terms"]
         """Raw reward terms of the last step, shape (n_envs, terms), where `record` is set."""
         self.record = arrays["record"]
+        self.cast = arrays["cast"]
+        """Observations of another dtype than their space's, shape (n_envs, 3): how many came, and of the last the
+        character of its dtype and the number of its key."""
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}
         self.final = {key: arrays[f"final/{key}"] for key in observation}
         """The observation an episode ended with, where one ended in the last step."""

@@ -6,15 +6,11 @@ with the episodes that ended. Observations, actions, rewards and flags travel in
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import itertools
 import json
 import math
-import os
 import sys
-import threading
-import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
@@ -22,9 +18,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rlctl.env_spec import EnvSpec
-from rlctl.errors import RlctlError
-from rlctl.rollout import goal_rewards
+from rlctl.env_spec import EnvSpec, make_several
+from rlctl.errors import in_words
+from rlctl.rollout import goal_rewards, returned
+from rlctl.rollout.failures import FailedInEpisode, as_message
+from rlctl.rollout.printed import say
+from rlctl.rollout.process_group import end_with_parent
+from rlctl.rollout.returned import NotAsDeclared
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
 from rlctl.run.env_info import describe
 from rlctl.task.env import TaskEnv
@@ -45,18 +45,23 @@ class _Episode:
     def start(self, seed: int) -> Any:
         self.seed, self.step, self.active = seed, 0, True
         self._return, self._sums = 0.0, {}
-        observation, _ = self.env.reset(seed=seed)
+        observation, info = returned.parts(self.env.reset(seed=seed), returned.RESET, "reset")
+        returned.check_info(info)
         return observation
 
     def count(self, reward: float, info: dict[str, Any]) -> None:
         self._return += reward
         sums = self._sums
-        for name, value in info.get("reward_terms", {}).items():
-            sums[name] = sums.get(name, 0.0) + value
+        try:
+            for name, value in info.get("reward_terms", {}).items():
+                sums[name] = sums.get(name, 0.0) + value
+        except (TypeError, AttributeError):
+            raise NotAsDeclared(f"info['reward_terms'] is {info['reward_terms']!r}, not a dict of numbers") from None
 
     def summary(self, info: dict[str, Any]) -> dict[str, Any]:
         success = info.get("is_success")
-        distance = info.get("metrics", info).get("distance")
+        metrics = info.get("metrics")  # of a plain environment it may be anything
+        distance = (metrics if isinstance(metrics, dict) else info).get("distance")
         if not isinstance(distance, int | float | np.number):  # a plain environment may mean something else by it
             distance = None
         return {
@@ -64,21 +69,23 @@ class _Episode:
             "seed": self.seed,
             "return": self._return,
             "length": self.step,
-            "success": None if success is None else bool(success),
-            "terms": {name: float(value) for name, value in self._sums.items()},
+            "success": None if success is None else bool(returned.number(success, "info['is_success']")),
+            "terms": {str(name): returned.number(value, f"reward term {name}") for name, value in self._sums.items()},
             "final_distance": None if distance is None else float(distance),
         }
 
 
 class _Worker:
     def __init__(self, descriptor: int, spec: EnvSpec, first: int, count: int, total: int) -> None:
-        envs = [spec.make() for _ in range(count)]
+        envs = make_several(spec, count)
         self.info = describe(envs[0])
         self.first = first
         self.term_names = list(self.info.reward_weights)
         self.episodes = [_Episode(env, first + i) for i, env in enumerate(envs)]
         space = envs[0].observation_space
         self.fields = observation_fields(space)
+        leaves = space.spaces if isinstance(space, spaces.Dict) else {SINGLE: space}
+        self.categories = {key: returned.categories(leaf) for key, leaf in leaves.items()}
         self.space = space
         # A task's environment has looked at its observation itself.
         self.checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
@@ -97,23 +104,32 @@ class _Worker:
             return
         parts = observation if isinstance(observation, dict) else {SINGLE: observation}
         if parts.keys() != place.keys():
-            raise ValueError(f"observation has the keys {sorted(parts)}, the space has {sorted(place)}")
+            raise NotAsDeclared(f"observation has the keys {sorted(parts)}, the space has {sorted(place)}")
         for key, value in parts.items():
             row = place[key]
-            shape, _ = self.fields[key]
+            shape, dtype = self.fields[key]
             value = np.asarray(value)
             if value.shape != shape:
-                what = f"observation {key!r}" if key else "observation"
-                raise ValueError(f"{what} has shape {value.shape}, the space has {shape}")
+                raise NotAsDeclared(f"{_named(key)} has shape {value.shape}, the space has {shape}")
+            if value.dtype is not dtype:
+                self.note_cast(episode, key, value)
             # A sum is finite unless an element is not, or it overflows: the slow check then tells.
             if (
                 value.dtype.kind == "f"
                 and not math.isfinite(np.add.reduce(value, None))
-                and not np.isfinite(value).all()
+                and (error := returned.first_not_finite(value, _named(key)))
             ):
-                bad = int(np.flatnonzero(~np.isfinite(value))[0])
-                raise ValueError(f"observation is not finite: element {bad} is {value.ravel()[bad]}")
+                raise error
+            limits = self.categories[key]
+            if limits is not None and not ((limits[0] <= value) & (value <= limits[1])).all():
+                raise NotAsDeclared(f"{_named(key)} is {value}, the space has {limits[0]} to {limits[1]}")
             row[episode.index] = value
+
+    def note_cast(self, episode: _Episode, key: str, value: Any) -> None:
+        returned.check_kind(value, _named(key))
+        if not np.can_cast(value.dtype, self.fields[key][1]):
+            count = self.arrays.cast[episode.index, 0] + 1
+            self.arrays.cast[episode.index] = count, ord(value.dtype.char), list(self.fields).index(key)
 
     def reset(self, pairs: list[tuple[int, int]]) -> list[dict[str, Any]]:
         for index, seed in pairs:
@@ -130,14 +146,23 @@ class _Worker:
         actions = iter(np.frombuffer(data, row.dtype).reshape(-1, *row.shape))
         ended: list[dict[str, Any]] = []
         for index, seed, steps in episodes:
-            episode = self.episodes[index - self.first]
             self.arrays.next_seed[index] = -1
-            self.guarded(episode, self.begin, seed)
-            for action in itertools.islice(actions, steps):
-                self.arrays.action[index] = action
-                if episode.active:
-                    self.guarded(episode, self.step_one, ended)
+            try:
+                self.live_again(index, seed, list(itertools.islice(actions, steps)), ended)
+            except FailedInEpisode as failure:
+                # It did not when it was lived first. So it is elsewhere now, and may begin the next one.
+                self.episodes[index - self.first].active = False
+                ended.append({"env": index})
+                say(f"{failure} when it was lived again")
         return ended
+
+    def live_again(self, index: int, seed: int, actions: list[Any], ended: list[dict[str, Any]]) -> None:
+        episode = self.episodes[index - self.first]
+        self.guarded(episode, self.begin, seed)
+        for action in actions:
+            self.arrays.action[index] = action
+            if episode.active:
+                self.guarded(episode, self.step_one, ended)
 
     def begin(self, episode: _Episode, seed: int) -> None:
         self.arrays.inside[episode.index] = seed, 0
@@ -145,7 +170,10 @@ class _Worker:
 
     def close(self) -> None:
         for episode in self.episodes:
-            episode.env.close()
+            try:
+                episode.env.close()
+            except BaseException as error:  # what was lived is lived
+                say(f"warning: closing environment {episode.index}: {in_words(error)}")
         self.episodes = []
 
     def step(self) -> list[dict[str, Any]]:
@@ -160,12 +188,18 @@ class _Worker:
         action = arrays.action[index]
         episode.step += 1
         arrays.inside[index, 1] = episode.step
-        observation, reward, terminated, truncated, info = episode.env.step(
-            int(action) if self.discrete else action.copy()
-        )
-        reward = float(reward)
+        given = episode.env.step(int(action) if self.discrete else action.copy())
+        if given.__class__ is not tuple or len(given) != 5:
+            given = returned.parts(given, returned.STEP, "step")
+        observation, reward, terminated, truncated, info = given
+        if reward.__class__ is not float:
+            reward = returned.number(reward, "reward")
         if not math.isfinite(reward):
-            raise ValueError(f"reward is {reward}")
+            raise NotAsDeclared(f"reward is {reward}")
+        if info.__class__ is not dict:
+            returned.check_info(info)
+        if terminated.__class__ is not bool or truncated.__class__ is not bool:
+            terminated, truncated = returned.flag(terminated, "terminated"), returned.flag(truncated, "truncated")
         episode.count(reward, info)
         arrays.reward[index] = reward
         arrays.terminated[index] = terminated
@@ -187,53 +221,27 @@ class _Worker:
         try:
             call(episode, argument)
         except BaseException as error:  # a plugin may raise anything, SystemExit too
-            raise _EpisodeFailed(episode) from error
+            raise FailedInEpisode(episode.index, episode.seed, episode.step) from error
         self.arrays.inside[episode.index, 1] = -1
-
-
-class _EpisodeFailed(Exception):
-    def __init__(self, episode: _Episode) -> None:
-        super().__init__()
-        self.where = {"env": episode.index, "seed": episode.seed, "step": episode.step}
-
-
-def _error(error: BaseException) -> dict[str, Any]:
-    where = error.where if isinstance(error, _EpisodeFailed) else {}
-    cause = error.__cause__ if isinstance(error, _EpisodeFailed) and error.__cause__ else error
-    ours = isinstance(cause, RlctlError)
-    return {
-        "message": str(cause) if ours else f"{type(cause).__name__}: {cause}",
-        "kind": type(cause).__name__ if ours else None,
-        "traceback": cause.details if isinstance(cause, RlctlError) else "".join(traceback.format_exception(cause)),
-        **where,
-    }
-
-
-def _end_with_parent(parent: int) -> None:
-    """End this process when its parent ends, even while an environment is stuck in a step."""
-
-    def watch() -> None:
-        import select
-        import time
-
-        with contextlib.suppress(AttributeError, OSError):  # not on every system, nor in every sandbox
-            descriptor = os.pidfd_open(parent)
-            if os.getppid() == parent:
-                select.select([descriptor], [], [])
-        while os.getppid() == parent:
-            time.sleep(1.0)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def main() -> None:
     """Serve commands until the connection closes. Arguments: connection, descriptor, and the job as JSON."""
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # what is printed is told at once
     job = json.loads(sys.argv[3])
-    _end_with_parent(job["parent"])
-    with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the main process has heard enough
+    end_with_parent(job["parent"])
+    try:
         _serve(job)
+    except (BrokenPipeError, ConnectionResetError):  # the main process has heard enough
+        return
+    except OSError as error:
+        told = error.strerror
+        say(f"no connection to rlctl any more ({told}): has an environment closed a file that is not its own?")
+        sys.exit(1)
+
+
+def _named(key: str) -> str:
+    return f"observation {key!r}" if key else "observation"
 
 
 def _serve(job: dict[str, Any]) -> None:
@@ -245,13 +253,13 @@ def _serve(job: dict[str, Any]) -> None:
     try:
         worker = _built(job, job["spec"])
     except BaseException as error:
-        answer(error=_error(error))
+        answer(error=as_message(error))
         return
     answer(info=worker.info.model_dump())
     while True:
         try:
             message = connection.recv_bytes()
-        except (EOFError, OSError):
+        except (EOFError, ConnectionResetError):
             break
         try:
             if message == b"step":
@@ -274,7 +282,7 @@ def _serve(job: dict[str, Any]) -> None:
             else:
                 ended = worker.reset(json.loads(message))
         except BaseException as error:
-            answer(error=_error(error))
+            answer(error=as_message(error))
             continue
         if ended:
             answer(ended=ended)

@@ -27,6 +27,8 @@ from rlctl import errors
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.rollout import goal_rewards
+from rlctl.rollout.printed import forward
+from rlctl.rollout.process_group import end
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
 from rlctl.run.env_info import EnvInfo
 
@@ -91,11 +93,14 @@ class Workers:
         self._ready = False
         self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
         read_end, self._printing = os.pipe()
-        self._output = threading.Thread(target=_forward, args=(read_end, on_output or _to_stderr), daemon=True)
+        self._output = threading.Thread(target=forward, args=(read_end, on_output or _to_stderr), daemon=True)
         self._output.start()
         try:
             for first, last in self._ranges:
                 self._start(first, last - first)
+        except OSError as error:
+            self.close()
+            raise TaskError(f"task {spec.task!r}: no worker can be started: {error.strerror or error}") from None
         except BaseException:
             self.close()
             raise
@@ -127,9 +132,15 @@ class Workers:
                 stdout=self._printing,
                 stderr=self._printing,
                 env=environment,
+                process_group=0,
             )
         self._processes.append(process)
         self._connections.append(Connection(ours.detach()))
+
+    @property
+    def spec(self) -> EnvSpec:
+        """What the environments are made from."""
+        return self._spec
 
     @property
     def info(self) -> EnvInfo:
@@ -333,11 +344,7 @@ class Workers:
         self._connections = []
         deadline = time.monotonic() + grace_s
         for process in self._processes:
-            try:
-                process.wait(timeout=max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            end(process, deadline)
         self._processes = []
         self._output.join(timeout=1.0)
         if self._memory >= 0:
@@ -355,16 +362,6 @@ def _picked(arrays: dict[str, NDArray[Any]], rows: Any) -> Observations:
     picked: dict[str, Any] = {key: array[rows].copy() for key, array in arrays.items()}
     result: Observations = picked.get(SINGLE, picked)
     return result
-
-
-def _forward(read_end: int, receive: Callable[[str], None]) -> None:
-    last = None
-    with os.fdopen(read_end, encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            # Many environments say the same; once is enough.
-            if line != last and not line.startswith("pybullet build time"):
-                receive(line.rstrip("\n"))
-            last = line
 
 
 def _to_stderr(line: str) -> None:

@@ -207,7 +207,8 @@ def _point_latest_to(root: Path, run: Path) -> None:
 def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
     """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing."""
     if text is None or text == "latest":
-        newest = _newest(root)
+        # The link first: names go by a clock, which may have been set back since.
+        newest = _linked(root) or _newest(root)
         if newest is None:
             raise ArtifactError(f"no run yet under {root.resolve()}; train one: rlctl train reach")
         return newest
@@ -234,6 +235,14 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> tup
         return path, RunDirectory(owner) if (owner / "run.json").is_file() else None
     run = find_run(text, root)
     return run.policy_file(which), run
+
+
+def _linked(root: Path) -> RunDirectory | None:
+    with contextlib.suppress(OSError, ValueError):  # no link, or one that leads elsewhere
+        run = root / os.readlink(root / "latest")
+        if (root / "latest").resolve().is_relative_to(root.resolve()) and (run / "run.json").is_file():
+            return RunDirectory(run)
+    return None
 
 
 _RUN_NAME = re.compile(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_s\d+(_\d+)?$")

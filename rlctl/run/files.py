@@ -152,6 +152,11 @@ def append(path: Path, content: bytes, size: int) -> None:
         os.close(descriptor)
 
 
+def set_aside(path: Path) -> None:
+    """Give a file that is not what it should be another name, `<name>.damaged`."""
+    os.replace(path, path.with_name(f"{path.name}.damaged"))
+
+
 def truncate(path: Path, size: int) -> None:
     """Cut a file back to its first `size` bytes."""
     descriptor = os.open(path, os.O_WRONLY)

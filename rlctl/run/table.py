@@ -37,16 +37,37 @@ class Table:
         """Write the rows that wait; with `sync` down to the disk itself. All of them, or `OSError` and none."""
         if self._waiting:
             # Whoever edits or removes the file while a training runs loses rows, but no more than that.
-            size = min(self.size, _size(self.path))
-            content = self._text(self._columns() if size else None).encode()
+            size = self._whole_rows()
+            columns = self._columns() if size else None
+            if size and columns is None:
+                files.set_aside(self.path)
+                size = 0
+            content = self._text(columns).encode()
             files.append(self.path, content, size)
             self.size, self._waiting = size + len(content), []
         if sync and self.size:
             files.sync(self.path)
 
+    def _whole_rows(self) -> int:
+        """Return how many bytes of the file are rows of ours: fewer than `size` if somebody has cut or edited it."""
+        size = min(self.size, _size(self.path))
+        if not size:
+            return 0
+        with self.path.open("rb") as file:
+            file.seek(size - 1)
+            if file.read(1) == b"\n":
+                return size
+            file.seek(0)
+            return file.read(size).rfind(b"\n") + 1
+
     def _columns(self) -> list[str] | None:
-        with self.path.open(newline="", encoding="utf-8") as file:
-            return next(csv.reader(file), None)
+        """Return the file's header; None if it is not the one of these rows any more."""
+        with self.path.open(newline="", encoding="utf-8", errors="replace") as file:
+            try:
+                columns = next(csv.reader(file), [])
+            except csv.Error:
+                return None
+        return columns if next(iter(self._waiting[0])) in columns else None
 
     def _text(self, columns: list[str] | None) -> str:
         text = io.StringIO()

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import ArtifactError
+from rlctl.errors import ArtifactError, EpisodeFailed
 from rlctl.rollout.collect import Episode
 from rlctl.run import files
 from rlctl.run.directory import RunDirectory
@@ -45,12 +43,16 @@ class EpisodeKeeper:
         """Write the last `count` episodes of the last evaluation, and return them with their files."""
         return [(self._write(episode), episode) for episode in list(self._latest)[-count:]] if count else []
 
-    def keep_failed(self, spec: EnvSpec, seed: int, actions: NDArray[Any], failure: str) -> Path:
-        """Write the actions of an episode that an environment did not survive, shape (steps, ...); return the file."""
-        nothing = np.zeros(0)
+    def keep_failed(self, spec: EnvSpec, error: EpisodeFailed, evaluated_at: int | None = None) -> Path:
+        """Write `error.actions`, of an episode that an environment did not survive; return the file."""
+        policy = "training" if evaluated_at is None else f"{_POLICY}{evaluated_at}"
+        failure = str(error).partition("\n")[0]
         info = EpisodeInfo.of(
-            spec, seed=seed, policy="training", total_reward=0.0, versions=versions(), failure=failure
+            spec, seed=error.seed, policy=policy, total_reward=0.0, versions=versions(), failure=failure
         )
+        nothing = np.zeros(0)
+        # Of a reset that failed there is no action to take the shape from.
+        actions = np.asarray(error.actions).reshape(-1, *(self.info.spaces()[1].shape or ()))
         return self._write(RecordedEpisode(info, actions, nothing, nothing, nothing.reshape(0, 0)))
 
     def _write(self, episode: RecordedEpisode) -> Path:

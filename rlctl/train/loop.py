@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,13 +17,13 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from rlctl.errors import ArtifactError, DivergedError, EpisodeFailed, Interrupted, TaskError
+from rlctl.errors import ArtifactError, DivergedError, Interrupted, RlctlError, TaskError, UsageError
 from rlctl.eval.statistics import mean_return, mean_terms, success_rate
 from rlctl.rollout.collect import Episode
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import Score, save_policy
+from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
-from rlctl.train import snapshot
+from rlctl.train import faults, snapshot
 from rlctl.train.checkpoint import Checkpoint
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
@@ -132,6 +131,8 @@ class TrainingLoop(BaseCallback):
         self.progress.recent += ended
         self.curriculum.count(ended)
         if warning := self.curriculum.warning():
+            self.display.message(warning)
+        for warning in self.env.watch.report(self.env.workers.arrays, self.progress):
             self.display.message(warning)
 
     def _begin_next_stage(self, steps: int) -> None:
@@ -242,7 +243,7 @@ class TrainingLoop(BaseCallback):
         except _Asked:
             assert self.stop_signal is not None
             self._stop(self.stop_signal, at_end=at_end)
-        except TaskError as error:
+        except (TaskError, UsageError, ArtifactError) as error:  # the last two where files were removed meanwhile
             self._evaluation_failed(error)
         self.progress.last_eval = steps
         while self.progress.next_eval <= steps:
@@ -255,11 +256,13 @@ class TrainingLoop(BaseCallback):
         if self.stop_signal is not None:
             raise _Asked
 
-    def _evaluation_failed(self, error: TaskError) -> None:
+    def _evaluation_failed(self, error: RlctlError) -> None:
         progress, steps = self.progress, self.model.num_timesteps
         progress.failed_evaluations += 1
         progress.first_failure = progress.first_failure or f"at step {steps:,}: {error}"
-        self.display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
+        told = [f"warning: evaluation at step {steps:,} failed, training goes on: {error}"]
+        told += faults.keep(error, self.curriculum.goal_spec, self.saver, self.episodes, steps)
+        self.display.message("\n".join(told))
 
     def _take_note(self, episodes: list[Episode], packed: Packed) -> None:
         progress, steps = self.progress, self.model.num_timesteps
@@ -268,8 +271,8 @@ class TrainingLoop(BaseCallback):
         better = self._is_better(success, mean)
         if better:
             info = packed[0].model_copy(update={"evaluation": Score(success=success, mean_return=mean)})
-            if self.saver.attempt("best policy", lambda: save_policy(self.run_directory.best_policy, info, packed[1])):
-                progress.best_success, progress.best_return, progress.best_step = success, mean, steps
+            self.saver.keep_best((info, packed[1]))
+            progress.best_success, progress.best_return, progress.best_step = success, mean, steps
         threshold = self.recipe.stop_success
         good = threshold is not None and success is not None and success >= threshold
         progress.good_in_a_row = progress.good_in_a_row + 1 if good else 0
@@ -304,20 +307,7 @@ class TrainingLoop(BaseCallback):
 
     def explain_fault(self, error: TaskError) -> TaskError:
         """Keep the actions of the episode that failed, and return the error with what to do next."""
-        told = [str(error)]
-        if self.saver.saved_step is not None:
-            told.append(
-                f"the checkpoint of step {self.saver.saved_step:,} stands; "
-                f"go on with: rlctl train --resume {self.run_directory.path}"
-            )
-        if isinstance(error, EpisodeFailed) and (actions := self.env.history.of(error.env)) is not None:
-            file: list[Path] = []
-            spec, what = self.curriculum.spec, str(error).partition("\n")[0]
-            self.saver.attempt(
-                "failed episode", lambda: file.append(self.episodes.keep_failed(spec, error.seed, actions, what))
-            )
-            told += [f"to live its actions again: rlctl replay {path}" for path in file]
-        return TaskError("\n".join(told), details=error.details)
+        return faults.explained(error, self.run_directory, self.env, self.saver, self.episodes)
 
     def save_checkpoint(self, *, at_end: bool = False) -> bool:
         """Write a checkpoint of the present boundary; False, with a warning, if the disk does not take it."""

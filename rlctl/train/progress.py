@@ -26,6 +26,10 @@ class Progress:
     failed_evaluations: int = 0
     first_failure: str = ""
     """Why the first of the failed evaluations failed."""
+    observations_outside: int = 0
+    """How many training observations were outside their space."""
+    observations_cast: int = 0
+    """How many came with a dtype that their space's cannot hold without loss."""
     done: bool = False
     """Whether nothing is left to do."""
     seconds: float = 0.0

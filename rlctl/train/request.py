@@ -19,6 +19,7 @@ from rlctl.run.env_info import EnvInfo
 from rlctl.run.recipe import resolve
 from rlctl.train import status
 from rlctl.train.display import Display, make_display
+from rlctl.train.importing import undisturbed
 from rlctl.train.precheck import Precheck
 from rlctl.train.resuming import Start, check_stop_success, prepare, resumed
 from rlctl.train.signals import StopSignals
@@ -84,7 +85,8 @@ def run_training(request: TrainRequest) -> TrainResult:
 
 def _new(request: TrainRequest) -> Start:
     task = request.task or ""
-    constructor: Any = registry.load(task)
+    with undisturbed():
+        constructor: Any = registry.load(task)
     stages = constructor.stages if registry.is_task(constructor) else ()
     return Start(task, resolve(task, request.config, request.settings, stages))
 
@@ -124,6 +126,7 @@ def _nothing_to_do(start: Start, checkpoint: Checkpoint) -> TrainResult:
     assert start.run is not None  # the checkpoint is in it
     if start.run.status().get("status") == "running":  # killed after all was done
         status.write_end(start.run, checkpoint.state.step, checkpoint.progress)
+    _tell_failed_evaluations(start.run, checkpoint.progress)
     note = "this run is finished already: nothing to do; -n makes it longer"
     return _result(start.run, start, checkpoint.state.step, checkpoint.progress, [], note)
 
@@ -206,20 +209,25 @@ def _saver(
         status.write_start(run, start.task, start.recipe, request.device, resumed_at)
 
     write_start()
-    return Saver(run, checkpoints, display.message, write_start)
+    saver = Saver(run, checkpoints, display.message, write_start)
+    saver.saved_step = start.checkpoint.state.step if start.checkpoint is not None else None
+    return saver
 
 
 def _learn_to_the_end(loop: TrainingLoop, request: TrainRequest, signals: StopSignals, display: Display) -> list[Path]:
     """Train, write that it is done, and return the recordings that were asked for."""
+    from rlctl.train.space_watch import summary
     from rlctl.train.tensorboard import writer_errors
 
     if loop.recipe.stages:
         display.stage(loop.curriculum.title)
     signals.begin(loop)
-    with writer_errors(display.message):
+    with writer_errors():
         _learn(loop)
     signals.end()
     steps, progress = loop.model.num_timesteps, loop.progress
+    if warning := summary(progress):
+        display.message(warning)
     loop.saver.attempt("run.json", lambda: status.write_end(loop.run_directory, steps, progress))
     return _record(loop, request.record)
 

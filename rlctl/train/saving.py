@@ -9,8 +9,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rlctl.errors import ArtifactError
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import PolicyInfo, save_policy
+from rlctl.run.policy import PolicyInfo, read_policy, save_policy
 from rlctl.run.table import Table
 from rlctl.train.checkpoint import Checkpoints
 from rlctl.train.progress import Progress
@@ -46,6 +47,8 @@ class Saver:
         self._next_checkpoint = time.monotonic()  # the first boundary saves one
         self._last_bytes = 0
         self._reminded = 0.0
+        self._best = _policy_of(run)
+        self._best_waits = False
 
     def attempt(self, what: str, write: Callable[[], object]) -> bool:
         """Write something; False, with a warning, if the disk does not take it."""
@@ -60,9 +63,13 @@ class Saver:
 
     def _restore_folder(self) -> None:
         # What is in memory is all that is left of the run, so it is not the moment to give up.
+        gone = not self._run.recipe_file.exists()
         os.makedirs(self._run.path, exist_ok=True)
         self._write_again()
-        self._warn(f"warning: {self._run.path} was removed while training: made anew, without what was in it")
+        if gone:
+            self._warn(f"warning: {self._run.path} was removed while training: made anew, without what was in it")
+        else:
+            self._warn(f"warning: {self._run.status_file} was removed while training: written again")
 
     def _tell(self, trouble: str) -> None:
         if trouble != self.trouble or time.monotonic() - self._reminded > _REMIND_EVERY_S:
@@ -75,6 +82,17 @@ class Saver:
         table.add(row)
         self.attempt(table.path.name, table.flush)
 
+    def keep_best(self, packed: Packed) -> None:
+        """Write the best policy; one that the disk does not take now, or loses, is written with a later checkpoint."""
+        self._best, self._best_waits = packed, True
+        self._write_best()
+
+    def _write_best(self) -> None:
+        if (best := self._best) is None or (not self._best_waits and self._run.best_policy.exists()):
+            return
+        if self.attempt("best policy", lambda: save_policy(self._run.best_policy, *best)):
+            self._best_waits = False
+
     def checkpoint_is_due(self) -> bool:
         """Whether the time that checkpoints may take allows one."""
         return time.monotonic() >= self._next_checkpoint
@@ -86,6 +104,7 @@ class Saver:
         saved = self.attempt("checkpoint", lambda: self._write_checkpoint(packed, progress, at_end))
         if saved:
             self._tell_saved_again()
+            self._write_best()
             self.attempt("last policy", lambda: save_policy(self._run.last_policy, *packed))
             self.attempt("old checkpoints", self._checkpoints.remove_old)
         now = time.monotonic()
@@ -107,3 +126,11 @@ class Saver:
         folder = self._checkpoints.save(packed, progress, at_end=at_end)
         self._last_bytes = sum(file.stat().st_size for file in folder.iterdir())
         self.saved_step = packed[0].training_steps
+
+
+def _policy_of(run: RunDirectory) -> Packed | None:
+    """Return the best policy that a run has already, when it is resumed."""
+    try:
+        return read_policy(run.best_policy)
+    except ArtifactError:  # there is none yet, or it is damaged: the next evaluation writes one
+        return None

@@ -41,6 +41,8 @@ class StopSignals:
     def begin(self, loop: TrainingLoop) -> None:
         """From now on let `loop` end the training at a boundary."""
         self._loop = loop
+        for number in self._before:  # importing the task may have put other handlers there
+            signal.signal(number, self._handle)
 
     def end(self) -> None:
         """The training is done and saved: it stays that, whoever asks for what."""

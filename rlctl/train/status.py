@@ -51,7 +51,7 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
 def _identity(task: str) -> dict[str, Any]:
     """Return what tells one version of a task from another: its distribution's, and its source."""
     source = registry.source_file(task)
-    digest = files.digest(source.read_bytes()) if source is not None else None
+    digest = files.digest(source.read_bytes()) if source is not None and source.is_file() else None
     return {"origin": registry.origin(task), "source_sha256": digest}
 
 
@@ -63,7 +63,9 @@ def task_changes(told: Mapping[str, Any], task: str) -> list[str]:
         names = (" ".join(map(str, each.values())) or "no installed package" for each in (before, after))
         return ["task {} came from {} when the run began, and comes from {} now".format(task, *names)]
     if told.get("source_sha256") != now["source_sha256"]:
-        return [f"{registry.source_file(task) or task} is not what it was when the run began"]
+        file = registry.source_file(task)
+        gone = file is not None and not file.is_file()
+        return [f"{file or task} {'is not there any more' if gone else 'is not what it was when the run began'}"]
     return []
 
 
@@ -84,6 +86,9 @@ def write_end(run: RunDirectory, steps: int, progress: Progress) -> None:
             "best_step": progress.best_step,
             "best_success": progress.best_success,
             "best_return": progress.best_return,
+            "observations_outside": progress.observations_outside,
+            "observations_cast": progress.observations_cast,
+            "failed_evaluations": progress.failed_evaluations,
             **({"stage": progress.stage} if progress.stage else {}),
         }
     )

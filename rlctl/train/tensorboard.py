@@ -1,4 +1,4 @@
-"""SB3's logger, writing TensorBoard files; a full disk costs the log, not the training."""
+"""SB3's logger, writing TensorBoard files; a full disk or a removed file costs that log, not the training."""
 
 from __future__ import annotations
 
@@ -14,40 +14,63 @@ from torch.utils.tensorboard.writer import SummaryWriter
 
 class _Format(TensorBoardOutputFormat):
     def __init__(self, folder: Path, first_step: int) -> None:
-        # What an earlier process wrote of these steps is not shown twice.
+        # What was written of these steps before, by an earlier process say, is not shown twice.
         self.writer = SummaryWriter(log_dir=str(folder), purge_step=first_step or None)
         self._is_closed = False
 
+    @property
+    def file(self) -> Path:
+        assert self.writer.file_writer is not None  # it is there until the writer is closed
+        name: str | bytes = self.writer.file_writer.event_writer._file_name
+        return Path(name if isinstance(name, str) else name.decode())
+
 
 class _TensorBoard(KVWriter):
+    """Begins another file whenever the one before is gone or was not written whole."""
+
     def __init__(self, folder: Path, warn: Callable[[str], None], first_step: int) -> None:
-        self._format: TensorBoardOutputFormat | None = _Format(folder, first_step)
+        self._folder = folder
         self._warn = warn
+        self._trouble = ""
+        self._format: _Format | None = None
+        self._attempt(lambda: self._open(first_step))
+
+    def _open(self, first_step: int) -> _Format:
+        if self._format is None or not self._format.file.exists():
+            self.close()
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._format = _Format(self._folder, first_step)
+        return self._format
 
     def write(self, key_values: dict[str, Any], key_excluded: Mapping[str, tuple[str, ...]], step: int = 0) -> None:
-        if self._format is None:
-            return
+        self._attempt(lambda: self._open(step).write(key_values, dict(key_excluded), step))
+
+    def _attempt(self, write: Callable[[], object]) -> None:
         try:
-            self._format.write(key_values, dict(key_excluded), step)
+            write()
         except OSError as error:
-            self._warn(f"warning: no more TensorBoard logs: {error.strerror or error}")
-            self._format = None
+            trouble = error.strerror or str(error)
+            if trouble != self._trouble:
+                self._warn(f"warning: not saved: TensorBoard log: {trouble}; metrics.csv has the same numbers")
+            self._trouble = trouble
+            self.close()
+        else:
+            self._trouble = ""
 
     def close(self) -> None:
-        if self._format is not None:
-            self._format.close()
-            self._format = None
+        before, self._format = self._format, None
+        if before is not None:
+            with contextlib.suppress(OSError):  # told when it happened first
+                before.close()
 
 
 @contextlib.contextmanager
-def writer_errors(warn: Callable[[str], None]) -> Iterator[None]:
-    """Tell `warn` when TensorBoard's own thread cannot write, instead of its traceback."""
+def writer_errors() -> Iterator[None]:
+    """Keep quiet of what TensorBoard's own thread cannot write: `write` raises it again, and that is told."""
     before = threading.excepthook
 
     def hook(arguments: threading.ExceptHookArgs) -> None:
-        if isinstance(arguments.exc_value, OSError):
-            warn(f"warning: not saved: TensorBoard log: {arguments.exc_value.strerror}")
-        else:
+        if not isinstance(arguments.exc_value, OSError):
             before(arguments)
 
     threading.excepthook = hook
@@ -59,9 +82,4 @@ def writer_errors(warn: Callable[[str], None]) -> Iterator[None]:
 
 def make_logger(folder: Path, warn: Callable[[str], None], first_step: int = 0) -> Logger:
     """Return a logger that writes to a TensorBoard folder from a step on; `warn` is told if it cannot."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        return Logger(str(folder), [_TensorBoard(folder, warn, first_step)])
-    except OSError as error:
-        warn(f"warning: no TensorBoard logs: {folder}: {error.strerror or error}")
-        return Logger(str(folder), [])
+    return Logger(str(folder), [_TensorBoard(folder, warn, first_step)])

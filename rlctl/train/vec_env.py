@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from rlctl.rollout.history import ActionHistory
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.train.space_watch import SpaceWatch
 
 _NOTHING: dict[str, Any] = {}
 
@@ -26,6 +27,7 @@ class WorkerVecEnv(VecEnv):
         """Per environment, how many episodes have begun: the next one's number."""
         self.history = ActionHistory(workers.n_envs)
         """What was done in the running episodes."""
+        self.watch = SpaceWatch(workers.info.spaces()[0])
         self.ended: list[EpisodeResult] = []
         """Episodes that ended since somebody last took them."""
         self.render_mode = None
@@ -55,6 +57,7 @@ class WorkerVecEnv(VecEnv):
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
         ended = self.workers.relive(dict(enumerate(zip(seeds, actions, strict=True))))
+        self.watch.forget(self.workers.arrays)  # counted when it was lived first
         self.history = ActionHistory.of_episodes(actions, self.workers.arrays.action)
         for env in range(self.num_envs):
             self.workers.arrays.next_seed[env] = self._seed(env, self.episodes_started[env])
@@ -79,7 +82,9 @@ class WorkerVecEnv(VecEnv):
             self.ended += ended
         # float32, as SB3's own environments hand rewards over.
         rewards = arrays.reward.astype(np.float32)
-        return self.workers.observations(), rewards, arrays.terminated | arrays.truncated, infos
+        observations = self.workers.observations()
+        self.watch.look(observations)
+        return observations, rewards, arrays.terminated | arrays.truncated, infos
 
     def _end_info(self, result: EpisodeResult, final_observation: Any) -> dict[str, Any]:
         arrays = self.workers.arrays

@@ -97,7 +97,10 @@ def test_a_resolved_recipe_is_a_config(packaged, config):
     ("values", "message"),
     [
         ({"alog": "ppo"}, "no key 'alog'. Did you mean 'algo'? Keys here: task, reward_weights, "),
-        ({"eval": {"episode": 3}}, "no key 'eval.episode'. Did you mean 'episodes'? Keys here: every_steps, episodes, deterministic."),
+        (
+            {"eval": {"episode": 3}},
+            "no key 'eval.episode'. Did you mean 'episodes'? Keys here: every_steps, episodes, deterministic.",
+        ),
         ({"checkpoint": {"kep": 3}}, "no key 'checkpoint.kep'. Did you mean 'keep'? Keys here: keep."),
         (
             {"algo": "sac", "her": {"n_sampled_goals": 3}},

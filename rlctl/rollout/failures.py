@@ -1,0 +1,31 @@
+"""What a worker tells of an environment that failed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rlctl.errors import RlctlError, in_words, their_traceback
+from rlctl.rollout.returned import NotAsDeclared
+
+
+class FailedInEpisode(Exception):
+    """Something was raised, as its cause says, in an episode that is known."""
+
+    def __init__(self, env: int, seed: int, step: int) -> None:
+        super().__init__()
+        self.where = {"env": env, "seed": seed, "step": step}
+
+    def __str__(self) -> str:
+        cause = "" if self.__cause__ is None else f"{in_words(self.__cause__)} "
+        return "{}in environment {env}, episode seed {seed}, step {step},".format(cause, **self.where)
+
+
+def as_message(error: BaseException) -> dict[str, Any]:
+    """Return what was raised, and where, as plain data for `Workers`."""
+    where: dict[str, int] = {}
+    if isinstance(error, FailedInEpisode):
+        where, error = error.where, error.__cause__ or error
+    if isinstance(error, RlctlError):
+        return {"message": str(error), "kind": type(error).__name__, "traceback": error.details, **where}
+    told = f"ValueError: {error}" if isinstance(error, NotAsDeclared) else in_words(error)
+    return {"message": told, "kind": None, "traceback": their_traceback(error) or None, **where}

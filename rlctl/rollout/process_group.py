@@ -1,0 +1,38 @@
+"""Workers end with all that their environments have started: each is the first of a process group of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import threading
+import time
+
+
+def end(process: subprocess.Popen[bytes], deadline: float) -> None:
+    """Wait until a worker ends or `time.monotonic()` reaches `deadline`; then kill what is left of its group."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=max(0.0, deadline - time.monotonic()))
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # nobody is left, or only who has ended
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def end_with_parent(parent: int) -> None:
+    """In a worker: end it and its group when its parent ends, even while an environment is stuck in a step."""
+
+    def watch() -> None:
+        import select
+
+        with contextlib.suppress(AttributeError, OSError):  # not on every system, nor in every sandbox
+            descriptor = os.pidfd_open(parent)
+            if os.getppid() == parent:
+                select.select([descriptor], [], [])
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        if os.getpgrp() == os.getpid():
+            os.killpg(0, signal.SIGKILL)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

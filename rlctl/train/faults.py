@@ -1,0 +1,36 @@
+"""What is told, and kept, of an environment that failed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import EpisodeFailed, RlctlError, TaskError
+from rlctl.run.directory import RunDirectory
+from rlctl.train.episodes import EpisodeKeeper
+from rlctl.train.saving import Saver
+from rlctl.train.vec_env import WorkerVecEnv
+
+
+def explained(error: TaskError, run: RunDirectory, env: WorkerVecEnv, saver: Saver, keeper: EpisodeKeeper) -> TaskError:
+    """Keep the actions of the training episode that failed, and return the error with what to do next."""
+    told = [str(error)]
+    if saver.saved_step is not None:
+        told.append(f"the checkpoint of step {saver.saved_step:,} stands; go on with: rlctl train --resume {run.path}")
+    if isinstance(error, EpisodeFailed):
+        lived = env.history.of(error.env)
+        # A reset that fails is that of the next episode: none of the actions is its own.
+        error.actions = None if lived is None else lived[: error.step]
+        told += keep(error, env.workers.spec, saver, keeper)
+    return TaskError("\n".join(told), details=error.details)
+
+
+def keep(
+    error: RlctlError, spec: EnvSpec, saver: Saver, keeper: EpisodeKeeper, evaluated_at: int | None = None
+) -> list[str]:
+    """Write the actions of an episode that failed, if they are known; return what to tell of it."""
+    if not isinstance(error, EpisodeFailed) or error.actions is None:
+        return []
+    files: list[Path] = []
+    saver.attempt("failed episode", lambda: files.append(keeper.keep_failed(spec, error, evaluated_at)))
+    return [f"to live its actions again: rlctl replay {file}" for file in files]

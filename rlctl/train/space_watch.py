@@ -1,0 +1,94 @@
+"""Counts observations that are not what their space says, which trains all the same, and says so once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
+from rlctl.train.progress import Progress
+
+
+class SpaceWatch:
+    """Looks at the observations of all environments after each step: some microseconds, for all of them together."""
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        leaves = space.spaces if isinstance(space, spaces.Dict) else {SINGLE: space}
+        self._dtypes = [dtype for _, dtype in observation_fields(space).values()]
+        self._keys = list(leaves)
+        self._bounds = {key: leaf for key, leaf in leaves.items() if isinstance(leaf, spaces.Box) and _may_leave(leaf)}
+        self._limits = {key: _one_for_all(box) for key, box in self._bounds.items()}
+        self._outside = 0
+        self._told = ""
+
+    def look(self, observations: Any) -> None:
+        """Count those that are outside; arrays have a row per environment."""
+        parts = observations if isinstance(observations, dict) else {SINGLE: observations}
+        rows: set[int] = set()
+        for key, box in self._bounds.items():
+            values = parts[key]
+            if (limits := self._limits[key]) is not None:  # one for all elements: that is faster
+                all_inside = limits[0] <= values.min() and values.max() <= limits[1]
+            else:
+                all_inside = not (np.count_nonzero(values < box.low) or np.count_nonzero(values > box.high))
+            if not all_inside:
+                rows.update(self._rows(key, box, values))
+        self._outside += len(rows)
+
+    def _rows(self, key: str, box: spaces.Box, values: NDArray[Any]) -> list[int]:
+        wrong = ((values < box.low) | (values > box.high)).reshape(len(values), -1)
+        if not self._told:
+            env, element = np.argwhere(wrong)[0]
+            value, low, high = (each.ravel()[element] for each in (values[env], box.low, box.high))
+            self._told = (
+                f"{_named(key)} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
+            )
+        return [int(row) for row in np.flatnonzero(wrong.any(axis=1))]
+
+    def report(self, arrays: SharedArrays, progress: Progress) -> list[str]:
+        """Add what was counted since the last report to `progress`; return what is new to tell."""
+        told = []
+        if self._outside and not progress.observations_outside:
+            told.append(f"warning: {self._told}; such observations are counted, and taken as they are")
+        cast = int(arrays.cast[:, 0].sum())
+        if cast and not progress.observations_cast:
+            _, character, number = arrays.cast[int(arrays.cast[:, 0].argmax())].tolist()
+            dtype, name = np.dtype(chr(character)), _named(self._keys[number])
+            told.append(f"warning: {name} comes as {dtype}, its space says {self._dtypes[number]}: cast, and counted")
+        progress.observations_outside += self._outside
+        progress.observations_cast += cast
+        self.forget(arrays)
+        return told
+
+    def forget(self, arrays: SharedArrays) -> None:
+        """Do not count what has come since the last report."""
+        self._outside = 0
+        arrays.cast[:] = 0
+
+
+def _one_for_all(box: spaces.Box) -> tuple[Any, Any] | None:
+    low, high = box.low.min(), box.high.max()
+    return (low, high) if (box.low == low).all() and (box.high == high).all() else None
+
+
+def _may_leave(box: spaces.Box) -> bool:
+    """Say whether the dtype has values that the space has not."""
+    dtype: Any = box.dtype
+    if np.issubdtype(dtype, np.integer):
+        limits = np.iinfo(dtype)
+        return bool((box.low > limits.min).any() or (box.high < limits.max).any())
+    return bool(np.isfinite(box.low).any() or np.isfinite(box.high).any())
+
+
+def _named(key: str) -> str:
+    return f"observation {key!r}" if key else "observation"
+
+
+def summary(progress: Progress) -> str | None:
+    """Return what to tell at the end of a training; None if there is nothing."""
+    counts = {"outside their space": progress.observations_outside, "of another dtype": progress.observations_cast}
+    told = [f"{count:,} {what}" for what, count in counts.items() if count]
+    return f"warning: observations {' and '.join(told)}" if told else None
