@@ -7,11 +7,13 @@ with the episodes that ended. Observations, actions, rewards and flags travel in
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import gc
 import itertools
 import json
 import math
 import os
+import signal
 import sys
 import threading
 import traceback
@@ -208,8 +210,13 @@ def _error(error: BaseException) -> dict[str, Any]:
     }
 
 
-def _end_with_parent(parent: int) -> None:
+def _end_with_parent(parent: int, lifeline: int) -> None:
     """End this process when its parent ends, even while an environment is stuck in a step."""
+    with contextlib.suppress(AttributeError, OSError):  # Linux only
+        # By the system itself: no thread of ours runs while a library is stuck that holds Python's lock.
+        fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
+        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
+        fcntl.fcntl(lifeline, fcntl.F_SETFL, os.O_ASYNC)
 
     def watch() -> None:
         import select
@@ -230,7 +237,7 @@ def main() -> None:
     """Serve commands until the connection closes. Arguments: connection, descriptor, and the job as JSON."""
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # what is printed is told at once
     job = json.loads(sys.argv[3])
-    _end_with_parent(job["parent"])
+    _end_with_parent(job["parent"], int(sys.argv[4]))
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the main process has heard enough
         _serve(job)
 

@@ -5,8 +5,9 @@ import os
 
 import pytest
 
-from rlctl.rollout.workers import available_cores
-from tests.crash.trials import ARGUMENTS, ForkServer, only_run
+pytest.register_assert_rewrite("tests.crash.contract", "tests.train.comparing")
+
+from tests.crash.trials import ARGUMENTS, ForkServer
 
 PARTS = 17
 """A test that repeats itself is in so many parts, of which the first runs with all other tests."""
@@ -22,7 +23,7 @@ def parts(function):
 def server():
     number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     cores = sorted(os.sched_getaffinity(0))
-    server = ForkServer(cores[number % available_cores()])
+    server = ForkServer(cores[number % len(cores)])
     yield server
     server.close()
 

@@ -88,9 +88,9 @@ def _orphans(deadline):
     except ChildProcessError:
         return []
     left = psutil.Process().children(recursive=True)
+    told = [f"{each.pid} {' '.join(each.cmdline())[:80]}" for each in left]
     for each in left:
         each.kill()
-    told = [f"{each.pid} {' '.join(each.cmdline())[:80]}" for each in left]
     psutil.wait_procs(left, timeout=5.0)
     return told
 

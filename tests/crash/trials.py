@@ -53,6 +53,8 @@ ARGUMENTS = {
 class Ended:
     """How a trial ended, and what it left."""
 
+    arguments: list[str]
+    plan: dict
     folder: Path
     code: int
     """Exit code; the negative number of a signal that killed it."""
@@ -100,7 +102,8 @@ class ForkServer:
         self._process.stdin.flush()
         answer = json.loads(self._process.stdout.readline())
         texts = [_text(folder / name) for name in ("stdout", "stderr", "log")]
-        return Ended(folder, answer["code"], answer["seconds"], answer["orphans"], *texts[:2], texts[2].splitlines())
+        log = texts[2].splitlines()
+        return Ended(arguments, plan, folder, answer["code"], answer["seconds"], answer["orphans"], *texts[:2], log)
 
     def close(self) -> None:
         self._process.stdin.close()
