@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
+import hashlib
 import json
 import platform
 from collections.abc import Mapping
@@ -113,6 +115,11 @@ class PolicyInfo(pydantic.BaseModel):
 
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
+    return dict(_versions())
+
+
+@functools.cache  # each is read from a file, and every checkpoint wants them
+def _versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "rlctl": rlctl.__version__}
     for name in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet"):
         try:
@@ -135,7 +142,17 @@ def policy_bytes(info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> bytes:
     from safetensors.numpy import save
 
     contiguous = {name: np.asarray(value, order="C") for name, value in tensors.items()}
-    return save(contiguous, metadata={"rlctl": info.model_dump_json()})
+    text = info.model_dump_json()
+    return save(contiguous, metadata={"rlctl": text, "sha256": _digest(text, contiguous)})
+
+
+def _digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
+    """Return the sha256 of what a policy file says: a disk may give back other bits, and they load as well."""
+    told = hashlib.sha256(info.encode())
+    for name, values in sorted(tensors.items()):
+        told.update(f"{name} {values.dtype} {values.shape}".encode())
+        told.update(np.ascontiguousarray(values).data)
+    return told.hexdigest()
 
 
 def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
@@ -150,7 +167,10 @@ def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError, ValueError, TypeError) as error:
         raise ArtifactError(f"{path}: damaged, or not a .safetensors file: {error}") from None
-    return parse_info(metadata.get("rlctl"), path), tensors
+    info = parse_info(metadata.get("rlctl"), path)
+    if metadata.get("sha256") != _digest(metadata["rlctl"], tensors):
+        raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
+    return info, tensors
 
 
 def parse_info(text: str | None, path: Path) -> PolicyInfo:

@@ -21,7 +21,7 @@ from rlctl.errors import ArtifactError, DivergedError, EpisodeFailed, Interrupte
 from rlctl.eval.statistics import mean_return, mean_terms, success_rate
 from rlctl.rollout.collect import Episode
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import Score, save_policy
+from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
 from rlctl.train import snapshot
 from rlctl.train.checkpoint import Checkpoint
@@ -162,7 +162,7 @@ class TrainingLoop(BaseCallback):
 
     def _save_the_end(self, *, at_end: bool) -> None:
         self.progress.done = True
-        if not self.save_checkpoint(at_end=at_end):
+        if not self.saver.persistently(lambda: self.save_checkpoint(at_end=at_end)):
             raise ArtifactError(
                 f"{self.run_directory.path}: the training is done, but could not be saved: {self.saver.trouble}"
             )
@@ -260,8 +260,8 @@ class TrainingLoop(BaseCallback):
         better = self._is_better(success, mean)
         if better:
             info = packed[0].model_copy(update={"evaluation": Score(success=success, mean_return=mean)})
-            if self.saver.attempt("best policy", lambda: save_policy(self.run_directory.best_policy, info, packed[1])):
-                progress.best_success, progress.best_return, progress.best_step = success, mean, steps
+            progress.best_success, progress.best_return, progress.best_step = success, mean, steps
+            self.saver.best_policy((info, packed[1]))
         threshold = self.recipe.stop_success
         good = threshold is not None and success is not None and success >= threshold
         progress.good_in_a_row = progress.good_in_a_row + 1 if good else 0

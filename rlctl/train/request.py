@@ -185,7 +185,9 @@ def _train(
         with writer_errors(display.message):
             _learn(model, loop, recipe)
         signals.end()
-        saver.attempt("run.json", lambda: status.write_end(run, model.num_timesteps, progress))
+        saver.persistently(
+            lambda: saver.attempt("run.json", lambda: status.write_end(run, model.num_timesteps, progress))
+        )
         recordings = _record(loop, request.record)
     except BaseException as error:
         with contextlib.suppress(OSError):  # a full disk must not hide the error itself
