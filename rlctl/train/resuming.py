@@ -126,7 +126,9 @@ def prepare(run: RunDirectory, found: Checkpoint | None, progress: Progress) -> 
         if not table.cut_back(size):
             told.append(f"warning: {file}: rows before step {step:,} are gone: it is shorter than the checkpoint says")
         elif size and table.digest() != sha256:
-            told.append(f"warning: {file}: damaged, or edited: rows before step {step:,} are not those that were written")
+            told.append(
+                f"warning: {file}: damaged, or edited: rows before step {step:,} are not those that were written"
+            )
     return told + _take_best(run, progress)
 
 

@@ -7,6 +7,7 @@ import threading
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from rlctl import output
 from rlctl.errors import Interrupted
 
 if TYPE_CHECKING:
@@ -50,6 +51,8 @@ class StopSignals:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         # No output here: it might come in the middle of another.
+        if number == signal.SIGHUP:
+            output.leave_closed_terminal()
         if self._done:
             return
         if self._loop is None:

@@ -5,9 +5,9 @@ import os
 
 import pytest
 
-pytest.register_assert_rewrite("tests.crash.contract", "tests.train.comparing")
-
 from tests.crash.trials import ARGUMENTS, ForkServer
+
+pytest.register_assert_rewrite("tests.crash.contract", "tests.train.comparing")
 
 PARTS = 17
 """A test that repeats itself is in so many parts, of which the first runs with all other tests."""

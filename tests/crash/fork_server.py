@@ -65,7 +65,7 @@ def _trial(request, descriptors):
 
 
 def _wait(process, folder, send):
-    """Send signals to a process, [when, number] each, and wait for its end; a moment is in seconds, or a file's name."""
+    """Send signals to a process, [when, number] each, and wait for its end; `when` is in seconds, or a file to be."""
     started = time.monotonic()
     for when, number in send:
         while not (folder / when).exists() if isinstance(when, str) else time.monotonic() < started + when:

@@ -5,8 +5,8 @@ import os
 import sys
 from pathlib import Path
 
-from tests.crash.faulty_os import FaultyOs, FaultyShutil
 from tests.crash import spare_workers
+from tests.crash.faulty_os import FaultyOs, FaultyShutil
 
 
 def run(arguments, folder, plan):
@@ -54,4 +54,3 @@ def _announce(saver, log):
         return saved
 
     saver.checkpoint = checkpoint
-

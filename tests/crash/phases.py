@@ -40,4 +40,3 @@ def send(number, phase, group=False, again=False):
         return original(*arguments, **options)
 
     setattr(owner, name, called)
-

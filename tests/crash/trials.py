@@ -86,7 +86,12 @@ class ForkServer:
 
     def __init__(self, core: int) -> None:
         # Nothing of the machine's may differ between trials, and the terminal is none.
-        environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'plugins'}", "CRASH_CORE": str(core), "TERM": "dumb"}
+        environment = {
+            **os.environ,
+            "PYTHONPATH": f"{ROOT}:{ROOT / 'plugins'}",
+            "CRASH_CORE": str(core),
+            "TERM": "dumb",
+        }
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tests.crash.fork_server"],
             cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -111,7 +116,7 @@ class ForkServer:
 
 
 def operation_after(whole: Ended, step: int) -> int:
-    """Return the number of the first operation after the checkpoint of a step was announced, in a run without faults."""
+    """Return the number of the first operation after a run without faults announced the checkpoint of a step."""
     place = whole.log.index(f"saved {step}")
     return next(int(line.split()[1]) for line in whole.log[place:] if line.startswith("operation "))
 
