@@ -88,8 +88,18 @@ class RunDirectory:
         return max(numbers, default=-1) + 1
 
     def recipe(self) -> Recipe:
-        """Read the resolved recipe."""
-        return validate(read(self.recipe_file), str(self.recipe_file))
+        """Read the resolved recipe; raises `ArtifactError` if it is not the one that the training began with."""
+        content = read(self.recipe_file)
+        if not files.is_as_sealed(self.recipe_file):
+            raise ArtifactError(
+                f"{self.recipe_file}: not as the training wrote it: edited, or damaged. "
+                f"For a new training with it: rlctl train TASK --config {self.recipe_file}"
+            )
+        return validate(content, str(self.recipe_file))
+
+    def write_recipe(self, recipe: Recipe) -> None:
+        """Write the resolved recipe; what is edited in it later is noticed."""
+        files.write_sealed(self.recipe_file, recipe.to_yaml())
 
     def status(self) -> dict[str, Any]:
         """Read `run.json`."""

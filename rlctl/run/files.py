@@ -152,11 +152,6 @@ def append(path: Path, content: bytes, size: int) -> None:
         os.close(descriptor)
 
 
-def set_aside(path: Path) -> None:
-    """Give a file that is not what it should be another name, `<name>.damaged`."""
-    os.replace(path, path.with_name(f"{path.name}.damaged"))
-
-
 def truncate(path: Path, size: int) -> None:
     """Cut a file back to its first `size` bytes."""
     descriptor = os.open(path, os.O_WRONLY)
@@ -203,6 +198,28 @@ def check_digest(path: Path, expected: str) -> None:
         raise ArtifactError(f"{path}: {error.strerror or error}") from None
     if digest(content) != expected:
         raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
+
+
+_SEAL = "\n# sha256 of the above: "
+
+
+def write_sealed(path: Path, content: str) -> None:
+    """Write a UTF-8 file that ends in a comment with its sha256, whole or not at all."""
+    content = content.removesuffix("\n")
+    write_text(path, f"{content}{_SEAL}{digest(content.encode())}\n")
+
+
+def is_as_sealed(path: Path) -> bool:
+    """Whether a file that can be read is as `write_sealed` wrote it."""
+    content, _, seal = path.read_bytes().rpartition(_SEAL.encode())
+    return seal.decode(errors="replace") == digest(content) + "\n"
+
+
+def set_aside(path: Path) -> None:
+    """Rename a damaged folder out of the way, in the place of one that was set aside before under this name."""
+    aside = path.with_name(f"{path.name}.damaged")
+    remove_tree(aside)
+    os.rename(path, aside)
 
 
 def remove(path: Path) -> None:

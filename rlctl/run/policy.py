@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
+import hashlib
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -115,6 +117,11 @@ class PolicyInfo(pydantic.BaseModel):
 
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
+    return dict(_versions())
+
+
+@functools.cache  # each is read from a file, and every checkpoint wants them
+def _versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "rlctl": rlctl.__version__}
     for name in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet"):
         try:
@@ -137,7 +144,17 @@ def policy_bytes(info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> bytes:
     from safetensors.numpy import save
 
     contiguous = {name: np.asarray(value, order="C") for name, value in tensors.items()}
-    return save(contiguous, metadata={"rlctl": info.model_dump_json()})
+    text = info.model_dump_json()
+    return save(contiguous, metadata={"rlctl": text, "sha256": _digest(text, contiguous)})
+
+
+def _digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
+    """Return the sha256 of what a policy file says: a disk may give back other bits, and they load as well."""
+    told = hashlib.sha256(info.encode())
+    for name, values in sorted(tensors.items()):
+        told.update(f"{name} {values.dtype} {values.shape}".encode())
+        told.update(np.ascontiguousarray(values).data)
+    return told.hexdigest()
 
 
 def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
@@ -152,6 +169,9 @@ def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
         raise ArtifactError(f"{path}: damaged, or not a .safetensors file: {error}") from None
+    # Other programs may leave it out.
+    if metadata.get("sha256", digest := _digest(metadata["rlctl"], tensors)) != digest:
+        raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
     for name, values in tensors.items():
         if not np.isfinite(values).all():
             raise ArtifactError(f"{path}: damaged: {shown(name)} is not finite")

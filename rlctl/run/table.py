@@ -29,6 +29,10 @@ class Table:
         self.size = min(size, self.size)
         return self.size == size
 
+    def digest(self) -> str:
+        """Return the sha256 of the first `size` bytes of the file."""
+        return files.digest(self.path.read_bytes()[: self.size] if self.size else b"")
+
     def add(self, row: Mapping[str, Any]) -> None:
         """Add a row, which the next `flush` writes; None becomes an empty field."""
         self._waiting.append({key: "" if value is None else value for key, value in row.items()})

@@ -171,7 +171,7 @@ class TrainingLoop(BaseCallback):
 
     def _save_the_end(self, *, at_end: bool) -> None:
         self.progress.done = True
-        if not self.save_checkpoint(at_end=at_end):
+        if not self.saver.persistently(lambda: self.save_checkpoint(at_end=at_end)):
             raise ArtifactError(
                 f"{self.run_directory.path}: the training is done, but could not be saved: {self.saver.trouble}"
             )

@@ -228,7 +228,8 @@ def _learn_to_the_end(loop: TrainingLoop, request: TrainRequest, signals: StopSi
     steps, progress = loop.model.num_timesteps, loop.progress
     if warning := summary(progress):
         display.message(warning)
-    loop.saver.attempt("run.json", lambda: status.write_end(loop.run_directory, steps, progress))
+    saver, run = loop.saver, loop.run_directory
+    saver.persistently(lambda: saver.attempt("run.json", lambda: status.write_end(run, steps, progress)))
     return _record(loop, request.record)
 
 
