@@ -216,10 +216,11 @@ def is_as_sealed(path: Path) -> bool:
 
 
 def set_aside(path: Path) -> None:
-    """Rename a damaged folder out of the way, in the place of one that was set aside before under this name."""
+    """Rename what is damaged out of the way, in the place of what was set aside before under this name."""
     aside = path.with_name(f"{path.name}.damaged")
-    remove_tree(aside)
-    os.rename(path, aside)
+    if aside.is_dir():
+        remove_tree(aside)
+    os.replace(path, aside)
 
 
 def remove(path: Path) -> None:
