@@ -71,6 +71,26 @@ def test_round_trip(tmp_path):
         assert arrays[name].dtype == value.dtype
 
 
+def test_no_bit_of_a_policy_changes_unnoticed(path):
+    content = path.read_bytes()
+    info, tensors = read_policy(path)
+    chance = np.random.default_rng(0)
+    for bit in chance.integers(8 * len(content), size=400).tolist():
+        flipped = bytearray(content)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            now, arrays = read_policy(path)
+        except ArtifactError as error:
+            assert str(path) in str(error)
+            continue
+        # A bit of the format's own, such as white space.
+        assert now == info
+        assert {name: values.tobytes() for name, values in arrays.items()} == {
+            name: values.tobytes() for name, values in tensors.items()
+        }
+
+
 def test_normalisation_by_hand(path):
     _, tensors = read_policy(path)
     policy = rlctl.load_policy(path)
