@@ -20,8 +20,8 @@ SMALL_PPO = {**SMALL, "algo_kwargs": {"n_steps": 16, "batch_size": 32, "n_epochs
 def train(tmp_path: Path):
     """Train on an environment of envs.py in this process, into a temporary folder."""
 
-    def run(env: str, settings: dict, **request) -> TrainResult:
-        task = f"{ENVS}:{env}" if env[0].isupper() else env
+    def run(env: str, settings: dict, envs: str | Path = ENVS, **request) -> TrainResult:
+        task = f"{envs}:{env}" if env[0].isupper() else env
         return run_training(TrainRequest(task, settings=settings, root=tmp_path / "runs", **request))
 
     return run
