@@ -76,7 +76,7 @@ def test_a_worker_that_is_killed_while_idle(spec, start):
     with pytest.raises(TaskError) as caught:
         workers.step()
     assert str(caught.value).startswith(f"task '{ENVS}:Walk': worker 1 died while ")
-    assert str(caught.value).endswith("(SIGKILL)\nit ran the environments 2 to 3")
+    assert str(caught.value).endswith("need less)\nit ran the environments 2 to 3")
 
 
 def test_an_environment_that_cannot_be_built(spec, start):
