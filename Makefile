@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow lint format bench clean
+.PHONY: demo test test-slow test-crash lint format bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/rlctl train reach
@@ -16,6 +16,9 @@ test: lint
 
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow --timeout 3600
+
+test-crash: $(VENV)/.dev
+	$(BIN)/python -m pytest tests/crash -m "" -n 2 --timeout 3600
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff format --check

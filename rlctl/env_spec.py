@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
-from rlctl.errors import RecipeError, TaskError, did_you_mean
+from rlctl import named_task
+from rlctl.errors import RecipeError, TaskError, did_you_mean, shown
 from rlctl.registry import guarded, is_task, load
 
 if TYPE_CHECKING:
     import gymnasium
+
+
+LARGEST_SPACE = 10_000_000
+"""Elements that the observations or the actions of an environment may have: a full-HD picture has 6 million."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,10 +35,16 @@ class EnvSpec:
     """Stage of the curriculum that these are of, from 1, for who reads it; 0 where there is none."""
     level: float = 1.0
     """How far the ranges of events that widen have done so, in [0, 1]."""
+    named_by: str = dataclasses.field(default="", compare=False)
+    """The kind of file that names the task, for people; empty where a person did. A file may name environments only."""
+
+    def constructor(self) -> Callable[..., Any]:
+        """Import what makes the environment; raises `ArtifactError` if a file names it and it is no environment."""
+        return named_task.load(self.task, self.named_by) if self.named_by else load(self.task)
 
     def make(self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None) -> gymnasium.Env[Any, Any]:
         """Build the environment; raises `UsageError` for what the user typed, `TaskError` for what it does."""
-        constructor = load(self.task)
+        constructor = self.constructor()
         if is_task(constructor):
             env = self._make_task_env(constructor, render_mode)
         else:
@@ -131,12 +143,21 @@ def _task_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in given.items():
         if key not in fields:
             raise _no_parameter(task.__name__, key, list(fields))
+        _check_number(key, hints[key], value)
         try:
             checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
         except pydantic.ValidationError as error:
             told = error.errors()[0]["msg"].removeprefix("Input ")
-            raise RecipeError(f"task.{key}: {told}, got {value!r}") from None
+            raise RecipeError(f"task.{key}: {told}, got {shown(repr(value))}") from None
     return checked
+
+
+def _check_number(key: str, hint: Any, value: Any) -> None:
+    """Raise `RecipeError` for what pydantic would make a number of: text and bools; and for what is none."""
+    if hint in (int, float) and isinstance(value, bool | str):
+        raise RecipeError(f"task.{key}: expected a number, got {shown(repr(value))}")
+    if isinstance(value, float) and math.isnan(value):
+        raise RecipeError(f"task.{key}: expected a number, got nan")
 
 
 def _stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any, Any]:
@@ -148,6 +169,8 @@ def _stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[An
     space = env.observation_space
     if not isinstance(space, spaces.Box) or len(space.shape) not in (1, 3):
         raise RecipeError(f"frame_stack: only flat and image observations can be stacked, this task has {space}")
+    if (count := math.prod(space.shape) * frames) > LARGEST_SPACE:
+        raise RecipeError(f"frame_stack: {frames:,} makes {count:,} elements; at most {LARGEST_SPACE:,} are supported")
     # Gymnasium stacks along a new first axis; networks want vectors and images of the same rank.
     stacked = spaces.Box(
         np.concatenate([space.low] * frames, axis=-1),

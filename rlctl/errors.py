@@ -119,3 +119,13 @@ def did_you_mean(word: str, options: Iterable[str]) -> str:
     """Return " Did you mean 'reach'?" for the option closest to `word`, or an empty string."""
     close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.5)
     return f" Did you mean {close[0]!r}?" if close else ""
+
+
+def shown(value: object, length: int = 80) -> str:
+    """Return a value as Python writes it, text as it is, in one line of at most `length` characters."""
+    try:
+        text = value if isinstance(value, str) else repr(value)
+    except (ValueError, RecursionError):  # a number of thousands of digits; what holds itself
+        text = f"a {type(value).__name__} that cannot be written down"
+    text = " ".join(text.split())
+    return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import os
+import stat
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -29,6 +31,18 @@ def results() -> TextIO:
         raise BrokenPipeError from None
     os.dup2(2, 1)
     return stream
+
+
+def leave_closed_terminal() -> None:
+    """Point what leads to a terminal that was closed to nowhere: to write there would be an error from now on."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    own = [results().fileno()] if results.cache_info().currsize else []
+    for descriptor in (0, 1, 2, *own):
+        with contextlib.suppress(OSError):  # not open at all
+            # A closed terminal is a device still, but no terminal.
+            if stat.S_ISCHR(os.fstat(descriptor).st_mode) and not os.isatty(descriptor):
+                os.dup2(nowhere, descriptor)
+    os.close(nowhere)
 
 
 @functools.cache

@@ -21,6 +21,7 @@ LAYERS = [
     {"run"},
     {"gym"},
     {"env_spec"},
+    {"named_task"},
     {"registry"},
     {"task"},
     {"output"},

@@ -38,5 +38,5 @@ def next_recording(output: Path | None, run: RunDirectory | None) -> Path:
         return owner.episode_file(owner.next_episode_number()).with_suffix(".rrd")
     if output.suffix == ".rrd":
         return output
-    numbers = [int(each.stem) for each in output.glob("*.rrd") if each.stem.isdigit()]
+    numbers = [int(each.stem) for each in output.glob("*.rrd") if each.stem.isdecimal()]
     return output / RunDirectory(output).episode_file(max(numbers, default=-1) + 1).with_suffix(".rrd").name

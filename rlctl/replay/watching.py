@@ -38,7 +38,7 @@ def watched_env(spec: EnvSpec, tell: Tell) -> Iterator[Env]:
 
 
 def _build(spec: EnvSpec, tell: Tell) -> Env:
-    if registry.is_task(registry.load(spec.task)):
+    if registry.is_task(spec.constructor()):
         return spec.make()  # its bodies are drawn; pictures would be slow and say less
     try:
         return spec.make("rgb_array")

@@ -22,7 +22,7 @@ _DT = 1 / 30  # [s] a step, where an environment does not say
 def open_window(spec: EnvSpec) -> Iterator[Env]:
     """Build an environment that shows itself, and close it; raises `UsageError` where there is no display."""
     if sys.platform == "linux":
-        _check_display(bullet=registry.is_task(registry.load(spec.task)))
+        _check_display(bullet=registry.is_task(spec.constructor()))
     env = spec.make("human")
     try:
         yield env

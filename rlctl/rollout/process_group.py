@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import signal
 import subprocess
@@ -19,8 +20,16 @@ def end(process: subprocess.Popen[bytes], deadline: float) -> None:
     process.wait()
 
 
-def end_with_parent(parent: int) -> None:
-    """In a worker: end it and its group when its parent ends, even while an environment is stuck in a step."""
+def end_with_parent(parent: int, lifeline: int) -> None:
+    """In a worker: end it and its group when its parent ends, even while an environment is stuck in a step.
+
+    `lifeline` is the descriptor of a pipe whose other end the parent alone holds.
+    """
+    with contextlib.suppress(AttributeError, OSError):  # Linux only
+        # By the system itself: no thread of ours runs while a library is stuck that holds Python's lock.
+        fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid() if os.getpgrp() == os.getpid() else os.getpid())
+        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
+        fcntl.fcntl(lifeline, fcntl.F_SETFL, os.O_ASYNC)
 
     def watch() -> None:
         import select

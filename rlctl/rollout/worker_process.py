@@ -229,7 +229,7 @@ def main() -> None:
     """Serve commands until the connection closes. Arguments: connection, descriptor, and the job as JSON."""
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # what is printed is told at once
     job = json.loads(sys.argv[3])
-    end_with_parent(job["parent"])
+    end_with_parent(job["parent"], int(sys.argv[4]))
     try:
         _serve(job)
     except (BrokenPipeError, ConnectionResetError):  # the main process has heard enough

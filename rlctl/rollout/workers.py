@@ -35,9 +35,11 @@ from rlctl.run.env_info import EnvInfo
 Observations = NDArray[Any] | dict[str, NDArray[Any]]
 
 # Started this way a worker finds what its parent finds, and the caller's script is not run again.
-# Ctrl-C reaches the whole group, and the main process decides: ignored before anything slow is imported.
+# Ctrl-C, a closed terminal and a service's stop reach the whole group, and the main process decides: ignored before
+# anything slow is imported. What the environments start has its own say in the latter two.
 _BOOTSTRAP = (
     "import json, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+    "[signal.signal(number, lambda *_: None) for number in (signal.SIGTERM, signal.SIGHUP)]; "
     "sys.path[:] = json.loads(sys.argv[3])['sys_path']; "
     "from rlctl.rollout.worker_process import main; main()"
 )
@@ -90,6 +92,7 @@ class Workers:
         self._memory = anonymous_file()
         self._processes: list[subprocess.Popen[bytes]] = []
         self._connections: list[Connection] = []
+        self._lifelines: list[int] = []
         self._ready = False
         self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
         read_end, self._printing = os.pipe()
@@ -109,6 +112,9 @@ class Workers:
 
     def _start(self, first: int, count: int) -> None:
         ours, theirs = socket.socketpair()
+        # The end of a pipe that nobody writes to: it tells the worker when this process is gone, and closes it.
+        lifeline, our_end = os.pipe()
+        self._lifelines.append(our_end)
         job = {
             "spec": dataclasses.asdict(self._spec),
             "first": first,
@@ -124,10 +130,11 @@ class Workers:
             "OPENBLAS_NUM_THREADS": "1",
             "MKL_NUM_THREADS": "1",
         }
-        with theirs:
+        passed = (theirs.fileno(), self._memory, lifeline)
+        with theirs, open(lifeline, "rb"):
             process = subprocess.Popen(
-                [sys.executable, "-c", _BOOTSTRAP, str(theirs.fileno()), str(self._memory), json.dumps(job)],
-                pass_fds=(theirs.fileno(), self._memory),
+                [sys.executable, "-c", _BOOTSTRAP, *map(str, passed[:2]), json.dumps(job), str(lifeline)],
+                pass_fds=passed,
                 stdin=subprocess.DEVNULL,
                 stdout=self._printing,
                 stderr=self._printing,
@@ -346,6 +353,8 @@ class Workers:
         for process in self._processes:
             end(process, deadline)
         self._processes = []
+        while self._lifelines:  # not before they have ended: it kills them
+            os.close(self._lifelines.pop())
         self._output.join(timeout=1.0)
         if self._memory >= 0:
             os.close(self._memory)

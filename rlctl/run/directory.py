@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import registry
-from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.errors import ArtifactError, UsageError, did_you_mean, shown
 from rlctl.run import files
 from rlctl.run.recipe import Recipe, read, validate
 
 ROOT = Path("runs")
+_DIGITS = 18  # of a training step
 
 
 class RunDirectory:
@@ -70,7 +71,7 @@ class RunDirectory:
         folder = self.path / "checkpoints"
         if not folder.is_dir():
             return []
-        return sorted(each for each in folder.iterdir() if each.name.isdigit())
+        return sorted(each for each in folder.iterdir() if each.name.isdecimal())
 
     @property
     def replay_segments(self) -> Path:
@@ -83,17 +84,27 @@ class RunDirectory:
 
     def next_episode_number(self) -> int:
         """Return the number after the highest one there is."""
-        numbers = [int(each.stem) for each in self.episodes.glob("*.npz") if each.stem.isdigit()]
+        numbers = [int(each.stem) for each in self.episodes.glob("*.npz") if each.stem.isdecimal()]
         return max(numbers, default=-1) + 1
 
     def recipe(self) -> Recipe:
-        """Read the resolved recipe."""
-        return validate(read(self.recipe_file), str(self.recipe_file))
+        """Read the resolved recipe; raises `ArtifactError` if it is not the one that the training began with."""
+        content = read(self.recipe_file)
+        if not files.is_as_sealed(self.recipe_file):
+            raise ArtifactError(
+                f"{self.recipe_file}: not as the training wrote it: edited, or damaged. "
+                f"For a new training with it: rlctl train TASK --config {self.recipe_file}"
+            )
+        return validate(content, str(self.recipe_file))
+
+    def write_recipe(self, recipe: Recipe) -> None:
+        """Write the resolved recipe; what is edited in it later is noticed."""
+        files.write_sealed(self.recipe_file, recipe.to_yaml())
 
     def status(self) -> dict[str, Any]:
         """Read `run.json`."""
         status = files.read_json(self.status_file)
-        if not isinstance(status, dict) or "task" not in status:
+        if not isinstance(status, dict) or not isinstance(status.get("task"), str):
             raise ArtifactError(f"{self.status_file}: not a run of rlctl: it names no task")
         return status
 
@@ -110,8 +121,8 @@ class RunDirectory:
                 hint = "train longer, or use --checkpoint last" if which == "best" else "it saved none"
                 raise ArtifactError(f"{self.path}: no {which} policy yet; {hint}")
             return file
-        if not which.isdigit():
-            raise UsageError(f"--checkpoint {which!r}: give best, last, or the step of a checkpoint")
+        if not which.isdecimal() or len(which) > _DIGITS:
+            raise UsageError(f"--checkpoint {shown(which)!r}: give best, last, or the step of a checkpoint")
         file = self.checkpoint(int(which)) / "policy.safetensors"
         if not file.is_file():
             steps = ", ".join(str(int(each.name)) for each in self.checkpoints())
@@ -124,7 +135,14 @@ class RunDirectory:
             files.recover(folder)
 
     def lock(self) -> RunLock:
-        """Claim the folder for writing until the lock is released or the process ends."""
+        """Claim the folder for writing until the lock is released or the process ends.
+
+        Raises `ArtifactError` for a folder with a link out of it: what is written must stay in the run.
+        """
+        own = self.path.resolve()
+        for place in self.path.rglob("*"):
+            if place.is_symlink() and not place.resolve().is_relative_to(own):
+                raise ArtifactError(f"{place}: a link out of the run's folder; nothing is written through it")
         return RunLock(self.path)
 
 
@@ -161,6 +179,12 @@ class RunLock:
         if self._descriptor >= 0:
             os.close(self._descriptor)
         self._descriptor = -1
+
+    def __enter__(self) -> RunLock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
 
 
 def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
@@ -215,7 +239,7 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> tup
     """Return the policy file for a user's word, which may be a policy file itself, and its run if it has one."""
     if text is not None and Path(text).suffix in (".safetensors", ".onnx"):
         path = Path(text)
-        if not path.is_file():
+        if not path.exists():
             raise ArtifactError(f"{path}: no such file")
         owner = path.parent.parent
         return path, RunDirectory(owner) if (owner / "run.json").is_file() else None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -9,7 +11,12 @@ import numpy as np
 import pydantic
 from gymnasium import spaces
 
-from rlctl.errors import ArtifactError, UsageError
+from rlctl.env_spec import LARGEST_SPACE
+from rlctl.errors import ArtifactError, UsageError, shown
+
+_ONE_HOT = 10
+"""How many elements of a Box an alternative of a discrete space counts for."""
+_DIMENSIONS = 32  # what the oldest numpy can do
 
 
 class EnvInfo(pydantic.BaseModel):
@@ -77,7 +84,11 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
 
 
 def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
-    """Return a space as plain data; raises `UsageError` for a kind that no policy here can handle."""
+    """Return a space as plain data; raises `UsageError` for a kind or a size that no policy here can handle."""
+    if isinstance(space, spaces.Box | spaces.MultiBinary) and math.prod(space.shape or ()) > LARGEST_SPACE:
+        raise UsageError(
+            f"a space of {math.prod(space.shape or ()):,} elements; at most {LARGEST_SPACE:,} are supported"
+        )
     if isinstance(space, spaces.Box):
         return {
             "type": "Box",
@@ -107,27 +118,75 @@ def _bound(values: Any) -> Any:
 
 def _unbound(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
     if isinstance(value, str):
-        return np.full(shape, float(value)).astype(dtype)
+        return np.full(shape, np.float64(value).astype(dtype))
     return np.array([float(v) for v in value]).reshape(shape).astype(dtype)
 
 
 def space_from_json(data: dict[str, Any]) -> spaces.Space[Any]:
-    """Return the space that `space_to_json` wrote; raises `ArtifactError` if it is not one."""
+    """Return the space that `space_to_json` wrote; raises `ArtifactError` if it is not one, before it takes memory."""
     try:
-        kind = data["type"]
-        if kind == "Box":
-            shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
-            low, high = _unbound(data["low"], shape, dtype), _unbound(data["high"], shape, dtype)
-            return spaces.Box(low, high, shape, dtype.type)
-        if kind == "Discrete":
-            return spaces.Discrete(data["n"], start=data["start"])
-        if kind == "MultiDiscrete":
-            return spaces.MultiDiscrete(data["nvec"])
-        if kind == "MultiBinary":
-            return spaces.MultiBinary(data["n"])
-        if kind == "Dict":
-            # Pairs: a mapping would be sorted by key, and the order is part of the space.
-            return spaces.Dict([(key, space_from_json(value)) for key, value in data["spaces"].items()])
-    except (KeyError, TypeError, ValueError, AssertionError) as error:
-        raise ArtifactError(f"not a space: {error!r}") from None
-    raise ArtifactError(f"not a space: type {kind!r}")
+        if (count := _elements(data)) > LARGEST_SPACE:
+            raise ValueError(f"{count:,} elements, at most {LARGEST_SPACE:,} are supported")
+        return _built(data)
+    except (KeyError, TypeError, ValueError, AttributeError, AssertionError, OverflowError, RecursionError) as error:
+        raise ArtifactError(f"not a space: {shown(str(error) or error)}") from None
+
+
+def _elements(data: dict[str, Any]) -> int:
+    if data["type"] == "Dict":
+        return sum(_elements(each) for each in data["spaces"].values())
+    if data["type"] == "Box":
+        return math.prod(_shape(data["shape"]))
+    if data["type"] == "MultiBinary":
+        return math.prod(_shape(data["n"]))
+    # Networks want them one-hot, as numbers of eight bytes, for a whole batch.
+    alternatives = [data["n"]] if data["type"] == "Discrete" else data["nvec"]
+    return _ONE_HOT * sum(_whole(each) for each in alternatives)
+
+
+def _built(data: dict[str, Any]) -> spaces.Space[Any]:
+    return _SPACES[data["type"]](data)
+
+
+def _box(data: dict[str, Any]) -> spaces.Space[Any]:
+    shape, dtype = _shape(data["shape"]), np.dtype(data["dtype"])
+    if dtype.kind not in "biuf":
+        raise ValueError(f"a Box of {dtype}")
+    low, high = _unbound(data["low"], shape, dtype), _unbound(data["high"], shape, dtype)
+    return spaces.Box(low, high, shape, dtype.type)
+
+
+def _discrete(data: dict[str, Any]) -> spaces.Space[Any]:
+    return spaces.Discrete(_whole(data["n"]), start=_whole(data["start"]))
+
+
+def _multi_binary(data: dict[str, Any]) -> spaces.Space[Any]:
+    shape = _shape(data["n"])
+    return spaces.MultiBinary(list(shape) if isinstance(data["n"], list) else shape[0])
+
+
+def _dict(data: dict[str, Any]) -> spaces.Space[Any]:
+    # Pairs: a mapping would be sorted by key, and the order is part of the space.
+    return spaces.Dict([(key, _built(value)) for key, value in data["spaces"].items()])
+
+
+_SPACES: dict[str, Callable[[dict[str, Any]], spaces.Space[Any]]] = {
+    "Box": _box,
+    "Discrete": _discrete,
+    "MultiDiscrete": lambda data: spaces.MultiDiscrete(data["nvec"]),
+    "MultiBinary": _multi_binary,
+    "Dict": _dict,
+}
+
+
+def _whole(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TypeError(f"expected a whole number, got {shown(value)}")
+    return value
+
+
+def _shape(sizes: Any) -> tuple[int, ...]:
+    shape = tuple(_whole(size) for size in (sizes if isinstance(sizes, list) else [sizes]))
+    if min(shape, default=0) < 0 or len(shape) > _DIMENSIONS:
+        raise ValueError(f"shape {shown(list(shape))}")
+    return shape

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pydantic
 from numpy.typing import NDArray
+from pydantic import Field
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.run import files
+from rlctl.named_task import EPISODE
+from rlctl.run import files, untrusted
 
 FORMAT = 1
 Observations = NDArray[Any] | dict[str, NDArray[Any]]
@@ -30,12 +31,12 @@ class EpisodeInfo(pydantic.BaseModel):
     reward_weights: dict[str, float] = {}
     randomize: bool = False
     events: dict[str, dict[str, Any]] = {}
-    frame_stack: int = 1
+    frame_stack: int = Field(1, ge=1)
     stage: int = 0
     """Stage of the curriculum, from 1; 0 where there is none."""
-    level: float = 1.0
+    level: float = Field(1.0, ge=0, le=1)
     """How far the ranges of events that widen had done so, in [0, 1]."""
-    seed: int
+    seed: int = Field(ge=0)
     policy: str = ""
     """What chose the actions, for people: a file name and a training step."""
     success: bool | None = None
@@ -71,6 +72,7 @@ class EpisodeInfo(pydantic.BaseModel):
             self.frame_stack,
             self.stage,
             self.level,
+            named_by=EPISODE,
         )
 
 
@@ -115,13 +117,40 @@ def load_episode(path: Path) -> RecordedEpisode:
     if not observed or not {"info", "actions", "rewards", "terms"} <= arrays.keys():
         raise ArtifactError(f"{path}: not an episode of rlctl: it has no info, actions, rewards and terms")
     try:
-        data = json.loads(str(arrays["info"]))
+        data = untrusted.parse_json(str(arrays["info"]))
         if isinstance(data.get("format"), int) and data["format"] > FORMAT:
             raise ArtifactError(f"{path}: episode format {data['format']} is newer than this rlctl can read ({FORMAT})")
         info = EpisodeInfo.model_validate(data)
     except (ValueError, AttributeError, pydantic.ValidationError) as error:
-        raise ArtifactError(f"{path}: its description is damaged: {str(error).splitlines()[0]}") from None
+        raise ArtifactError(f"{path}: its description is damaged: {untrusted.explained(error)}") from None
     prefix = "observations/"
     parts = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
     observations: Observations = parts or arrays["observations"]
-    return RecordedEpisode(info, arrays["actions"], observations, arrays["rewards"], arrays["terms"])
+    episode = RecordedEpisode(info, arrays["actions"], observations, arrays["rewards"], arrays["terms"])
+    if (problem := _mismatch(episode)) is not None:
+        raise ArtifactError(f"{path}: damaged: {problem}")
+    return episode
+
+
+def _mismatch(episode: RecordedEpisode) -> str | None:
+    """Say which array is not what an episode of as many steps as it has rewards would have; None if all are."""
+    observations, rewards = episode.observations, episode.rewards
+    if rewards.ndim != 1 or rewards.dtype != np.float64:
+        return f"rewards are {_told(rewards)}, not a row of float64"
+    steps, names = len(rewards), len(episode.info.term_names)
+    if episode.terms.shape != (steps, names) or episode.terms.dtype != np.float64:
+        return f"reward terms are {_told(episode.terms)}, not float64 of shape {(steps, names)}"
+    parts = observations if isinstance(observations, dict) else {"": observations}
+    for name, values, count in (("actions", episode.actions, steps), *((k, v, steps + 1) for k, v in parts.items())):
+        label = name if name == "actions" else f"observations {name}".strip()
+        if values.ndim == 0 or len(values) != count:
+            return f"{label} are {_told(values)}, not {count} of them"
+        if values.dtype.kind not in "biuf":
+            return f"{label} are {_told(values)}, not numbers"
+    if not np.isfinite(episode.actions).all():
+        return "actions are not all finite"
+    return None
+
+
+def _told(values: NDArray[Any]) -> str:
+    return f"{values.dtype} of shape {values.shape}"

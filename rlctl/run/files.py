@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError
+from rlctl.run import untrusted
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -55,9 +56,7 @@ def write_json(path: Path, content: Any) -> None:
 def read_json(path: Path) -> Any:
     """Read JSON; raises `ArtifactError` if the file is missing or damaged."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ArtifactError(f"{path}: {error.strerror or error}") from None
+        return untrusted.parse_json(untrusted.read_bytes(path, untrusted.JSON_LIMIT).decode())
     except ValueError as error:
         raise ArtifactError(f"{path}: damaged: {error}") from None
 
@@ -72,10 +71,9 @@ def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """Read a `.npz` without pickle; raises `ArtifactError` if it is missing, damaged or of another kind."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError:
-        raise ArtifactError(f"{path}: no such file") from None
+        return untrusted.read_arrays(path)
+    except ArtifactError:
+        raise
     except Exception as error:  # numpy raises whatever zipfile, zlib and its own parser raise
         raise ArtifactError(f"{path}: damaged, or not an .npz file: {error}") from None
 
@@ -154,11 +152,6 @@ def append(path: Path, content: bytes, size: int) -> None:
         os.close(descriptor)
 
 
-def set_aside(path: Path) -> None:
-    """Give a file that is not what it should be another name, `<name>.damaged`."""
-    os.replace(path, path.with_name(f"{path.name}.damaged"))
-
-
 def truncate(path: Path, size: int) -> None:
     """Cut a file back to its first `size` bytes."""
     descriptor = os.open(path, os.O_WRONLY)
@@ -205,6 +198,29 @@ def check_digest(path: Path, expected: str) -> None:
         raise ArtifactError(f"{path}: {error.strerror or error}") from None
     if digest(content) != expected:
         raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
+
+
+_SEAL = "\n# sha256 of the above: "
+
+
+def write_sealed(path: Path, content: str) -> None:
+    """Write a UTF-8 file that ends in a comment with its sha256, whole or not at all."""
+    content = content.removesuffix("\n")
+    write_text(path, f"{content}{_SEAL}{digest(content.encode())}\n")
+
+
+def is_as_sealed(path: Path) -> bool:
+    """Whether a file that can be read is as `write_sealed` wrote it."""
+    content, _, seal = path.read_bytes().rpartition(_SEAL.encode())
+    return seal.decode(errors="replace") == digest(content) + "\n"
+
+
+def set_aside(path: Path) -> None:
+    """Rename what is damaged out of the way, in the place of what was set aside before under this name."""
+    aside = path.with_name(f"{path.name}.damaged")
+    if aside.is_dir():
+        remove_tree(aside)
+    os.replace(path, aside)
 
 
 def remove(path: Path) -> None:

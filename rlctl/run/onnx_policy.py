@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,9 @@ import onnxruntime
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.errors import ArtifactError, UsageError
+from rlctl.env_spec import LARGEST_SPACE
+from rlctl.errors import ArtifactError, UsageError, shown
+from rlctl.run import memory, onnx_file, untrusted
 from rlctl.run.policy import ROWS, Observations, Policy, PolicyInfo, State, parse_info
 
 METADATA_KEY = "rlctl"
@@ -24,6 +28,8 @@ STATE_OUTPUTS = ("state_h_out", "state_c_out")
 """The LSTM state for the next step."""
 
 _FATAL_ONLY = 4
+_LARGEST = 2 * 2**30  # [bytes] of a file, the most that its format can hold
+_MEMORY = 2 * 2**30  # [bytes]
 
 
 class OnnxPolicy(Policy):
@@ -41,24 +47,16 @@ class OnnxPolicy(Policy):
         if self._recurrent:
             layers, _, hidden = inputs[STATE_INPUTS[0]]
             self._state_size = (int(layers), int(hidden))
+            if math.prod(self._state_size) > LARGEST_SPACE:
+                raise ValueError(f"a state of {layers} layers of {hidden}")
         self._outputs = [ACTION, *STATE_OUTPUTS] if self._recurrent else [ACTION]
         self._state = self._zeros(1)
 
     @classmethod
     def load(cls, path: Path) -> OnnxPolicy:
         """Read an exported file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise ArtifactError(f"{path}: {error.strerror or error}") from None
-        try:
-            session = onnxruntime.InferenceSession(content, _options(), providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's own errors have no public base class
-            raise ArtifactError(
-                f"{path}: damaged, or not an ONNX file that onnxruntime {onnxruntime.__version__} can read: "
-                f"{' '.join(str(error).split())[:200]}"
-            ) from None
-        text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        session, metadata = _opened(path)
+        text = metadata.get(METADATA_KEY)
         if text is None:
             raise ArtifactError(
                 f"{path}: not an ONNX file of rlctl: its metadata has no {METADATA_KEY!r} entry; "
@@ -66,9 +64,12 @@ class OnnxPolicy(Policy):
             )
         info = parse_info(text, path)
         try:
-            return cls(info, session)
-        except ValueError as error:
-            raise ArtifactError(f"{path}: its graph does not fit its description: {error}; export it again") from None
+            policy = cls(info, session)
+            policy.try_once()
+        except (ArtifactError, ValueError, TypeError, LookupError, MemoryError) as error:
+            told = shown(str(error), 200)
+            raise ArtifactError(f"{path}: its graph does not fit its description: {told}; export it again") from None
+        return policy
 
     def initial_state(self) -> State | None:
         return self._zeros(ROWS)
@@ -109,7 +110,10 @@ class OnnxPolicy(Policy):
             raise UsageError("an exported policy cannot sample: only its deterministic action is in the ONNX file")
         if state is not None:
             batch.update(zip(STATE_INPUTS, state, strict=True))
-        actions, *after = self.session.run(self._outputs, batch)
+        try:
+            actions, *after = self.session.run(self._outputs, batch)
+        except Exception as error:  # onnxruntime's own errors have no public base class
+            raise ArtifactError(f"the exported policy cannot act: {shown(str(error), 200)}") from None
         return actions, tuple(after) or None
 
     def _zeros(self, rows: int) -> State | None:
@@ -119,6 +123,21 @@ class OnnxPolicy(Policy):
         return tuple(np.zeros((layers, rows, hidden), np.float32) for _ in STATE_INPUTS)
 
 
+def _opened(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
+    """Return a session on a file, and the file's metadata."""
+    content = untrusted.read_bytes(path, _LARGEST)
+    try:
+        onnx_file.check(content)
+        _limit_memory()
+        session = onnxruntime.InferenceSession(content, _options(), providers=["CPUExecutionProvider"])
+        return session, session.get_modelmeta().custom_metadata_map
+    except Exception as error:  # onnxruntime's own errors have no public base class
+        raise ArtifactError(
+            f"{path}: damaged, or not an ONNX file that onnxruntime {onnxruntime.__version__} can read: "
+            f"{shown(str(error), 200)}"
+        ) from None
+
+
 def _fields(space: spaces.Space[Any]) -> dict[str, tuple[tuple[int, ...], Any]]:
     """Shape and dtype of every input that is an observation."""
     if isinstance(space, spaces.Dict):
@@ -126,10 +145,23 @@ def _fields(space: spaces.Space[Any]) -> dict[str, tuple[tuple[int, ...], Any]]:
     return {SINGLE_INPUT: (space.shape or (), space.dtype)}
 
 
+@functools.cache
+def _limit_memory() -> None:
+    """Bound what all graphs of this process may take: a small file can ask for any amount."""
+    there = memory.available()
+    limit = _MEMORY if there is None else min(_MEMORY, there // 2)
+    place = onnxruntime.OrtMemoryInfo(
+        "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
+    )
+    settings = dict.fromkeys(("arena_extend_strategy", "initial_chunk_size_bytes", "max_dead_bytes_per_chunk"), -1)
+    onnxruntime.create_and_register_allocator(place, onnxruntime.OrtArenaCfg({"max_mem": limit, **settings}))
+
+
 def _options() -> onnxruntime.SessionOptions:
     options = onnxruntime.SessionOptions()
     # These networks are too small to share among threads, and the result must not depend on the machine's cores.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.use_env_allocators", "1")  # which `_limit_memory` bounds
     options.log_severity_level = _FATAL_ONLY
     return options

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import json
+import functools
+import hashlib
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -19,11 +20,13 @@ import numpy as np
 import pydantic
 from gymnasium import spaces
 from numpy.typing import NDArray
+from pydantic import Field
 
 import rlctl
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import ArtifactError
-from rlctl.run import files
+from rlctl.errors import ArtifactError, shown
+from rlctl.named_task import POLICY
+from rlctl.run import files, untrusted
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.stages import StageContent
 
@@ -56,7 +59,7 @@ class PolicyInfo(pydantic.BaseModel):
     policy: str
     """SB3's name of the policy class: MlpPolicy, CnnPolicy, MultiInputPolicy, MlpLstmPolicy, ..."""
     policy_kwargs: dict[str, Any] = {}
-    clip_observation: float | None = None
+    clip_observation: float | None = Field(None, gt=0)
     """Clip of normalised observations; None where observations are not normalised."""
     normalized_keys: list[str] = []
     """Which entries of a dict observation are normalised."""
@@ -66,7 +69,7 @@ class PolicyInfo(pydantic.BaseModel):
     reward_weights: dict[str, float] = {}
     randomize: bool = False
     events: dict[str, dict[str, Any]] = {}
-    frame_stack: int = 1
+    frame_stack: int = Field(1, ge=1)
     stages: list[StageContent] = []
     """Stages of the curriculum; the fields above are those of the last."""
     training_steps: int = 0
@@ -91,6 +94,7 @@ class PolicyInfo(pydantic.BaseModel):
             self.frame_stack,
             stage=len(self.stages),
             level=self.stages[-1].level if self.stages else 1.0,
+            named_by=POLICY if task is None else "",
         )
 
     def stage_spec(self, number: int, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
@@ -113,6 +117,11 @@ class PolicyInfo(pydantic.BaseModel):
 
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
+    return dict(_versions())
+
+
+@functools.cache  # each is read from a file, and every checkpoint wants them
+def _versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "rlctl": rlctl.__version__}
     for name in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet"):
         try:
@@ -135,22 +144,38 @@ def policy_bytes(info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> bytes:
     from safetensors.numpy import save
 
     contiguous = {name: np.asarray(value, order="C") for name, value in tensors.items()}
-    return save(contiguous, metadata={"rlctl": info.model_dump_json()})
+    text = info.model_dump_json()
+    return save(contiguous, metadata={"rlctl": text, "sha256": _digest(text, contiguous)})
+
+
+def _digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
+    """Return the sha256 of what a policy file says: a disk may give back other bits, and they load as well."""
+    told = hashlib.sha256(info.encode())
+    for name, values in sorted(tensors.items()):
+        told.update(f"{name} {values.dtype} {values.shape}".encode())
+        told.update(np.ascontiguousarray(values).data)
+    return told.hexdigest()
 
 
 def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
     """Read a policy file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
     from safetensors import SafetensorError, safe_open
 
-    if not path.is_file():
-        raise ArtifactError(f"{path}: no such file")
+    untrusted.check_safetensors(path)
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
+            info = parse_info(metadata.get("rlctl"), path)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, OSError, ValueError, TypeError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
         raise ArtifactError(f"{path}: damaged, or not a .safetensors file: {error}") from None
-    return parse_info(metadata.get("rlctl"), path), tensors
+    # Other programs may leave it out.
+    if metadata.get("sha256", digest := _digest(metadata["rlctl"], tensors)) != digest:
+        raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
+    for name, values in tensors.items():
+        if not np.isfinite(values).all():
+            raise ArtifactError(f"{path}: damaged: {shown(name)} is not finite")
+    return info, tensors
 
 
 def parse_info(text: str | None, path: Path) -> PolicyInfo:
@@ -158,7 +183,7 @@ def parse_info(text: str | None, path: Path) -> PolicyInfo:
     if text is None:
         raise ArtifactError(f"{path}: not an rlctl policy: its metadata has no 'rlctl' entry")
     try:
-        data = json.loads(text)
+        data = untrusted.parse_json(text)
         if isinstance(data, dict) and isinstance(data.get("format"), int) and data["format"] > FORMAT:
             raise ArtifactError(
                 f"{path}: policy format {data['format']} is newer than this rlctl {rlctl.__version__} can read "
@@ -166,7 +191,7 @@ def parse_info(text: str | None, path: Path) -> PolicyInfo:
             )
         return PolicyInfo.model_validate(data)
     except (ValueError, pydantic.ValidationError) as error:
-        raise ArtifactError(f"{path}: its rlctl metadata is damaged: {str(error).splitlines()[0]}") from None
+        raise ArtifactError(f"{path}: its rlctl metadata is damaged: {untrusted.explained(error)}") from None
 
 
 class Policy(abc.ABC):
@@ -212,6 +237,27 @@ class Policy(abc.ABC):
     def reset(self) -> None:
         """Begin an episode: forget the recurrent state."""
         self._starts = True
+
+    @property
+    def observation_parts(self) -> dict[str, spaces.Space[Any]]:
+        """The spaces of a dict observation by key, or the one that there is under an empty key."""
+        space = self.observation_space
+        return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
+
+    def try_once(self) -> None:
+        """Act once, on made-up observations; raises `ValueError` for actions that the action space cannot have.
+
+        Whatever else is wrong with a file that somebody has written by hand raises here too.
+        """
+        parts = {
+            key: np.full((ROWS, *(space.shape or ())), getattr(space, "start", 0), space.dtype)
+            for key, space in self.observation_parts.items()
+        }
+        observations = parts if isinstance(self.observation_space, spaces.Dict) else parts[""]
+        actions, _ = self.forward(observations, self.initial_state(), True)
+        wanted = (ROWS, *(self.action_space.shape or ()))
+        if actions.shape != wanted or not np.isfinite(actions).all():
+            raise ValueError(f"its actions are {actions.dtype} of shape {actions.shape[1:]}, or not finite")
 
 
 class BatchActor:

@@ -15,18 +15,25 @@ from pydantic import Field
 
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import ArtifactError, RecipeError, did_you_mean
-from rlctl.run import yaml_text
-from rlctl.run.hyperparameters import RANGES
+from rlctl.errors import ArtifactError, RecipeError, did_you_mean, shown
+from rlctl.run import untrusted, yaml_text
+from rlctl.run.hyperparameters import ON_POLICY as ON_POLICY
+from rlctl.run.hyperparameters import check_algorithm, check_policy, check_together
+from rlctl.run.quantities import Number, Switch, Whole
 from rlctl.run.stages import Promotion, Stage, check_promotions
 
 Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
-ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
 IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
 """What can learn in hindsight: what has a replay buffer, except crossq, which has no network for Dict spaces."""
 
+_DEEPEST_KEY = 20
+_LONGEST = 2**20  # [bytes] of a recipe file
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
+
+
+_MOST_STEPS = 10**12
+_MOST_ENVS = 10_000
 
 
 class _Section(pydantic.BaseModel):
@@ -36,60 +43,64 @@ class _Section(pydantic.BaseModel):
 class Normalize(_Section):
     """Running normalisation, as SB3's VecNormalize does it."""
 
-    observation: bool = True
-    reward: bool = True
-    clip_observation: float = Field(10.0, gt=0)
-    clip_reward: float = Field(10.0, gt=0)
+    observation: Switch = True
+    reward: Switch = True
+    clip_observation: Number = Field(10.0, gt=0)
+    clip_reward: Number = Field(10.0, gt=0)
 
 
 class Evaluation(_Section):
     """Evaluation while training; steps are environment steps, all environments together."""
 
-    every_steps: int | None = Field(None, ge=1)
-    episodes: int = Field(100, ge=1)
-    deterministic: bool = True
+    every_steps: Whole | None = Field(None, ge=1, le=_MOST_STEPS)
+    episodes: Whole = Field(100, ge=1, le=1_000_000)
+    deterministic: Switch = True
     """Whether to take the mean action, and not a sample."""
 
 
 class Hindsight(_Section):
     """Hindsight experience replay, by the names of SB3's `HerReplayBuffer`; see `rlctl.train.hindsight`."""
 
-    n_sampled_goal: int = Field(4, ge=1)
+    n_sampled_goal: Whole = Field(4, ge=1, le=1000)
     goal_selection_strategy: Literal["future", "final", "episode"] = "future"
 
 
 class Checkpoints(_Section):
-    keep: int = Field(3, ge=1)
+    keep: Whole = Field(3, ge=1, le=1_000_000)
 
 
 class Recipe(_Section):
     """How to train a task. `algo_kwargs` and `policy_kwargs` are SB3's own names."""
 
     task: dict[str, Any] = {}
-    reward_weights: dict[str, pydantic.FiniteFloat] = {}
-    randomize: bool = False
+    reward_weights: dict[str, Number] = {}
+    randomize: Switch = False
     events: dict[str, dict[str, Any]] = {}
     algo: Algorithm = "ppo"
     algo_kwargs: dict[str, Any] = {}
     policy_kwargs: dict[str, Any] = {}
     her: Hindsight | None = None
     normalize: Normalize | None = None
-    frame_stack: int = Field(1, ge=1)
-    n_envs: int = Field(8, ge=1)
-    total_timesteps: int = Field(300_000, ge=1)
-    seed: int = Field(0, ge=0, lt=2**32)
+    frame_stack: Whole = Field(1, ge=1, le=1000)
+    n_envs: Whole = Field(8, ge=1, le=_MOST_ENVS)
+    total_timesteps: Whole = Field(300_000, ge=1, le=_MOST_STEPS)
+    seed: Whole = Field(0, ge=0, lt=2**32)
     eval: Evaluation = Evaluation()
-    stop_success: float | None = Field(None, gt=0, le=1)
+    stop_success: Number | None = Field(None, gt=0, le=1)
     checkpoint: Checkpoints = Checkpoints()
     stages: list[Stage] = []
 
-    @pydantic.field_validator("algo_kwargs")
+    @pydantic.field_validator("algo_kwargs", "policy_kwargs")
     @classmethod
-    def _in_range(cls, values: dict[str, Any]) -> dict[str, Any]:
-        for name, value in values.items():
-            if name in RANGES:
-                RANGES[name].check(name, value)
+    def _in_range(cls, values: dict[str, Any], info: pydantic.ValidationInfo) -> dict[str, Any]:
+        check = check_algorithm if info.field_name == "algo_kwargs" else check_policy
+        check(info.data.get("algo", "ppo"), values)
         return values
+
+    @pydantic.model_validator(mode="after")
+    def _fit_together(self) -> Recipe:
+        check_together(self.algo, self.algo_kwargs, self.policy_kwargs, self.n_envs)
+        return self
 
     @pydantic.field_validator("her")
     @classmethod
@@ -105,9 +116,14 @@ class Recipe(_Section):
         check_promotions(values)
         return values
 
-    def env_specs(self, task: str) -> list[EnvSpec]:
-        """Return what environments are made from, stage by stage; of a recipe without stages a list of one."""
-        base = EnvSpec(task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack)
+    def env_specs(self, task: str, named_by: str = "") -> list[EnvSpec]:
+        """Return what environments are made from, stage by stage; of a recipe without stages a list of one.
+
+        `named_by` is the kind of file that names the task, if no person does.
+        """
+        base = EnvSpec(
+            task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack, named_by=named_by
+        )
         return [
             dataclasses.replace(
                 base,
@@ -127,13 +143,16 @@ class Recipe(_Section):
 
 def read(path: Path) -> dict[str, Any]:
     """Read a recipe file as plain data, unchecked."""
+    if not path.exists():
+        raise ArtifactError(f"no recipe file {path}")
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ArtifactError(f"no recipe file {path}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ArtifactError(f"{path}: cannot be read: {error}") from None
-    content = yaml_text.load(text, str(path))
+        text = untrusted.read_bytes(path, _LONGEST).decode()
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start:,}; save it as UTF-8") from None
+    return _mapping(yaml_text.load(text, str(path)), path)
+
+
+def _mapping(content: Any, path: Path) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -147,13 +166,15 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
     for text in settings:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
-            raise RecipeError(f"--set {text!r}: write key=value, for example --set task.tolerance=0.02")
+            raise RecipeError(f"--set {shown(text)!r}: write key=value, for example --set task.tolerance=0.02")
         *path, last = key.strip().split(".")
+        if len(path) >= _DEEPEST_KEY or not all((*path, last)):
+            raise RecipeError(f"--set {shown(text)!r}: a key is some names with a dot between, such as task.tolerance")
         place = result
         for part in path:
             place = place.setdefault(part, {})
             if not isinstance(place, dict):
-                raise RecipeError(f"--set {text!r}: {part!r} has been given a value already")
+                raise RecipeError(f"--set {shown(text)!r}: {part!r} has been given a value already")
         place[last] = yaml_text.load(value, f"--set {key}")
     return result
 
@@ -201,9 +222,9 @@ def validate(values: Mapping[str, Any], source: str) -> Recipe:
 
 
 def _explain(problem: Any) -> str:
-    path = [str(part) for part in problem["loc"]]
+    path = [shown(str(part)) for part in problem["loc"]]
     where = ""
-    if path[0] == "stages" and len(path) > 1:
+    if path[:1] == ["stages"] and len(path) > 1:
         where, path = f"stage {problem['loc'][1] + 1}: ", path[2:]
     key = ".".join(path)
     if problem["type"] == "extra_forbidden":
@@ -212,8 +233,10 @@ def _explain(problem: Any) -> str:
         return f"{where}no key {key!r}.{did_you_mean(path[-1], names)} Keys here: {', '.join(names)}."
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if problem["type"] == "value_error":
-        return f"{where}{key}{'.' if key == 'algo_kwargs' else ': '}{message}"
-    return f"{where}{key + ': ' if key else ''}{message}, got {problem['input']!r}"
+        between = "." if key in ("algo_kwargs", "policy_kwargs") else ": " if key else ""
+        return f"{where}{key}{between}{message}"
+    given = problem["input"]
+    return f"{where}{key + ': ' if key else ''}{message}, got {shown(repr(given) if isinstance(given, str) else given)}"
 
 
 _SECTIONS: dict[str, type[pydantic.BaseModel]] = {

@@ -9,6 +9,7 @@ import pydantic
 from pydantic import Field
 
 from rlctl.env_spec import EnvSpec
+from rlctl.run.quantities import Number, Whole
 
 _STRICT = pydantic.ConfigDict(extra="forbid", frozen=True)
 
@@ -18,11 +19,11 @@ class Promotion(pydantic.BaseModel):
 
     model_config = _STRICT
 
-    success: float | None = Field(None, gt=0, le=1)
-    mean_return: pydantic.FiniteFloat | None = Field(None, alias="return")
-    window: int = Field(100, ge=1)
+    success: Number | None = Field(None, gt=0, le=1)
+    mean_return: Number | None = Field(None, alias="return")
+    window: Whole = Field(100, ge=1, le=1_000_000)
     """How many finished training episodes of the stage are looked at; the rule holds no earlier than that."""
-    min_steps: int = Field(0, ge=0)
+    min_steps: Whole = Field(0, ge=0)
     """Environment steps that a stage lasts at least, all environments together."""
 
     @pydantic.model_validator(mode="after")
@@ -46,9 +47,9 @@ class Stage(pydantic.BaseModel):
     model_config = _STRICT
 
     task: dict[str, Any] = {}
-    reward_weights: dict[str, pydantic.FiniteFloat] = {}
+    reward_weights: dict[str, Number] = {}
     events: dict[str, dict[str, Any]] = {}
-    level: float = Field(1.0, ge=0, le=1)
+    level: Number = Field(1.0, ge=0, le=1)
     """How far ranges of events written `{from: ..., to: ...}` have widened."""
     promote: Promotion | None = None
 
@@ -69,7 +70,7 @@ class StageContent(pydantic.BaseModel):
     task_parameters: dict[str, Any] = {}
     reward_weights: dict[str, float] = {}
     events: dict[str, dict[str, Any]] = {}
-    level: float = 1.0
+    level: float = Field(1.0, ge=0, le=1)
 
     @classmethod
     def of(cls, spec: EnvSpec) -> StageContent:

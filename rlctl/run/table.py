@@ -29,10 +29,13 @@ class Table:
         self.size = min(size, self.size)
         return self.size == size
 
+    def digest(self) -> str:
+        """Return the sha256 of the first `size` bytes of the file."""
+        return files.digest(self.path.read_bytes()[: self.size] if self.size else b"")
+
     def add(self, row: Mapping[str, Any]) -> None:
-        """Add a row and write it; None becomes an empty field. Raises `OSError`, and keeps the row, if it cannot."""
+        """Add a row, which the next `flush` writes; None becomes an empty field."""
         self._waiting.append({key: "" if value is None else value for key, value in row.items()})
-        self.flush()
 
     def flush(self, *, sync: bool = False) -> None:
         """Write the rows that wait; with `sync` down to the disk itself. All of them, or `OSError` and none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import VecTransposeImage
+from torch.overrides import TorchFunctionMode
 
-from rlctl.errors import ArtifactError, RecipeError, did_you_mean
+from rlctl.errors import ArtifactError, RecipeError, did_you_mean, shown
 from rlctl.run.policy import ROWS, Observations, Policy, PolicyInfo, State, read_policy
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -149,6 +151,30 @@ class _NoOptimizer:
         del parameters, settings
 
 
+class _NoLargerThan(TorchFunctionMode):
+    """While it is active, refuses to make tensors that are out of all proportion to a file of `elements`.
+
+    Networks are built before their tensors are put in: a description must not make one that no file belongs to.
+    """
+
+    def __init__(self, elements: int) -> None:
+        super().__init__()
+        # A network is built of its parameters, their initial values, and what these are computed with.
+        self._left = 4 * elements + 1_000_000
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in _MAKERS:
+            sizes = (kwargs or {}).get("size", args[0] if args and isinstance(args[0], list | tuple) else args)
+            self._left -= max(math.prod(size for size in sizes if isinstance(size, int)), _LEAST_COST)
+            if self._left < 0:
+                raise ArtifactError("its description is of a network larger than its tensors")
+        return func(*args, **(kwargs or {}))
+
+
+_MAKERS = frozenset({torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn})
+_LEAST_COST = 1000  # also many small tensors take memory
+
+
 class Normalizer:
     """The observation normalisation of a policy, in float64 as SB3's VecNormalize computes it."""
 
@@ -190,18 +216,32 @@ class TorchPolicy(Policy):
         """Read a policy file; raises `ArtifactError` if it is not one or does not fit together."""
         info, tensors = read_policy(path)
         try:
+            return cls._fitted(info, tensors)
+        except ArtifactError as error:
+            raise ArtifactError(f"{path}: {error}") from None
+        except Exception as error:  # whatever torch and SB3 raise for a description that nobody has checked
+            raise ArtifactError(f"{path}: its tensors do not fit its description: {shown(str(error), 200)}") from None
+
+    @classmethod
+    def _fitted(cls, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> TorchPolicy:
+        """Build the network that a description asks for, and try it; never one larger than its tensors."""
+        with _NoLargerThan(sum(value.size for value in tensors.values())):
             network = build_network(info)
-            prefix = "policy/"
-            state = {
-                name[len(prefix) :]: torch.from_numpy(value.copy())
-                for name, value in tensors.items()
-                if name.startswith(prefix)
-            }
-            network.load_state_dict(state)
-            return cls(info, network, Normalizer(info, tensors))
-        except (RuntimeError, KeyError, TypeError, ValueError, RecipeError) as error:
-            told = " ".join(str(error).split())[:200]
-            raise ArtifactError(f"{path}: its tensors do not fit its description: {told}") from None
+        prefix = "policy/"
+        state = {
+            name[len(prefix) :]: torch.from_numpy(value.copy())
+            for name, value in tensors.items()
+            if name.startswith(prefix)
+        }
+        network.load_state_dict(state)
+        policy = cls(info, network, Normalizer(info, tensors))
+        shapes = {key: space.shape for key, space in policy.observation_parts.items()}
+        for key in info.normalized_keys:
+            for name in (f"normalize/{key}/mean", f"normalize/{key}/var"):
+                if tensors[name].shape != shapes.get(key):
+                    raise ValueError(f"{name} has shape {tensors[name].shape}, the observation {shapes.get(key)}")
+        policy.try_once()
+        return policy
 
     def initial_state(self) -> State | None:
         if self.info.algo != "recurrent_ppo":

@@ -8,7 +8,11 @@ from typing import Any
 
 import yaml
 
-from rlctl.errors import RecipeError
+from rlctl.errors import RecipeError, shown
+
+_PREFIX = "tag:yaml.org,2002:"
+_DEEPEST = 50
+_MOST_VALUES = 100_000  # with each alias written out
 
 
 class _Dumper(yaml.SafeDumper):
@@ -17,30 +21,101 @@ class _Dumper(yaml.SafeDumper):
 
 class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
+    # Plain data only: no dates, no bytes, no sets.
+    yaml_constructors = {
+        tag: construct
+        for tag, construct in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.removeprefix(_PREFIX) in ("null", "bool", "str", "seq", "map")
+    }
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        if not isinstance(node, yaml.MappingNode):  # text or a list with an explicit tag
+            raise _problem("expected a mapping here", node)
         seen: set[Any] = set()
         for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, Hashable):
-                if key in seen:
-                    raise yaml.constructor.ConstructorError(
-                        problem=f"key {key!r} is there twice", problem_mark=key_node.start_mark
-                    )
-                seen.add(key)
+            key = _text_of_key(key_node)
+            if key in seen:
+                raise _problem(f"key {key!r} is there twice", key_node)
+            seen.add(key)
         return super().construct_mapping(node, deep)
 
     def construct_int(self, node: yaml.ScalarNode) -> int:
         text = self.construct_scalar(node).replace("_", "")
-        return int(text, 0) if text.lstrip("+-").startswith(("0x", "0o")) else int(text)
+        try:
+            number = int(text, 0) if text.lstrip("+-").startswith(("0x", "0o")) else int(text)
+        except ValueError:  # text with an explicit tag, or thousands of digits
+            raise _problem(f"{shown(text)} is not a whole number that can be read", node) from None
+        if abs(number) >= 2**63:
+            raise _problem(f"{shown(text)} is too large a number", node)
+        return number
 
     def construct_float(self, node: yaml.ScalarNode) -> float:
         text = self.construct_scalar(node).replace("_", "").lower()
-        return float(text.replace(".inf", "inf").replace(".nan", "nan"))
+        try:
+            return float(text.replace(".inf", "inf").replace(".nan", "nan"))
+        except ValueError:
+            raise _problem(f"{shown(text)!r} is not a number", node) from None
+
+    def construct_bool(self, node: yaml.ScalarNode) -> bool:
+        text = self.construct_scalar(node).lower()
+        if text not in ("true", "false"):
+            raise _problem(f"{shown(text)!r} is not true or false", node)
+        return text == "true"
+
+    def construct_text(self, node: yaml.ScalarNode) -> str:
+        text: str = self.construct_scalar(node)
+        if any("\ud800" <= character <= "\udfff" for character in text):
+            raise _problem(f"{shown(ascii(text))} has half a character, which no file can hold", node)
+        return text
 
 
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_int)
-_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_float)
+def _problem(told: str, node: yaml.Node) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(problem=told, problem_mark=node.start_mark)
+
+
+def _text_of_key(node: yaml.Node) -> str:
+    if node.tag != f"{_PREFIX}str" or not isinstance(node.value, str):
+        told = shown(node.value) if isinstance(node.value, str) else "a list or a mapping"
+        raise _problem(f"{told} cannot be a key: keys are text, numbers in quotes", node)
+    if node.value == "<<":
+        raise _problem("merge keys (<<) are not read: write the values out, or give them by name (*name)", node)
+    return node.value
+
+
+def _expanded(root: yaml.Node) -> int:
+    """Count the values of a document with each alias written out; raises `YAMLError` when there are too many."""
+    counted: dict[int, int] = {}
+    inside: set[int] = set()
+
+    def count(node: yaml.Node) -> int:
+        if id(node) in counted:
+            return counted[id(node)]
+        if id(node) in inside:
+            raise _problem("an alias that contains itself", node)
+        if len(inside) >= _DEEPEST:
+            raise _problem(f"nested more than {_DEEPEST} deep", node)
+        inside.add(id(node))
+        parts: list[yaml.Node] = []
+        if isinstance(node, yaml.MappingNode):
+            parts = [part for pair in node.value for part in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            parts = node.value
+        counted[id(node)] = total = 1 + sum(count(part) for part in parts)
+        inside.discard(id(node))
+        if total > _MOST_VALUES:
+            raise _problem(f"its aliases make more than {_MOST_VALUES:,} values of it", node)
+        return total
+
+    return count(root)
+
+
+for _tag, _construct in (
+    ("int", _Loader.construct_int),
+    ("float", _Loader.construct_float),
+    ("bool", _Loader.construct_bool),
+    ("str", _Loader.construct_text),
+):
+    _Loader.add_constructor(f"{_PREFIX}{_tag}", _construct)
 # https://yaml.org/spec/1.2.2/#103-core-schema, and digits grouped by underscores.
 for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
@@ -54,17 +129,32 @@ for _tag, _pattern, _first in (
 ):
     # Text that looks like a number in either version of YAML is written in quotes.
     for _class in (_Loader, _Dumper):
-        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
+        _class.add_implicit_resolver(f"{_PREFIX}{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
 
 
 def load(text: str, source: str) -> Any:
     """Parse YAML; raises `RecipeError` with `source` and the line."""
     try:
-        return yaml.load(text, Loader=_Loader)  # noqa: S506 (a SafeLoader, with other scalars)
+        loader = _Loader(text)
+        try:
+            root = loader.get_single_node()
+            if root is None:
+                return None
+            _expanded(root)
+            return loader.construct_document(root)
+        finally:
+            loader.dispose()
+    except RecursionError:
+        raise RecipeError(f"{source}: nested more than {_DEEPEST} deep") from None
+    except yaml.reader.ReaderError as error:
+        raise RecipeError(f"{source}: character {error.character:#x} at {error.position:,} cannot be in YAML") from None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{source}:{mark.line + 1}" if mark else source
-        raise RecipeError(f"{where}: {getattr(error, 'problem', None) or error}") from None
+        problem = getattr(error, "problem", None) or str(error)
+        if isinstance(error, yaml.composer.ComposerError) and error.context:
+            problem = f"{error.context}, {problem}"
+        raise RecipeError(f"{where}: {shown(problem, 200)}") from None
 
 
 def dump(value: Any) -> str:

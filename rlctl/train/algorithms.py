@@ -14,9 +14,11 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from rlctl.errors import RecipeError, UsageError, did_you_mean
+from rlctl.errors import RecipeError, UsageError, did_you_mean, shown
+from rlctl.run.hyperparameters import with_whole_numbers
 from rlctl.run.recipe import Normalize, Recipe
 from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
+from rlctl.train import footprint
 from rlctl.train.hindsight import replay_arguments
 from rlctl.train.vec_env import WorkerVecEnv
 
@@ -49,6 +51,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         raise RecipeError(f"{recipe.algo} cannot be used here: it has no network for {kind}")
     policy_kwargs = _policy_kwargs(recipe, cls.policy_aliases[name])
     _check_rollout(recipe, env.num_envs)
+    footprint.check(recipe, env.observation_space, env.action_space, env.num_envs)
     try:
         return cls(
             name,
@@ -58,8 +61,8 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
             device=device,
             **kwargs,
         )
-    except (AssertionError, ValueError, TypeError) as error:
-        raise RecipeError(f"{recipe.algo} cannot be used here: {' '.join(str(error).split())}") from error
+    except (AssertionError, ValueError, TypeError, RuntimeError, MemoryError) as error:
+        raise RecipeError(f"{recipe.algo} cannot be used here: {shown(str(error), 300)}") from error
 
 
 def _check_device(device: str) -> None:
@@ -97,23 +100,14 @@ def _algorithm_kwargs(recipe: Recipe, cls: type[BaseAlgorithm], action_space: sp
 
 def _value(name: str, value: Any) -> Any:
     if isinstance(value, str) and value.startswith("lin_"):
-        return _linear(name, value)
-    if isinstance(value, list):
-        return tuple(value)
-    if isinstance(value, float) and value.is_integer() and name in _COUNTS:
-        return int(value)
-    return value
+        return _linear(value)
+    value = with_whole_numbers(name, value)
+    return tuple(value) if isinstance(value, list) else value
 
 
-_COUNTS = frozenset({"n_steps", "batch_size", "n_epochs", "buffer_size", "learning_starts", "gradient_steps"})
-
-
-def _linear(name: str, text: str) -> Callable[[float], float]:
+def _linear(text: str) -> Callable[[float], float]:
     """A schedule that falls from a value to zero over the training, written `lin_3e-4` as rl-zoo does."""
-    try:
-        start = float(text.removeprefix("lin_"))
-    except ValueError:
-        raise RecipeError(f"algo_kwargs.{name}: {text!r} is not lin_ and a number, such as lin_3e-4") from None
+    start = float(text.removeprefix("lin_"))
     # The last rollout may go past the end, and a negative rate would unlearn.
     return lambda remaining: max(remaining, 0.0) * start
 
@@ -127,7 +121,7 @@ def _policy_kwargs(recipe: Recipe, policy_class: Any) -> dict[str, Any]:
                 f"policy_kwargs.{name}: {policy_class.__name__} has no parameter {name!r}."
                 f"{did_you_mean(name, known)} It has: {', '.join(known)}."
             )
-        kwargs[name] = activation(value) if name == "activation_fn" else value
+        kwargs[name] = activation(value) if name == "activation_fn" else with_whole_numbers(name, value)
     return kwargs
 
 

@@ -7,6 +7,7 @@ when to write a checkpoint, which changes nothing: so a run that was resumed is 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from typing import Any
@@ -43,6 +44,16 @@ _MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", 
 _OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
 
 
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """What learns, where it learns, and how far it has come."""
+
+    model: BaseAlgorithm
+    env: WorkerVecEnv
+    curriculum: Curriculum
+    progress: Progress
+
+
 class TrainingStopped(Exception):
     """Ends SB3's `learn` at a boundary; nothing is wrong."""
 
@@ -56,33 +67,30 @@ class TrainingLoop(BaseCallback):
 
     def __init__(
         self,
-        model: BaseAlgorithm,
         run: RunDirectory,
         recipe: Recipe,
-        env: WorkerVecEnv,
+        learner: Learner,
         evaluator: Evaluator,
         saver: Saver,
-        progress: Progress,
         display: Display,
-        curriculum: Curriculum,
         resumed: Checkpoint | None = None,
     ) -> None:
         super().__init__()
-        self.model = model
         self.run_directory = run
         self.recipe = recipe
-        self.env = env
+        self.model = learner.model
+        self.env = learner.env
+        self.curriculum = learner.curriculum
+        self.progress = learner.progress
         self.saver = saver
-        self.progress = progress
         self.display = display
-        self.curriculum = curriculum
         self.stop_signal: int | None = None
-        self.episodes = EpisodeKeeper(run, curriculum.goal_spec, curriculum.goal)
+        self.episodes = EpisodeKeeper(run, learner.curriculum.goal_spec, learner.curriculum.goal)
         self._evaluator = evaluator
         self._resumed = resumed
         self._told_to_stop = False
-        self._started = time.monotonic() - progress.seconds
-        self._last_row = (time.monotonic(), model.num_timesteps)
+        self._started = time.monotonic() - self.progress.seconds
+        self._last_row = (time.monotonic(), self.model.num_timesteps)
 
     def _on_step(self) -> bool:
         self.display.steps(self.model.num_timesteps)
@@ -163,7 +171,7 @@ class TrainingLoop(BaseCallback):
 
     def _save_the_end(self, *, at_end: bool) -> None:
         self.progress.done = True
-        if not self.save_checkpoint(at_end=at_end):
+        if not self.saver.persistently(lambda: self.save_checkpoint(at_end=at_end)):
             raise ArtifactError(
                 f"{self.run_directory.path}: the training is done, but could not be saved: {self.saver.trouble}"
             )

@@ -35,6 +35,10 @@ class Progress:
     seconds: float = 0.0
     metrics_bytes: int = 0
     evals_bytes: int = 0
+    """How long the tables were."""
+    metrics_sha256: str = ""
+    evals_sha256: str = ""
+    """Of so much of them; empty where there was none yet."""
     recent: list[EpisodeResult] = dataclasses.field(default_factory=list)
     """Training episodes that ended after the last row of metrics."""
     stage: int = 0

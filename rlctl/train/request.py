@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
+from rlctl.named_task import RUN
 from rlctl.rollout.workers import Workers
 from rlctl.run import directory
-from rlctl.run.directory import RunDirectory
+from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.recipe import Recipe, resolve
+from rlctl.run.recipe import resolve
 from rlctl.train import status
 from rlctl.train.display import Display, make_display
 from rlctl.train.importing import undisturbed
@@ -25,8 +26,9 @@ from rlctl.train.signals import StopSignals
 
 if TYPE_CHECKING:
     from rlctl.train.checkpoint import Checkpoint, Checkpoints
-    from rlctl.train.loop import TrainingLoop
+    from rlctl.train.loop import Learner, TrainingLoop
     from rlctl.train.progress import Progress
+    from rlctl.train.saving import Saver
 
 _EVAL_ENVS = 32
 
@@ -98,7 +100,7 @@ def _resumed(request: TrainRequest) -> Start:
 def _run(request: TrainRequest, start: Start, signals: StopSignals) -> TrainResult:
     if start.checkpoint is not None and start.checkpoint.progress.done:
         return _nothing_to_do(start, start.checkpoint)
-    specs = start.recipe.env_specs(start.task)
+    specs = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")
     title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
     with make_display(title, start.recipe.total_timesteps) as display:
         # The workers build their environments, and the check runs, while this process imports torch.
@@ -143,66 +145,92 @@ def _train(
     signals: StopSignals,
 ) -> TrainResult:
     from rlctl.run.torch_policy import pin_threads
-    from rlctl.train.algorithms import build_model
-    from rlctl.train.checkpoint import Checkpoints
-    from rlctl.train.curriculum import Curriculum
     from rlctl.train.evaluation import Evaluator
     from rlctl.train.loop import TrainingLoop
-    from rlctl.train.progress import Progress
-    from rlctl.train.saving import Saver
-    from rlctl.train.space_watch import summary
-    from rlctl.train.tensorboard import make_logger, writer_errors
-    from rlctl.train.vec_env import WorkerVecEnv
 
     pin_threads()
-    recipe, checkpoint = start.recipe, start.checkpoint
-    goal = _goal(specs, workers, request, display)
-    check_stop_success(recipe, start.task, _may_succeed(workers))
-    progress = Progress(next_eval=recipe.eval.every_steps or recipe.total_timesteps)
-    if checkpoint is not None:
-        progress = checkpoint.progress
-    curriculum = Curriculum(recipe.stages, specs, goal, progress)
-    env = WorkerVecEnv(workers, recipe.seed)
-    model = build_model(recipe, env, request.device)
+    recipe = start.recipe
+    learner = _learner(request, start, specs, workers, display)
     if precheck is not None:
         precheck.refuse_errors(display)
     run = start.run or directory.create(start.task, recipe.seed, request.root)
-    lock = start.lock or run.lock()
-    steps = checkpoint.state.step if checkpoint is not None else 0
-    model.set_logger(make_logger(run.tensorboard, display.message, steps))
-    checkpoints = Checkpoints(run, model, env, recipe.checkpoint.keep)
+    with start.lock or run.lock() as lock:
+        saver = _saver(request, start, run, lock, learner, display)
+        evaluator = Evaluator(
+            recipe, lambda: _workers(specs[-1], min(recipe.eval.episodes, _EVAL_ENVS), request, display)
+        )
+        loop = TrainingLoop(run, recipe, learner, evaluator, saver, display, start.checkpoint)
+        try:
+            recordings = _learn_to_the_end(loop, request, signals, display)
+        except BaseException as error:
+            with contextlib.suppress(OSError):  # a full disk must not hide the error itself
+                status.write_failure(run, error)
+            raise
+        finally:
+            evaluator.close()
+    _tell_failed_evaluations(run, learner.progress)
+    return _result(run, start, learner.model.num_timesteps, learner.progress, recordings)
+
+
+def _learner(request: TrainRequest, start: Start, specs: list[EnvSpec], workers: Workers, display: Display) -> Learner:
+    from rlctl.train.algorithms import build_model
+    from rlctl.train.curriculum import Curriculum
+    from rlctl.train.loop import Learner
+    from rlctl.train.progress import Progress
+    from rlctl.train.vec_env import WorkerVecEnv
+
+    recipe = start.recipe
+    goal = _goal(specs, workers, request, display)
+    check_stop_success(recipe, start.task, _may_succeed(workers))
+    progress = Progress(next_eval=recipe.eval.every_steps or recipe.total_timesteps)
+    if start.checkpoint is not None:
+        progress = start.checkpoint.progress
+    env = WorkerVecEnv(workers, recipe.seed)
+    model = build_model(recipe, env, request.device)
+    return Learner(model, env, Curriculum(recipe.stages, specs, goal, progress), progress)
+
+
+def _saver(
+    request: TrainRequest, start: Start, run: RunDirectory, lock: RunLock, learner: Learner, display: Display
+) -> Saver:
+    """Put everything where the checkpoint has it, if there is one, and return what writes from now on."""
+    from rlctl.train.checkpoint import Checkpoints
+    from rlctl.train.saving import Saver
+    from rlctl.train.tensorboard import make_logger
+
+    resumed_at = None if start.run is None else start.checkpoint.state.step if start.checkpoint else 0
+    learner.model.set_logger(make_logger(run.tensorboard, display.message, resumed_at or 0))
+    checkpoints = Checkpoints(run, learner.model, learner.env, start.recipe.checkpoint.keep)
     if start.run is not None:
-        _go_on(start, run, checkpoints, progress, goal, display)
+        _go_on(start, run, checkpoints, learner, display)
 
     def write_start() -> None:
         lock.renew()
-        status.write_start(run, start.task, recipe, request.device, steps if start.run is not None else None)
+        status.write_start(run, start.task, start.recipe, request.device, resumed_at)
 
     write_start()
-    evaluator = Evaluator(recipe, lambda: _workers(specs[-1], min(recipe.eval.episodes, _EVAL_ENVS), request, display))
     saver = Saver(run, checkpoints, display.message, write_start)
-    saver.saved_step = checkpoint.state.step if checkpoint is not None else None
-    loop = TrainingLoop(model, run, recipe, env, evaluator, saver, progress, display, curriculum, checkpoint)
-    if recipe.stages:
-        display.stage(curriculum.title)
+    saver.saved_step = start.checkpoint.state.step if start.checkpoint is not None else None
+    return saver
+
+
+def _learn_to_the_end(loop: TrainingLoop, request: TrainRequest, signals: StopSignals, display: Display) -> list[Path]:
+    """Train, write that it is done, and return the recordings that were asked for."""
+    from rlctl.train.space_watch import summary
+    from rlctl.train.tensorboard import writer_errors
+
+    if loop.recipe.stages:
+        display.stage(loop.curriculum.title)
     signals.begin(loop)
-    try:
-        with writer_errors():
-            _learn(model, loop, recipe)
-        signals.end()
-        if warning := summary(progress):
-            display.message(warning)
-        saver.attempt("run.json", lambda: status.write_end(run, model.num_timesteps, progress))
-        recordings = _record(loop, request.record)
-    except BaseException as error:
-        with contextlib.suppress(OSError):  # a full disk must not hide the error itself
-            status.write_failure(run, error)
-        raise
-    finally:
-        evaluator.close()
-        lock.release()
-    _tell_failed_evaluations(run, progress)
-    return _result(run, start, model.num_timesteps, progress, recordings)
+    with writer_errors():
+        _learn(loop)
+    signals.end()
+    steps, progress = loop.model.num_timesteps, loop.progress
+    if warning := summary(progress):
+        display.message(warning)
+    saver, run = loop.saver, loop.run_directory
+    saver.persistently(lambda: saver.attempt("run.json", lambda: status.write_end(run, steps, progress)))
+    return _record(loop, request.record)
 
 
 def _may_succeed(workers: Workers) -> bool:
@@ -210,34 +238,33 @@ def _may_succeed(workers: Workers) -> bool:
     return workers.info.has_success or not workers.info.reward_weights
 
 
-def _go_on(
-    start: Start, run: RunDirectory, checkpoints: Checkpoints, progress: Progress, goal: EnvInfo, display: Display
-) -> None:
+def _go_on(start: Start, run: RunDirectory, checkpoints: Checkpoints, learner: Learner, display: Display) -> None:
     """Put model, environments and run folder where the checkpoint has them, and say how exactly."""
     from rlctl.run.policy import read_policy
     from rlctl.train.checkpoint import differences
 
     for note in start.notes:
         display.message(note)
-    inexact = list(start.inexact)
     if start.checkpoint is not None:
         folder, state = start.checkpoint.folder, start.checkpoint.state
         info, _ = read_policy(folder / "policy.safetensors")
-        info.check_fits(goal, folder / "policy.safetensors")
-        inexact += differences(state.computed_with, checkpoints.computed_with())
-        inexact += filter(None, [checkpoints.put_back(start.checkpoint)])
+        info.check_fits(learner.curriculum.goal, folder / "policy.safetensors")
+        strayed = checkpoints.put_back(start.checkpoint)
+        inexact = [*start.inexact, *differences(state.computed_with, checkpoints.computed_with())]
+        inexact += [strayed] if strayed else []
         told = f"not bit-exact: {'; '.join(inexact)}" if inexact else "as if it had never stopped"
         display.message(f"going on at step {state.step:,}, {told}")
-    for note in prepare(run, start.checkpoint, progress):
+    for note in prepare(run, start.checkpoint, learner.progress):
         display.message(note)
 
 
-def _learn(model: Any, loop: TrainingLoop, recipe: Recipe) -> None:
+def _learn(loop: TrainingLoop) -> None:
     from rlctl.train.loop import TrainingStopped
 
+    missing = loop.recipe.total_timesteps - loop.model.num_timesteps
     try:
-        if model.num_timesteps < recipe.total_timesteps:
-            model.learn(recipe.total_timesteps - model.num_timesteps, callback=loop, reset_num_timesteps=False)
+        if missing > 0:
+            loop.model.learn(missing, callback=loop, reset_num_timesteps=False)
         loop.finish()
     except TrainingStopped:
         return

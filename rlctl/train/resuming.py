@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import ArtifactError, RecipeError, UsageError
-from rlctl.run import directory
+from rlctl.run import directory, files
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.recipe import Recipe, validate
 from rlctl.train import status
@@ -116,28 +115,46 @@ def prepare(run: RunDirectory, found: Checkpoint | None, progress: Progress) -> 
     step = found.state.step if found is not None else 0
     for folder in run.checkpoints():
         if int(folder.name) > step:
-            os.replace(folder, folder.with_name(f"{folder.name}.damaged"))
+            files.set_aside(folder)
     remove_after(run, step)
     told = []
-    for file, size in ((run.metrics_file, progress.metrics_bytes), (run.evals_file, progress.evals_bytes)):
-        if not Table(file).cut_back(size):
+    for file, size, sha256 in (
+        (run.metrics_file, progress.metrics_bytes, progress.metrics_sha256),
+        (run.evals_file, progress.evals_bytes, progress.evals_sha256),
+    ):
+        table = Table(file)
+        if not table.cut_back(size):
             told.append(f"warning: {file}: rows before step {step:,} are gone: it is shorter than the checkpoint says")
-    _take_best(run, progress)
-    return told
+        elif size and table.digest() != sha256:
+            told.append(
+                f"warning: {file}: damaged, or edited: rows before step {step:,} are not those that were written"
+            )
+    return told + _take_best(run, progress)
 
 
-def _take_best(run: RunDirectory, progress: Progress) -> None:
-    """Believe the best policy's own file: it may be newer than the checkpoint, and must not give way to a worse one."""
+def _take_best(run: RunDirectory, progress: Progress) -> list[str]:
+    """Believe the best policy's own file: it may be newer than the checkpoint, and must not give way to a worse one.
+
+    Return what to tell if it is not as good as the checkpoint says.
+    """
     from rlctl.run.policy import read_policy
 
+    known, trouble = progress.best_step, ""
+    score = (progress.best_success or 0.0, progress.best_return or 0.0)
     progress.best_success = progress.best_return = progress.best_step = None
     try:
         info, _ = read_policy(run.best_policy)
-    except ArtifactError:
-        return  # there is none yet, or it is damaged: the next evaluation writes one
-    if info.evaluation is not None:
-        progress.best_success, progress.best_return = info.evaluation.success, info.evaluation.mean_return
-        progress.best_step = info.training_steps
+    except ArtifactError as error:
+        trouble = str(error)
+    else:
+        if info.evaluation is not None:
+            progress.best_success, progress.best_return = info.evaluation.success, info.evaluation.mean_return
+            progress.best_step = info.training_steps
+        if progress.best_step is None or (progress.best_success or 0.0, progress.best_return or 0.0) < score:
+            trouble = f"{run.best_policy}: not the best policy, but that of step {info.training_steps:,}"
+    if known is None or not trouble:
+        return []
+    return [f"warning: {trouble}; the best one was that of step {known:,}, and is lost unless a checkpoint has it"]
 
 
 def check_stop_success(recipe: Recipe, task: str, may_succeed: bool) -> None:

@@ -21,6 +21,8 @@ Packed = tuple[PolicyInfo, Tensors]
 
 TIME_FOR_CHECKPOINTS = 0.02
 """Part of the training's time that checkpoints may take."""
+PAUSES_S = (1.0, 5.0)
+"""How long to wait before what ends a training is tried once more."""
 _REMIND_EVERY_S = 60.0
 
 
@@ -48,6 +50,7 @@ class Saver:
         self._last_bytes = 0
         self._reminded = 0.0
         self._best = _policy_of(run)
+        """The best policy: to be written again if the disk does not take it, or loses it."""
         self._best_waits = False
 
     def attempt(self, what: str, write: Callable[[], object]) -> bool:
@@ -77,34 +80,42 @@ class Saver:
             self._reminded = time.monotonic()
         self.trouble = trouble
 
+    def persistently(self, write: Callable[[], bool]) -> bool:
+        """Call `write`, which says whether it has written, a few times: when a training ends there is no next time."""
+        if write():
+            return True
+        for pause in PAUSES_S:
+            time.sleep(pause)
+            if write():
+                return True
+        return False
+
     def row(self, table: Table, row: dict[str, Any]) -> None:
         """Add a row to a table; one that the disk does not take now is written with the next."""
-        self.attempt(table.path.name, lambda: table.add(row))
+        table.add(row)
+        self.attempt(table.path.name, table.flush)
 
     def keep_best(self, packed: Packed) -> None:
-        """Write the best policy; one that the disk does not take now, or loses, is written with a later checkpoint."""
+        """Write the best policy; one that the disk does not take now is written before the next checkpoint."""
         self._best, self._best_waits = packed, True
-        self._write_best()
+        self.attempt("best policy", self._write_best)
 
     def _write_best(self) -> None:
-        if (best := self._best) is None or (not self._best_waits and self._run.best_policy.exists()):
-            return
-        if self.attempt("best policy", lambda: save_policy(self._run.best_policy, *best)):
-            self._best_waits = False
+        if self._best is not None and (self._best_waits or not self._run.best_policy.exists()):
+            save_policy(self._run.best_policy, *self._best)
+        self._best_waits = False
 
     def checkpoint_is_due(self) -> bool:
         """Whether the time that checkpoints may take allows one."""
         return time.monotonic() >= self._next_checkpoint
 
     def checkpoint(self, pack: Callable[[], Packed], progress: Progress, *, at_end: bool = False) -> bool:
-        """Write a checkpoint, and the last policy; False, with a warning, if the disk does not take it."""
+        """Write the last policy and a checkpoint; False, with a warning, if the disk does not take it."""
         began = time.monotonic()
         packed = pack()
         saved = self.attempt("checkpoint", lambda: self._write_checkpoint(packed, progress, at_end))
         if saved:
             self._tell_saved_again()
-            self._write_best()
-            self.attempt("last policy", lambda: save_policy(self._run.last_policy, *packed))
             self.attempt("old checkpoints", self._checkpoints.remove_old)
         now = time.monotonic()
         self._next_checkpoint = now + (now - began) / TIME_FOR_CHECKPOINTS
@@ -116,10 +127,13 @@ class Saver:
         self.trouble = ""
 
     def _write_checkpoint(self, packed: Packed, progress: Progress, at_end: bool) -> None:
-        # Every row before a checkpoint must be on the disk before it is.
+        # Whoever goes on from a checkpoint will not come by here again: everything before it must be on the disk.
         self.metrics.flush(sync=True)
         self.evals.flush(sync=True)
         progress.metrics_bytes, progress.evals_bytes = self.metrics.size, self.evals.size
+        progress.metrics_sha256, progress.evals_sha256 = self.metrics.digest(), self.evals.digest()
+        self._write_best()
+        save_policy(self._run.last_policy, *packed)
         if shutil.disk_usage(self._run.path).free < 2 * self._last_bytes:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         folder = self._checkpoints.save(packed, progress, at_end=at_end)

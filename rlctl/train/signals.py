@@ -7,16 +7,17 @@ import threading
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from rlctl import output
 from rlctl.errors import Interrupted
 
 if TYPE_CHECKING:
     from rlctl.train.loop import TrainingLoop
 
-_ASKING = (signal.SIGINT, signal.SIGTERM)
+_ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignals:
-    """Handles SIGINT and SIGTERM as long as it is entered.
+    """Handles SIGINT, SIGTERM and SIGHUP, which a closed terminal sends, as long as it is entered.
 
     Before the training they end the process at once; while it goes on the first ends it at the next boundary and the
     second at once; when it is done they change nothing any more.
@@ -30,8 +31,10 @@ class StopSignals:
     def __enter__(self) -> StopSignals:
         # Python has signal handlers in the main thread only; a caller in another keeps its own.
         if threading.current_thread() is threading.main_thread():
-            # Set even where a shell has made SIGINT ignored, as for a command in the background.
-            self._before = {number: signal.signal(number, self._handle) for number in _ASKING}
+            # Set even where a shell has made SIGINT ignored, as for a command in the background; what `nohup` has made
+            # ignored stays so.
+            asking = [each for each in _ASKING if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN]
+            self._before = {number: signal.signal(number, self._handle) for number in asking}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -50,6 +53,8 @@ class StopSignals:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         # No output here: it might come in the middle of another.
+        if number == signal.SIGHUP:
+            output.leave_closed_terminal()
         if self._done:
             return
         if self._loop is None:

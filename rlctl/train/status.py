@@ -25,7 +25,7 @@ _STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedE
 
 def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resumed_at: int | None) -> None:
     """Write the recipe, and that a training runs; `resumed_at` is the step it goes on from."""
-    files.write_text(run.recipe_file, recipe.to_yaml())
+    run.write_recipe(recipe)
     changes: dict[str, Any] = {
         "status": "running",
         "error": None,

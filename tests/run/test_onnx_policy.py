@@ -105,7 +105,7 @@ def test_sampling_is_refused(pendulum):
 
 
 def test_missing_file(tmp_path):
-    with pytest.raises(ArtifactError, match=r"none\.onnx: No such file"):
+    with pytest.raises(ArtifactError, match=r"none\.onnx: no such file"):
         OnnxPolicy.load(tmp_path / "none.onnx")
 
 

@@ -12,6 +12,11 @@ def table(tmp_path):
     return Table(tmp_path / "metrics.csv")
 
 
+def add(table, row):
+    table.add(row)
+    table.flush()
+
+
 class FullDisk:
     """Takes `room` bytes of each write, and none after that."""
 
@@ -29,37 +34,37 @@ class FullDisk:
 
 
 def test_rows_under_a_header(table):
-    table.add({"steps": 64, "success": None})
-    table.add({"steps": 128, "success": 0.5})
+    add(table, {"steps": 64, "success": None})
+    add(table, {"steps": 128, "success": 0.5})
     assert table.path.read_text() == "steps,success\n64,\n128,0.5\n"
     assert table.size == len("steps,success\n64,\n128,0.5\n")
 
 
 def test_going_on_with_a_table_that_is_there(table):
-    table.add({"steps": 64, "success": 1})
+    add(table, {"steps": 64, "success": 1})
     again = Table(table.path)
-    again.add({"success": 0, "steps": 128, "new": 3})
+    add(again, {"success": 0, "steps": 128, "new": 3})
     assert table.path.read_text() == "steps,success\n64,1\n128,0\n"
 
 
 def test_cutting_back(table):
-    table.add({"steps": 64})
+    add(table, {"steps": 64})
     size = table.size
-    table.add({"steps": 128})
+    add(table, {"steps": 128})
     again = Table(table.path)
     assert again.cut_back(size)
-    again.add({"steps": 128})
+    add(again, {"steps": 128})
     assert table.path.read_text() == "steps\n64\n128\n"
     assert not Table(table.path).cut_back(10_000)
 
 
 @pytest.mark.parametrize("room", [0, 1, 3])
 def test_a_full_disk_leaves_no_half_row_and_loses_none(table, monkeypatch, room):
-    table.add({"steps": 64})
+    add(table, {"steps": 64})
     monkeypatch.setattr(files, "os", FullDisk(room))
     for steps in (128, 192):
         with pytest.raises(OSError, match="No space left"):
-            table.add({"steps": steps})
+            add(table, {"steps": steps})
     assert table.path.read_text() == "steps\n64\n"
     monkeypatch.undo()
     table.flush()
@@ -67,15 +72,15 @@ def test_a_full_disk_leaves_no_half_row_and_loses_none(table, monkeypatch, room)
 
 
 def test_a_half_row_that_could_not_be_cut_back_is_written_over(table):
-    table.add({"steps": 64})
+    add(table, {"steps": 64})
     with table.path.open("a") as file:
         file.write("12,half a row,")
-    table.add({"steps": 128})
+    add(table, {"steps": 128})
     assert table.path.read_text() == "steps\n64\n128\n"
 
 
 def test_a_file_that_was_removed_begins_anew(table):
-    table.add({"steps": 64})
+    add(table, {"steps": 64})
     table.path.unlink()
-    table.add({"steps": 128})
+    add(table, {"steps": 128})
     assert table.path.read_text() == "steps\n128\n"

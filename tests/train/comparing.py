@@ -41,7 +41,7 @@ def assert_same_run(one: RunDirectory, other: RunDirectory) -> None:
     different = [name for name, values in ours.tensors.items() if values.tobytes() != theirs.tensors[name].tobytes()]
     assert different == []
     assert repr(ours.state.model) == repr(theirs.state.model)
-    timeless = {"seconds": 0.0, "metrics_bytes": 0, "evals_bytes": 0}
+    timeless = {"seconds": 0.0, "metrics_bytes": 0, "evals_bytes": 0, "metrics_sha256": "", "evals_sha256": ""}
     assert dataclasses.replace(ours.progress, **timeless) == dataclasses.replace(theirs.progress, **timeless)
     _assert_same_transitions(replay_buffer(one, ours.state.segments), replay_buffer(other, theirs.state.segments))
     assert load_best(one).keys() == load_best(other).keys()

@@ -201,7 +201,10 @@ def test_divergence_is_told(train, small_ppo):
             {"policy_kwargs": {"activation_fn": "rellu"}},
             "policy_kwargs.activation_fn: no activation 'rellu'. Did you mean 'relu'?",
         ),
-        ({"algo_kwargs": {"learning_rate": "lin_fast"}}, "'lin_fast' is not lin_ and a number, such as lin_3e-4"),
+        (
+            {"algo_kwargs": {"learning_rate": "lin_fast"}},
+            "'lin_fast' is not lin_ and a number in (0, 1], such as lin_0.1",
+        ),
         ({"algo": "dqn"}, "dqn cannot be used here: "),
         ({"task": {"colour": 1}}, "task.colour: "),
         ({"reward_weights": {"speed": 1.0}}, "is a plain Gymnasium environment; only tasks have them"),

@@ -1,0 +1,64 @@
+"""How much memory there is: what does not fit is refused before it is allocated.
+
+numpy and torch reserve memory without touching it, so what is too big seems to work until the system kills the process.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+_CGROUPS = Path("/sys/fs/cgroup")
+
+
+def available() -> int | None:
+    """Return how many bytes this process may still take: of the machine and of its control group; None if unknown."""
+    found = [value for value in (_of_machine(), *_of_control_groups()) if value is not None]
+    return max(min(found), 0) if found else None
+
+
+def told(size: float) -> str:
+    """Return a number of bytes for people: `512 MB`, `1,024 GB`."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= factor:
+            amount = size / factor
+            return f"{amount:,.0f} {unit}" if amount >= 10 else f"{amount:.1f} {unit}"
+    return f"{size:.0f} bytes"
+
+
+def _of_machine() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration, ValueError):  # not Linux: what is installed, for want of what is free
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError):
+        return None
+
+
+def _of_control_groups() -> list[int]:
+    """What the limits of containers and jobs leave; the limit of a group holds for all groups below it."""
+    try:
+        entries = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []
+    own = next((entry[3:] for entry in entries if entry.startswith("0::")), "/")
+    folder = _CGROUPS / own.strip("/")
+    groups = [each for each in (folder, *folder.parents) if each.is_relative_to(_CGROUPS)]
+    found = [_left(group, "memory.max", "memory.current", "file") for group in groups]
+    found.append(_left(_CGROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "cache"))
+    return [value for value in found if value is not None]
+
+
+def _left(group: Path, limit: str, used: str, given_back: str) -> int | None:
+    try:
+        ceiling = int((group / limit).read_text(encoding="ascii"))  # "max" where there is none
+        taken = int((group / used).read_text(encoding="ascii"))
+        rows = (group / "memory.stat").read_text(encoding="ascii").splitlines()
+    except (OSError, ValueError):
+        return None
+    # Cached files count as used, and are given back when memory is short.
+    cached = next((int(row.split()[1]) for row in rows if row.startswith(f"{given_back} ")), 0)
+    return ceiling - taken + cached

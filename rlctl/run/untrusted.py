@@ -1,0 +1,165 @@
+"""Reading what somebody may have sent: regular files only, nothing unpickled, no more memory than the file may take."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import stat
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any, BinaryIO
+
+import numpy as np
+import pydantic
+from numpy.typing import NDArray
+
+from rlctl.errors import ArtifactError, shown
+from rlctl.run import memory
+
+JSON_LIMIT = 16 * 2**20  # [bytes]
+_DEPTH = 100
+"""How deep JSON may be nested: far more than anything of ours, far less than Python's own limit."""
+_MEMBERS = 1000
+"""How many arrays a file may have."""
+_PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""How arrays may be packed: as numpy does it. LZMA lets a file choose how much memory unpacking takes."""
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a regular file; raises `ArtifactError` for one that is missing, unreadable, a folder, a pipe or a device."""
+    try:
+        # A pipe would otherwise wait for somebody who writes.
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
+        raise ArtifactError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise ArtifactError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if not stat.S_ISREG(mode := os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise ArtifactError(f"{path}: {'a folder' if stat.S_ISDIR(mode) else 'a pipe or a device'}, not a file")
+    with os.fdopen(descriptor, "rb") as file:
+        yield file
+
+
+def read_bytes(path: Path, limit: int | None = None) -> bytes:
+    """Read a regular file of at most `limit` bytes, by default of what fits into memory; raises `ArtifactError`."""
+    with opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if limit is not None and size > limit:
+            raise ArtifactError(f"{path}: too large: {memory.told(size)}, at most {memory.told(limit)} are read")
+        if (problem := too_large(size)) is not None:
+            raise ArtifactError(f"{path}: too large: {problem}")
+        try:
+            return file.read()
+        except OSError as error:
+            raise ArtifactError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def too_large(size: int) -> str | None:
+    """Say why so many bytes are not read into memory; None if they may be: up to half of what is there."""
+    there = memory.available()
+    if there is None or size <= there // 2:
+        return None
+    return f"it needs {memory.told(size)} of memory, and {memory.told(there)} are free"
+
+
+def check_safetensors(path: Path) -> None:
+    """Raise `ArtifactError` for what is no regular file, or would take more memory than a policy may."""
+    with opened(path) as file:
+        if (problem := too_large(os.fstat(file.fileno()).st_size)) is not None:
+            raise ArtifactError(f"{path}: too large: {problem}")
+        header = int.from_bytes(file.read(8), "little")  # the format: a length, and as much JSON
+    if header > JSON_LIMIT:
+        told = f"{memory.told(header)}, at most {memory.told(JSON_LIMIT)} are read"
+        raise ArtifactError(f"{path}: damaged, or not a .safetensors file: header too large: {told}")
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON; raises `ValueError` for what is damaged, nested too deeply or has a number too large to be one."""
+    try:
+        content = json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    _check_depth(content)
+    return content
+
+
+def _check_depth(content: Any) -> None:
+    level = [content]
+    for _ in range(_DEPTH):
+        level = [each for value in level if isinstance(value, dict | list) for each in _within(value)]
+        if not level:
+            return
+    raise ValueError("nested too deeply")
+
+
+def _within(value: dict[str, Any] | list[Any]) -> Any:
+    return value.values() if isinstance(value, dict) else value
+
+
+def explained(error: Exception) -> str:
+    """Return in a line what is wrong with a description; of pydantic's report the first problem, with its place."""
+    if isinstance(error, pydantic.ValidationError):
+        problem = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in problem["loc"]) or "it"
+        return shown(f"{place}: {problem['msg']}, got {shown(problem['input'])}", 200)
+    return shown(str(error), 200)
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an `.npz` file, by name.
+
+    Sizes are checked before anything is unpacked: what the archive, and each array's own header, says. Raises
+    `ArtifactError` for what is no file or too large, and whatever numpy and zipfile raise for a damaged one.
+    """
+    with opened(path) as file, zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        _check_archive(members)
+        if (problem := too_large(sum(each.file_size for each in members))) is not None:
+            raise ArtifactError(f"{path}: too large: unpacked {problem}")
+        return {each.filename.removesuffix(".npy"): _read_member(archive, each) for each in members}
+
+
+def _check_archive(members: list[zipfile.ZipInfo]) -> None:
+    if len(members) > _MEMBERS:
+        raise ValueError(f"it has {len(members):,} members, at most {_MEMBERS:,} are read")
+    seen: set[str] = set()
+    for each in members:
+        name = each.filename
+        if name in seen:
+            raise ValueError(f"{name!r} is in it twice")
+        seen.add(name)
+        if name.startswith("/") or ".." in name.split("/"):
+            raise ValueError(f"{name!r} leads out of it")
+        if not name.endswith(".npy") or each.is_dir():
+            raise ValueError(f"{name!r} is no array")
+        if each.compress_type not in _PACKED:
+            raise ValueError(f"{name!r} is not packed as numpy does it")
+
+
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    with archive.open(member) as stream:
+        shape, dtype = _read_header(stream)
+        if dtype.hasobject:
+            raise ValueError(f"Object arrays cannot be loaded: {member.filename!r} holds pickles")
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.itemsize == 0 or min(shape, default=0) < 0 or stream.tell() + size != member.file_size:
+            raise ValueError(f"{member.filename!r} is not as large as its header says")
+    with archive.open(member) as stream:
+        array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    return array
+
+
+def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    elif version == (2, 0):
+        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+    else:
+        raise ValueError(f"array format {version[0]}.{version[1]} is not read")
+    return shape, dtype

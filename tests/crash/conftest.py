@@ -1,0 +1,48 @@
+"""A server of trials for each process of tests, and the runs that nothing interrupted."""
+
+import itertools
+import os
+
+import pytest
+
+from tests.crash.trials import ARGUMENTS, ForkServer
+
+pytest.register_assert_rewrite("tests.crash.contract", "tests.train.comparing")
+
+PARTS = 17
+"""A test that repeats itself is in so many parts, of which the first runs with all other tests."""
+
+
+def parts(function):
+    """Let a test run in parts: it takes those of its trials whose number leaves `part` when divided by `PARTS`."""
+    values = [pytest.param(part, marks=pytest.mark.crash if part else ()) for part in range(PARTS)]
+    return pytest.mark.parametrize("part", values)(function)
+
+
+@pytest.fixture(scope="session")
+def server():
+    number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    cores = sorted(os.sched_getaffinity(0))
+    server = ForkServer(cores[number % len(cores)])
+    yield server
+    server.close()
+
+
+@pytest.fixture(scope="session")
+def whole(server, tmp_path_factory):
+    """How an algorithm's training ends that nothing interrupts, by name."""
+    ended = {}
+
+    def get(name):
+        if name not in ended:
+            ended[name] = server.run(ARGUMENTS[name], tmp_path_factory.mktemp(name))
+            assert ended[name].code == 0, ended[name].stderr
+        return ended[name]
+
+    return get
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Folders for trials, each a new one."""
+    return (tmp_path / str(number) for number in itertools.count())

@@ -1,0 +1,59 @@
+"""What must hold after a fault, whatever it was."""
+
+from rlctl.run.directory import RunDirectory
+from rlctl.run.policy import read_policy
+from tests.crash.trials import Ended, ForkServer, only_run, resume
+from tests.train.comparing import assert_same_run, rows
+
+
+def assert_nothing_lost(server: ForkServer, arguments, ended: Ended, whole: RunDirectory, announced=0) -> None:
+    """Resume what a fault has ended, without faults, and compare it to a training that had none.
+
+    `announced` is the step of the last checkpoint that was announced before the command that the fault has ended.
+    """
+    announced = max(announced, ended.announced)
+    assert ended.orphans == []
+    run = only_run(ended.folder)
+    if run is None:  # ended before there was a run: the next one is a new one
+        assert announced == 0
+        again = server.run(arguments, ended.folder)
+    else:
+        assert_best_is_best(run)
+        again = server.run(resume(run), ended.folder)
+    assert again.code == 0, again.stderr
+    assert_quiet(again)
+    if "nothing to do" not in again.stdout + again.stderr:
+        assert again.went_on_at >= announced
+    assert_same_end(only_run(ended.folder), whole)
+
+
+def assert_same_end(run: RunDirectory, whole: RunDirectory) -> None:
+    """Hold that a run has ended as another one: bit by bit, and tidily."""
+    assert run.status()["status"] == "finished"
+    assert_same_run(whole, run)
+    ours, theirs = read_policy(run.last_policy)[1], read_policy(whole.last_policy)[1]
+    assert {name: values.tobytes() for name, values in ours.items()} == {
+        name: values.tobytes() for name, values in theirs.items()
+    }
+    assert read_policy(run.best_policy)[0] == read_policy(whole.best_policy)[0]
+
+
+def assert_quiet(ended: Ended) -> None:
+    """Hold that nobody sees a traceback, and that no process is left."""
+    assert ended.orphans == []
+    assert "Traceback" not in ended.stderr
+    assert ended.code != 70
+
+
+def assert_best_is_best(run: RunDirectory) -> None:
+    """Hold that the best policy is at least as good as each evaluation there is a row of."""
+    if not run.evals_file.exists() or not (evals := rows(run.evals_file)):
+        return
+    score = read_policy(run.best_policy)[0].evaluation
+    best = max((float(row["success"]), float(row["return"])) for row in evals)
+    assert (score.success, score.mean_return) >= best
+
+
+def assert_tidy(run: RunDirectory) -> None:
+    """Hold that nothing half-written is left in a run that has ended well."""
+    assert [path for path in run.path.rglob("*.part*") if path.is_file()] == []

@@ -1,0 +1,56 @@
+"""What a trial does in its own process before and while it trains: the plan's faults, and a log of what was done."""
+
+import functools
+import os
+import sys
+from pathlib import Path
+
+from tests.crash import spare_workers
+from tests.crash.faulty_os import FaultyOs, FaultyShutil
+
+
+def run(arguments, folder, plan):
+    """Run the command line as a plan has it; return its exit code. `folder` gets a file `log`."""
+    log = _opened(folder / "log")
+    if plan.get("cores", 1) == 1:
+        # One core, one worker: a trial is a matter of less than a second.
+        os.sched_setaffinity(0, {int(os.environ["CRASH_CORE"])})
+    if not plan.get("real_workers"):
+        spare_workers.take_over(3)
+    from rlctl.run import files
+    from rlctl.train import saving
+
+    saving.TIME_FOR_CHECKPOINTS = plan.get("time_for_checkpoints", 1e9)  # at every boundary
+    saving.PAUSES_S = (0.0, 0.0)
+    _announce(saving.Saver, log)
+    files.os = FaultyOs(log, **plan.get("disk", {}))
+    files.shutil = FaultyShutil(files.os)
+    if "signal" in plan:
+        from tests.crash import phases
+
+        phases.send(**plan["signal"])
+    from rlctl import cli
+
+    sys.argv = ["rlctl", *arguments]
+    code = cli.run(arguments)
+    log(f"operations {files.os.count}")
+    return code
+
+
+def _opened(file: Path):
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC, 0o644)
+    return lambda text: os.write(descriptor, f"{text}\n".encode())
+
+
+def _announce(saver, log):
+    """Log what is announced: each checkpoint whose saving came back as done."""
+    original = saver.checkpoint
+
+    @functools.wraps(original)
+    def checkpoint(self, *arguments, **options):
+        saved = original(self, *arguments, **options)
+        if saved:
+            log(f"saved {self.saved_step}")
+        return saved
+
+    saver.checkpoint = checkpoint

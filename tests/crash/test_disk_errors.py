@@ -1,0 +1,58 @@
+"""A disk that does not do what it is asked for, once or from then on, at every operation."""
+
+import pytest
+
+from tests.crash.conftest import PARTS, parts
+from tests.crash.contract import assert_nothing_lost, assert_quiet, assert_same_end
+from tests.crash.trials import ARGUMENTS, only_run
+
+ERRORS = {"ENOSPC": "No space left on device", "EIO": "Input/output error", "EACCES": "Permission denied"}
+
+
+def errors(part, operations):
+    """Return the number of each operation, and an error, that a part tries."""
+    tried = [(at, error) for at in range(1, operations + 2) for error in ERRORS]
+    return tried[part::PARTS]
+
+
+@parts
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_an_error_once_costs_nothing(server, whole, folders, name, part):
+    before = whole(name)
+    for at, error in errors(part, before.operations):
+        ended = server.run(ARGUMENTS[name], next(folders), disk={"fault": error, "at": at})
+        assert_quiet(ended)
+        run = only_run(ended.folder)
+        if ended.announced == 0:  # nothing had been done yet, and nothing is done
+            assert ended.code == 5
+            assert ERRORS[error] in ended.stderr
+            continue
+        assert ended.code == 0, ended.stderr
+        assert_same_end(run, only_run(before.folder))
+
+
+@parts
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_short_writes_cost_nothing(server, whole, folders, name, part):
+    before = whole(name)
+    for at in range(part or PARTS, before.operations + 1, PARTS):
+        ended = server.run(ARGUMENTS[name], next(folders), disk={"fault": "short", "at": at, "lasting": at % 2 == 0})
+        assert_quiet(ended)
+        assert ended.code == 0, ended.stderr
+        assert "warning" not in ended.stderr
+        assert_same_end(only_run(ended.folder), only_run(before.folder))
+
+
+@parts
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_a_disk_that_has_failed_for_good(server, whole, folders, name, part):
+    before = whole(name)
+    final = before.announced
+    for at, error in errors(part, before.operations):
+        disk = {"fault": error, "at": at, "lasting": True}
+        ended = server.run(ARGUMENTS[name], next(folders), disk=disk)
+        assert_quiet(ended)
+        assert ended.code == 5 or (ended.code == 0 and ended.announced == final), ended.stderr
+        if any(line.startswith("fault ") for line in ended.log):
+            assert ERRORS[error] in ended.stderr
+        assert_nothing_lost(server, ARGUMENTS[name], ended, only_run(before.folder))

@@ -1,0 +1,57 @@
+"""Killed at every operation on the disk, before it and in the middle of it; and killed again while resuming."""
+
+import signal
+
+import pytest
+
+from tests.crash.conftest import PARTS, parts
+from tests.crash.contract import assert_nothing_lost, assert_tidy
+from tests.crash.trials import ARGUMENTS, copied, only_run, operation_after, resume
+
+
+def every(part, operations):
+    """Return the numbers of the operations that a part tries, one more than there are among them."""
+    return range(part or PARTS, operations + 2, PARTS)
+
+
+@parts
+@pytest.mark.parametrize("fault", ["kill", "half"])
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_killed_at_an_operation(server, whole, folders, name, fault, part):
+    before = whole(name)
+    for at in every(part, before.operations):
+        ended = server.run(ARGUMENTS[name], next(folders), disk={"fault": fault, "at": at})
+        assert ended.code == (-signal.SIGKILL if at <= before.operations else 0), ended.stderr
+        assert_nothing_lost(server, ARGUMENTS[name], ended, only_run(before.folder))
+        assert_tidy(only_run(ended.folder))
+
+
+@pytest.fixture(scope="session")
+def half_done(server, whole, tmp_path_factory):
+    """A run that was killed in the middle of a checkpoint, by name."""
+    ended = {}
+
+    def get(name, saved):
+        if name not in ended:
+            at = operation_after(whole(name), saved) + 12
+            folder = tmp_path_factory.mktemp(f"half of {name}")
+            ended[name] = server.run(ARGUMENTS[name], folder, disk={"fault": "half", "at": at})
+            assert ended[name].announced == saved
+        return ended[name]
+
+    return get
+
+
+@parts
+@pytest.mark.parametrize(("name", "saved"), [("ppo", 16), ("sac", 16)])
+def test_killed_again_while_resuming(server, whole, half_done, folders, name, saved, part):
+    before = half_done(name, saved)
+    first = next(folders)
+    operations = server.run(resume(copied(only_run(before.folder), first)), first).operations
+    assert operations > 20
+    for at in every(part, operations):
+        folder = next(folders)
+        run = copied(only_run(before.folder), folder)
+        ended = server.run(resume(run), folder, disk={"fault": "half", "at": at})
+        assert ended.code == (-signal.SIGKILL if at <= operations else 0), ended.stderr
+        assert_nothing_lost(server, ARGUMENTS[name], ended, only_run(whole(name).folder), before.announced)

@@ -1,0 +1,129 @@
+"""Signals that ask a training to stop, in each of its phases: sent to it alone, to its whole group, and twice."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+from tests.crash.contract import assert_nothing_lost, assert_quiet
+from tests.crash.phases import PHASES
+from tests.crash.trials import ARGUMENTS, ROOT, only_run
+
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
+BEFORE = ("workers start", "workers build", "run folder")
+AFTER = ("last checkpoint", "done")
+SOME = {("first rollout", signal.SIGHUP), ("evaluation", signal.SIGTERM), ("checkpoint", signal.SIGINT)}
+SOME |= {("workers build", signal.SIGTERM), ("done", signal.SIGINT), ("the end", signal.SIGHUP)}
+
+
+def cases(some):
+    """Return every phase with every signal; those that are not among `some` are for `make test-crash`."""
+    return [
+        pytest.param(phase, number, marks=() if (phase, number) in some else pytest.mark.crash)
+        for phase in PHASES
+        for number in CODES
+    ]
+
+
+@pytest.mark.parametrize(("phase", "number"), cases(SOME))
+@pytest.mark.parametrize("group", [False, True], ids=["alone", "group"])
+def test_a_signal_in_a_phase(server, whole, tmp_path, phase, number, group):
+    before = whole("ppo")
+    ended = server.run(
+        ARGUMENTS["ppo"],
+        tmp_path,
+        real_workers=group,
+        signal={"number": int(number), "phase": phase, "group": group},
+    )
+    assert_quiet(ended)
+    if phase in AFTER:
+        assert ended.code == 0, ended.stderr
+    else:
+        assert ended.code == CODES[number], ended.stderr
+        assert "interrupted" in ended.stderr.splitlines()[-1]
+        if phase not in BEFORE:
+            assert "checkpoint saved. Go on with: rlctl train --resume runs/Line/" in ended.stderr
+            assert ended.announced > 0
+    assert_nothing_lost(server, ARGUMENTS["ppo"], ended, only_run(before.folder))
+
+
+@pytest.mark.parametrize(("phase", "number"), cases({("checkpoint", signal.SIGTERM), ("evaluation", signal.SIGINT)}))
+def test_a_second_signal_ends_it_at_once(server, whole, tmp_path, phase, number):
+    ended = server.run(
+        ARGUMENTS["ppo"],
+        tmp_path,
+        signal={"number": int(number), "phase": phase, "again": True},
+    )
+    assert_quiet(ended)
+    assert ended.code == (0 if phase == "done" else CODES[number]), ended.stderr
+    assert_nothing_lost(server, ARGUMENTS["ppo"], ended, only_run(whole("ppo").folder))
+
+
+START = 12  # moments, evenly over the first seconds of a process
+
+
+@pytest.mark.parametrize(
+    "part", [pytest.param(0), *(pytest.param(k, marks=pytest.mark.crash) for k in range(1, START))]
+)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_the_process_starts(tmp_path, number, part):
+    moment = 0.15 + 0.4 * (part + list(CODES).index(number) / 3)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rlctl", *ARGUMENTS["ppo"], "-n", "100_000"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    time.sleep(moment)
+    os.killpg(process.pid, number)
+    _, stderr = process.communicate(timeout=60)
+    # Until rlctl's first line runs, Python itself decides.
+    assert process.returncode in (CODES[number], -number), stderr
+    if process.returncode == CODES[number]:
+        assert "Traceback" not in stderr
+    assert left_of(process.pid) == []
+
+
+def left_of(session):
+    """Return the commands of the processes of a session that do not end within some seconds."""
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline and members(session):
+        time.sleep(0.05)
+    return [each.cmdline() for each in members(session)]
+
+
+def members(session):
+    found = []
+    for each in psutil.process_iter(["status"]):
+        try:
+            if os.getsid(each.pid) == session and each.info["status"] != psutil.STATUS_ZOMBIE:
+                found.append(each)
+        except ProcessLookupError:
+            continue
+    return found
+
+
+def test_a_closed_terminal(tmp_path):
+    process, terminal = pty.fork()
+    if process == 0:
+        os.chdir(tmp_path)
+        command = [sys.executable, "-m", "rlctl", *ARGUMENTS["ppo"], "-n", "1_000_000"]
+        os.execvpe(command[0], command, {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'plugins'}"})
+    deadline = time.monotonic() + 60.0
+    while not list(tmp_path.glob("runs/Line/*/metrics.csv")):
+        assert time.monotonic() < deadline
+        os.read(terminal, 2**16)
+    os.close(terminal)
+    _, status = os.waitpid(process, 0)
+    assert os.waitstatus_to_exitcode(status) == CODES[signal.SIGHUP]
+    assert left_of(process) == []
+    told = json.loads((only_run(tmp_path).status_file).read_text())
+    assert told["status"] == "interrupted"
+    assert "checkpoint saved" in told["error"]

@@ -1,0 +1,294 @@
+"""Recipes that cannot be: each ends with exit code 2, and three lines at most that name the key and what is right."""
+
+import pytest
+
+from rlctl.errors import RecipeError, UsageError
+from rlctl.run.recipe import parse_settings, resolve
+from rlctl.train.request import TrainRequest, run_training
+
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 9)}]\n" for level in range(1, 10)
+)
+MERGE_BOMB = "a0: &a0 {k: 1}\n" + "".join(
+    f"a{level}: &a{level}\n  !!merge <<: [{', '.join([f'*a{level - 1}'] * 9)}]\n" for level in range(1, 10)
+)
+
+
+def refused(config, settings=()):
+    """The message with which a recipe is refused before anything is built."""
+    with pytest.raises(RecipeError) as caught:
+        resolve("Pendulum-v1", config, parse_settings(list(settings)))
+    message = str(caught.value)
+    assert caught.value.exit_code == 2
+    assert len(message.splitlines()) <= 3
+    assert len(message) < 500
+    return message
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("n_envs: 1\nseed: 2\nn_envs: 3\n", ":3: key 'n_envs' is there twice"),
+        ("n_envs:\t1\n", ":1: found character '\\t' that cannot start any token"),
+        ("n_envs: [1\n", ":2: expected ',' or ']', but got '<stream end>'"),
+        ("n_envs: 1\n---\nn_envs: 2\n", ":2: expected a single document in the stream, but found another document"),
+        ("- n_envs\n", ": a recipe is a mapping of keys to values, this is a list"),
+        ("ppo\n", ": a recipe is a mapping of keys to values, this is a str"),
+        ("7\n", ": a recipe is a mapping of keys to values, this is a int"),
+        (BOMB, ":6: its aliases make more than 100,000 values of it"),
+        (MERGE_BOMB, ": its aliases make more than 100,000 values of it"),
+        ("task: &a {b: *a}\n", ":1: an alias that contains itself"),
+        ("task: *b\n", ":1: found undefined alias 'b'"),
+        ("base: &b {n_envs: 1}\n<<: *b\n", ":2: merge keys (<<) are not read: write the values out, or "),
+        ("task: " + "[" * 10_000 + "]" * 10_000, ": nested more than 50 deep"),
+        ("task: " + "{a: " * 10_000 + "}" * 10_000, ": nested more than 50 deep"),
+        ("task: " + "[" * 60 + "]" * 60, ":1: nested more than 50 deep"),
+        ("- " * 10_000 + "a", ": nested more than 50 deep"),
+        ("task: !!python/object/apply:os.system [touch pwned]\n", ":1: could not determine a constructor for the tag"),
+        ("task: {a: !!binary aGk=}\n", ":1: could not determine a constructor for the tag"),
+        ("task: {a: !!timestamp 2020-01-01}\n", ":1: could not determine a constructor for the tag"),
+        ("task: !!map [1]\n", ":1: expected a mapping here"),
+        ("n_envs: !!int many\n", ":1: many is not a whole number that can be read"),
+        ("stop_success: !!float high\n", ":1: 'high' is not a number"),
+        ("randomize: !!bool maybe\n", ":1: 'maybe' is not true or false"),
+        (f"n_envs: {'9' * 10_000}\n", ":1: 9999"),
+        (f"n_envs: 0x{'f' * 10_000}\n", ":1: 0xfff"),
+        ("n_envs: 99999999999999999999\n", ":1: 99999999999999999999 is too large a number"),
+        ("1: 2\n", ":1: 1 cannot be a key: keys are text, numbers in quotes"),
+        ("true: 2\n", ":1: true cannot be a key"),
+        ("null: 2\n", ":1: null cannot be a key"),
+        ("[a, b]: 2\n", ":1: a list or a mapping cannot be a key"),
+        ('task: {a: "\\ud800"}\n', ":1: '\\ud800' has half a character"),
+        ("task: a\0b\n", ": character 0x0 at 7 cannot be in YAML"),
+        (b"\xff\xfet\x00a\x00s\x00k\x00", ": not UTF-8 text: invalid start byte at byte 0; save it as UTF-8"),
+        ("n_envs: 1\n".encode("utf-16-be"), ": character 0x0 at 0 cannot be in YAML"),
+        (b"task: {name: \xe9}\n", ": not UTF-8 text: invalid continuation byte at byte 13; save it as UTF-8"),
+    ],
+)
+def test_a_file_that_is_no_recipe(content, told, tmp_path):
+    file = tmp_path / "recipe.yaml"
+    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    message = refused(file)
+    place, found, _ = message.partition(told)
+    assert found, message
+    assert place.startswith(str(file))
+    assert [each.name for each in tmp_path.iterdir()] == ["recipe.yaml"]
+
+
+def test_what_looks_wrong_and_is_right(tmp_path):
+    file = tmp_path / "recipe.yaml"
+    file.write_text(
+        "\ufefftotal_timesteps: 1e6\n"
+        "algo_kwargs: {learning_rate: 3e-4, n_steps: 010, target_kl: null}\n"
+        "task: {mode: on, time: 1:30, same: &s [1], again: *s}\n",
+        encoding="utf-8",
+    )
+    recipe = resolve("Pendulum-v1", file, {})
+    assert recipe.total_timesteps == 1_000_000
+    assert recipe.algo_kwargs["learning_rate"] == 3e-4
+    assert recipe.algo_kwargs["n_steps"] == 10
+    assert recipe.task == {"mode": "on", "time": "1:30", "same": [1], "again": [1]}
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("n_envs=0", "n_envs: should be greater than or equal to 1, got 0"),
+        ("n_envs=1e6", "n_envs: should be less than or equal to 10000, got 1000000"),
+        ("n_envs='4'", "n_envs: expected a number, got '4'"),
+        ("n_envs=true", "n_envs: expected a number, got True"),
+        ("n_envs=.nan", "n_envs: should be a finite number, got nan"),
+        ("total_timesteps=0", "total_timesteps: should be greater than or equal to 1, got 0"),
+        (
+            "total_timesteps=1e30",
+            "total_timesteps: should be less than or equal to 1000000000000, got 1000000000000000019884624838656",
+        ),
+        ("total_timesteps=-.inf", "total_timesteps: should be a finite number, got -inf"),
+        ("seed=-1", "seed: should be greater than or equal to 0, got -1"),
+        ("seed=1099511627776", "seed: should be less than 4294967296, got 1099511627776"),
+        ("frame_stack=0", "frame_stack: should be greater than or equal to 1, got 0"),
+        ("frame_stack=1e9", "frame_stack: should be less than or equal to 1000, got 1000000000"),
+        ("randomize=yes", "randomize: expected true or false, got 'yes'"),
+        ("randomize=1", "randomize: expected true or false, got 1"),
+        ("stop_success=.inf", "stop_success: should be a finite number, got inf"),
+        ("stop_success='1'", "stop_success: expected a number, got '1'"),
+        ("eval=null", "eval: should be a valid dictionary or instance of Evaluation, got None"),
+        ("eval.episodes=0", "eval.episodes: should be greater than or equal to 1, got 0"),
+        ("eval.every_steps=0", "eval.every_steps: should be greater than or equal to 1, got 0"),
+        ("checkpoint.keep=0", "checkpoint.keep: should be greater than or equal to 1, got 0"),
+        ("normalize.observation=1", "normalize.observation: expected true or false, got 1"),
+        ("normalize.clip_reward=.inf", "normalize.clip_reward: should be a finite number, got inf"),
+        ("normalize.clip_observation=-1", "normalize.clip_observation: should be greater than 0, got -1"),
+        ("reward_weights.a=.nan", "reward_weights.a: should be a finite number, got nan"),
+        ("reward_weights.a=true", "reward_weights.a: expected a number, got True"),
+        ("events.mass=3", "events.mass: should be a valid dictionary, got 3"),
+        ("task=3", "task: should be a valid dictionary, got 3"),
+        ("stages=3", "stages: should be a valid list, got 3"),
+        ("stages=[{}, {}]", "stages: stage 1 of 2 (the recipe's own task) has no promotion rule"),
+        ("stages=[{level: .nan}]", "stage 1: level: should be a finite number, got nan"),
+        ("stages=[{level: 2}]", "stage 1: level: should be less than or equal to 1, got 2"),
+        ("stages=[{promote: {}}]", "stage 1: promote: give success or return, one of the two"),
+        ("stages=[{promote: {success: 0.5, window: 0}}]", "stage 1: promote.window: should be greater than or equal"),
+        ("stages=[{promote: {success: '0.5'}}]", "stage 1: promote.success: expected a number, got '0.5'"),
+        ("algo=[ppo]", "algo: should be 'ppo', 'a2c', 'sac', 'td3', 'ddpg', 'dqn', 'tqc', 'crossq' or "),
+        ("stage=[]", "no key 'stage'. Did you mean 'stages'? Keys here: "),
+    ],
+)
+def test_values_that_cannot_be(setting, told):
+    message = refused(None, [setting])
+    assert message.startswith(f"recipe: {told}")
+
+
+def test_a_key_that_never_ends():
+    assert "a key is some names with a dot between" in refused(None, ["task" + ".a" * 10_000 + "=1"])
+    assert "a key is some names with a dot between" in refused(None, ["task..a=1"])
+
+
+@pytest.mark.parametrize("name", ["learning_rate", "gamma", "ent_coef", "max_grad_norm", "clip_range", "log_std_init"])
+@pytest.mark.parametrize("value", [".nan", ".inf", "-.inf", "'0.1'", "true", "null", "[0.1]", "{a: 1}"])
+def test_every_number_is_a_finite_one(name, value):
+    section = "policy_kwargs" if name == "log_std_init" else "algo_kwargs"
+    message = refused(None, [f"{section}.{name}={value}"])
+    assert message.startswith(f"recipe: {section}.{name}: ")
+    assert " is not in " in message or "expected a number" in message
+
+
+NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
+
+
+@pytest.mark.parametrize(
+    ("algo", "setting", "told"),
+    [
+        ("ppo", "learning_rate=3", "3 is not in (0, 1]"),
+        ("ppo", "learning_rate=0", "0 is not in (0, 1]"),
+        ("ppo", "learning_rate=lin_-3e-4", "'lin_-3e-4' is not lin_ and a number in (0, 1], such as lin_0.1"),
+        ("ppo", "learning_rate=lin_inf", "'lin_inf' is not lin_ and a number in (0, 1]"),
+        ("ppo", "learning_rate=lin_", "'lin_' is not lin_ and a number in (0, 1]"),
+        ("ppo", "learning_rate=linear", "expected a number or lin_ and a number, got 'linear'"),
+        ("ppo", "gamma=99", "99 is not in (0, 1]"),
+        ("ppo", "gae_lambda=1.5", "1.5 is not in [0, 1]"),
+        ("ppo", "n_epochs=0", "0 is not in [1, 1e+09]"),
+        ("ppo", "batch_size=0", "0 is not in [2, 1e+09]"),
+        ("ppo", "n_steps=1.5", "expected a whole number, got 1.5"),
+        ("ppo", "ent_coef=auto", "expected a number, got 'auto'"),
+        ("ppo", "vf_coef=-1", "-1 is not in [0, inf]"),
+        ("ppo", "clip_range=-1", "-1 is not in (0, 10]"),
+        ("ppo", "clip_range_vf=0", "0 is not in (0, inf]"),
+        ("ppo", "target_kl=0", "0 is not in (0, inf]"),
+        ("ppo", "normalize_advantage=1", "expected true or false, got 1"),
+        ("ppo", "use_sde=on", "expected true or false, got on"),
+        ("ppo", "sde_sample_freq=-2", "-2 is not in [1, 1e+09]"),
+        ("ppo", "stats_window_size=0", "0 is not in [1, 1e+09]"),
+        ("a2c", "rms_prop_eps=0", "0 is not in (0, 1]"),
+        ("a2c", "use_rms_prop=null", "expected true or false, got None"),
+        ("sac", "ent_coef=autoo", "expected a number or auto, got 'autoo'"),
+        ("sac", "ent_coef=auto_-1", "'auto_-1' is not auto_ and a number in [0, inf], such as auto_0.1"),
+        ("sac", "ent_coef=-1", "-1 is not in [0, inf]"),
+        ("sac", "tau=0", "0 is not in (0, 1]"),
+        ("sac", "buffer_size=0", "0 is not in [1, 1e+15]"),
+        ("sac", "train_freq=0", "0 is not in [1, 1e+09]"),
+        ("sac", "train_freq=[1]", "expected a number of steps, or a pair such as [1, episode], got [1]"),
+        ("sac", "train_freq=[1, year]", "expected a number of steps, or a pair such as [1, episode], got [1, 'year']"),
+        ("sac", "train_freq=[1, episode]", "[1, 'episode'] counts the episodes of one environment, and n_envs is 8; "),
+        ("sac", "gradient_steps=-2", "-2 is not in [1, 1e+09]"),
+        ("sac", "gradient_steps=0", "0 is not in [1, 1e+09]"),
+        ("sac", "learning_starts=-1", "-1 is not in [0, 1e+09]"),
+        ("sac", "target_entropy=low", "expected a number or auto, got 'low'"),
+        ("sac", "target_entropy=.nan", "nan is not in [-inf, inf]"),
+        ("sac", "optimize_memory_usage=true", "not supported: checkpoints need the whole buffer; leave it out"),
+        ("td3", "action_noise=-1", "-1 is not in [0, inf]"),
+        ("td3", "action_noise=.nan", "nan is not in [0, inf]"),
+        ("td3", "policy_delay=0", "0 is not in [1, 1e+09]"),
+        ("td3", "target_noise_clip=-0.5", "-0.5 is not in [0, inf]"),
+        ("dqn", "exploration_final_eps=2", "2 is not in [0, 1]"),
+        ("dqn", "target_update_interval=0", "0 is not in [1, 1e+09]"),
+        ("tqc", "top_quantiles_to_drop_per_net=25", "25 of 25 leaves nothing; it must be below "),
+        ("ppo", "net_arch=[-1]", "-1 is not in [1, 65536]"),
+        ("ppo", "net_arch=[0]", "0 is not in [1, 65536]"),
+        ("ppo", "net_arch=[a]", "expected a whole number, got 'a'"),
+        ("ppo", "net_arch=64", "expected a list of layer widths, such as [64, 64], got 64"),
+        ("ppo", "net_arch={pi: [64]}", f"{NETWORK}{{'pi': [64]}}"),
+        ("ppo", "net_arch={pi: [64], qf: [64]}", f"{NETWORK}{{'pi': [64], 'qf': [64]}}"),
+        ("ppo", "net_arch={pi: [64], vf: [0]}", "0 is not in [1, 65536]"),
+        ("dqn", "net_arch={pi: [64], qf: [64]}", "expected a list of layer widths, such as [64, 64], got {"),
+        ("ppo", "log_std_init=100", "100 is not in [-20, 10]"),
+        ("ppo", "activation_fn=[tanh]", "expected a name, such as tanh, got ['tanh']"),
+        ("ppo", "features_extractor_kwargs={features_dim: 0}", "0 is not in [1, 65536]"),
+        ("ppo", "features_extractor_kwargs={feature_dim: 9}", "no key 'feature_dim'. Did you mean 'features_dim'?"),
+        ("sac", "n_critics=1e6", "1000000.0 is not in [1, 100]"),
+        ("recurrent_ppo", "lstm_hidden_size=0", "0 is not in [1, 65536]"),
+        ("recurrent_ppo", "lstm_kwargs={device: meta}", "no key 'device'. Keys here: dropout, bias"),
+        ("tqc", "n_quantiles=0", "0 is not in [1, 10000]"),
+    ],
+)
+def test_hyperparameters_that_make_no_sense(algo, setting, told):
+    name = setting.partition("=")[0]
+    of_the_network = name.startswith(("net_", "log_std", "activation", "features", "n_crit", "lstm", "n_quant"))
+    section = "policy_kwargs" if of_the_network else "algo_kwargs"
+    message = refused(None, [f"algo={algo}", f"{section}.{setting}"])
+    assert message.startswith(f"recipe: {section}.{name}")
+    assert f": {told}" in message
+
+
+def not_built(task, root, settings):
+    """The message with which a recipe is refused when the model is to be built; no run is left behind."""
+    with pytest.raises(UsageError) as caught:
+        run_training(TrainRequest(task, settings=parse_settings(settings), root=root))
+    assert caught.value.exit_code == 2
+    assert not root.exists()
+    message = str(caught.value)
+    assert len(message.splitlines()) <= 3
+    return message
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (["algo=sac", "algo_kwargs.buffer_size=1e12"], "algo_kwargs.buffer_size: 1000000000000.0 needs 40,000 GB of "),
+        (["algo=sac", "algo_kwargs.batch_size=1e9", "algo_kwargs.learning_starts=9"], "algo_kwargs.batch_size: "),
+        (["algo_kwargs.n_steps=1e9"], "algo_kwargs.n_steps: 1000000000.0 needs 80 GB of memory, and "),
+        (["policy_kwargs.net_arch=[65536, 65536, 65536]"], "policy_kwargs: this network needs 275 GB of memory, and "),
+        (["policy_kwargs.activation_fn=tahn"], "policy_kwargs.activation_fn: no activation 'tahn'. Did you mean"),
+        (["algo_kwargs.gama=0.9"], "algo_kwargs.gama: ppo has no parameter 'gama'. Did you mean 'gamma'?"),
+        (["algo=dqn", "algo_kwargs.use_sde=true"], "algo_kwargs.use_sde: dqn has no parameter 'use_sde'."),
+        (["algo=dqn"], "dqn cannot be used here: "),
+        (["policy_kwargs.squash_output=true"], "ppo cannot be used here: squash_output=True is only available when"),
+    ],
+)
+def test_what_only_building_finds(settings, told, tmp_path):
+    assert not_built("Pendulum-v1", tmp_path / "runs", ["n_envs=2", *settings]).startswith(told)
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("task.tolerance='0.02'", "task.tolerance: expected a number, got '0.02'"),
+        ("task.tolerance=true", "task.tolerance: expected a number, got True"),
+        ("task.tolerance=.nan", "task.tolerance: expected a number, got nan"),
+        ("task.tolerance=[1]", "task.tolerance: should be a valid number, got [1]"),
+        ("task.tollerance=1", "task.tollerance: Reach has no parameter 'tollerance'. Did you mean 'tolerance'?"),
+    ],
+)
+def test_parameters_of_a_task(setting, told, tmp_path):
+    assert told in not_built("reach", tmp_path / "runs", ["n_envs=1", setting])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("-n", "1e30"),
+        ("-n", "[[["),
+        ("--seed", "-1"),
+        ("--set", "algo_kwargs.gamma='0.99'"),
+        ("--set", "task=!!python/object/apply:os.system [touch pwned]"),
+        ("--num-envs", "1000000"),
+        ("--algo", "{a: 1}"),
+    ],
+)
+def test_the_command_ends_with_one_error(arguments, rlctl, tmp_path):
+    done = rlctl("train", "Pendulum-v1", *arguments)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("error: ")
+    assert len(done.stderr.splitlines()) <= 3
+    assert done.stdout == ""
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,83 @@
+"""Nothing is unpickled: not of good files, not of hostile ones. Python itself tells, by its audit events."""
+
+import json
+import pickle
+import subprocess
+import sys
+
+from tests.train.conftest import ENVS
+
+WATCHED = """
+import json, sys
+
+found = []
+
+def hook(event, arguments):
+    if event in ("pickle.find_class", "os.system"):
+        found.append([event, *map(str, arguments)])
+
+from rlctl.cli import run
+sys.addaudithook(hook)  # can never be removed: a process of its own
+codes = [run(arguments) for arguments in json.loads(sys.argv[1])]
+print("@" + json.dumps([codes, found]), file=sys.stderr)
+"""
+
+
+def watched(folder, *commands):
+    """Run commands in one process; return their exit codes and every class that was looked up for a pickle."""
+    done = subprocess.run(
+        [sys.executable, "-c", WATCHED, json.dumps([[str(word) for word in command] for command in commands])],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    told = [line for line in done.stderr.splitlines() if line.startswith("@")]
+    assert told, done.stderr
+    return json.loads(told[-1][1:])
+
+
+def test_the_life_of_a_run(tmp_path):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(
+        "algo: sac\nn_envs: 2\neval: {episodes: 2, every_steps: 64}\nalgo_kwargs: {learning_starts: 16}\n"
+    )
+    codes, found = watched(
+        tmp_path,
+        ["train", f"{ENVS}:Line", "--config", recipe, "-n", "64", "--no-check"],
+        ["train", "--resume", "latest", "-n", "96"],
+        ["eval", "latest", "--episodes", "2", "--n-envs", "1"],
+        ["export", "latest", "--onnx"],
+        ["eval", "runs/latest/exports/policy.onnx", "--episodes", "2", "--n-envs", "1"],
+        ["replay", "latest"],
+        ["replay", "--verify", "runs/latest/episodes/000000.npz"],
+    )
+    assert codes == [0] * 7
+    assert found == []
+
+
+class Bait:
+    def __reduce__(self):
+        import os
+
+        return (os.system, ("touch sprung",))
+
+
+def test_files_that_are_pickles(tmp_path):
+    import numpy as np
+    import torch
+
+    for suffix in ("safetensors", "onnx", "npz"):
+        (tmp_path / f"plain.{suffix}").write_bytes(pickle.dumps(Bait()))
+        torch.save(Bait(), tmp_path / f"torch.{suffix}")
+    np.savez(tmp_path / "array.npz", info=np.array([Bait()], dtype=object))
+    commands = [["eval", f"{name}.{suffix}"] for name in ("plain", "torch") for suffix in ("safetensors", "onnx")]
+    commands += [["export", f"{name}.safetensors", "--onnx"] for name in ("plain", "torch")]
+    commands += [["replay", "--verify", f"{name}.npz"] for name in ("plain", "torch", "array")]
+    # A task's own code may unpickle what it likes; it is here to see that the watch sees it.
+    probe = f"import json, pickle\npickle.loads({pickle.dumps(json.JSONDecoder)!r})\n"
+    (tmp_path / "probe.py").write_text(probe)
+    codes, found = watched(tmp_path, *commands, ["train", "probe.py:Env"])
+    assert codes == [5] * len(commands) + [2]
+    assert [each[:3] for each in found] == [["pickle.find_class", "json.decoder", "JSONDecoder"]]
+    assert not (tmp_path / "sprung").exists()
