@@ -6,28 +6,17 @@ import psutil
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.rollout.seeds import EpisodeAddress, Stream
-from rlctl.run.directory import RunDirectory
 from rlctl.train import checkpoint, saving
 from tests.train import faulty_envs
 from tests.train.comparing import assert_same_run
+from tests.train.conftest import FAULTY as ENVS
+from tests.train.conftest import FAULTY_SEED as SEED
+from tests.train.conftest import TINY
 
-ENVS = faulty_envs.__file__
-SEED = EpisodeAddress(0, Stream.TRAIN, 1, 3).seed
-"""Of the fourth episode of the second environment: its seventh step is the 37th of them, in the third rollout."""
-TINY = {
-    "n_envs": 2,
-    "total_timesteps": 128,
-    "eval": {"episodes": 1, "every_steps": 1_000_000},
-    "algo_kwargs": {"n_steps": 16, "batch_size": 32, "n_epochs": 1},
-}
 PLACE = f"in environment 1, episode seed {SEED}, step 7; to see it alone: rlctl check-env {ENVS}:"
 
 
-@pytest.fixture(autouse=True)
-def every_boundary(monkeypatch):
-    """Write a checkpoint at every boundary, whatever it costs."""
-    monkeypatch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e9)
+pytestmark = pytest.mark.usefixtures("every_boundary")
 
 
 @pytest.fixture(scope="module")
@@ -39,20 +28,6 @@ def whole(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e9)
         return run_training(TrainRequest(f"{ENVS}:Faulty", settings={**TINY, "task": {"fault": ""}}, root=root)).run
-
-
-@pytest.fixture
-def fail(train, tmp_path):
-    """Train into a fault; return the error and the run."""
-
-    def run(env="Faulty", settings=TINY, timeout_s=60.0, **parameters):
-        task = {"faulty_seed": SEED, **parameters}
-        with pytest.raises(TaskError) as caught:
-            train(env, {**settings, "task": task}, envs=ENVS, env_timeout_s=timeout_s)
-        (folder,) = (tmp_path / "runs").glob("*/2*")
-        return caught.value, RunDirectory(folder)
-
-    return run
 
 
 # The same faults without a training, and many more, are in tests/rollout/test_returned.py.
