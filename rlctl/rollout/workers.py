@@ -28,18 +28,20 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.rollout import goal_rewards
 from rlctl.rollout.printed import forward
-from rlctl.rollout.process_group import end
+from rlctl.rollout.process_group import end, signals_held
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
 from rlctl.run.env_info import EnvInfo
 
 Observations = NDArray[Any] | dict[str, NDArray[Any]]
 
 # Started this way a worker finds what its parent finds, and the caller's script is not run again.
-# Ctrl-C, a closed terminal and a service's stop reach the whole group, and the main process decides: ignored before
-# anything slow is imported. What the environments start has its own say in the latter two.
+# Who stops a service signals all of its processes, and the main process decides: ignored before anything slow is
+# imported, and held back until then. What the environments start has its own say.
 _BOOTSTRAP = (
-    "import json, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); "
-    "[signal.signal(number, lambda *_: None) for number in (signal.SIGTERM, signal.SIGHUP)]; "
+    "import signal; numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP); "
+    "[signal.signal(number, lambda *_: None) for number in numbers]; "
+    "signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers); "
+    "import json, sys; "
     "sys.path[:] = json.loads(sys.argv[3])['sys_path']; "
     "from rlctl.rollout.worker_process import main; main()"
 )
@@ -131,7 +133,7 @@ class Workers:
             "MKL_NUM_THREADS": "1",
         }
         passed = (theirs.fileno(), self._memory, lifeline)
-        with theirs, open(lifeline, "rb"):
+        with theirs, open(lifeline, "rb"), signals_held():
             process = subprocess.Popen(
                 [sys.executable, "-c", _BOOTSTRAP, *map(str, passed[:2]), json.dumps(job), str(lifeline)],
                 pass_fds=passed,
