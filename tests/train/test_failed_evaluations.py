@@ -34,8 +34,8 @@ def only_run(tmp_path):
     ("fault", "told"),
     [
         ("raise", "RuntimeError: the gripper fell off"),
-        ("out of memory", "worker 0 died while stepping (SIGKILL: "),
-        ("sleep", "no answer for 3 s while stepping"),
+        pytest.param("out of memory", "worker 0 died while stepping (SIGKILL: ", marks=pytest.mark.slow),
+        pytest.param("sleep", "no answer for 3 s while stepping", marks=pytest.mark.slow),
     ],
 )
 def test_training_goes_on(train, settings, tmp_path, capfd, fault, told):
@@ -62,6 +62,7 @@ def test_training_goes_on(train, settings, tmp_path, capfd, fault, told):
     assert f"to live its actions again: rlctl replay {kept[0]}" in printed
 
 
+@pytest.mark.slow
 def test_it_is_lived_again(train, settings, tmp_path):
     # Each life is counted: the first is the one evaluation, the second and third may be the replay's.
     with pytest.raises(TaskError):
