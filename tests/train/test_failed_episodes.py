@@ -26,7 +26,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+QUICK = ("plain", "discrete", "reset")
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
 def test_it_fails_again_as_it_did(fail, rlctl, case):
     env, settings, parameters = CASES[case]
     error, run = fail(env, {**TINY, **settings}, **{"fault": "raise", **parameters})
