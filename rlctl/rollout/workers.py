@@ -48,7 +48,6 @@ _BOOTSTRAP = (
 
 # A PyBullet world is one block of 28 MB, which huge pages fill in half the time. Other C libraries ignore this.
 _TUNED = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0

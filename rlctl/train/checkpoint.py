@@ -124,7 +124,7 @@ class Checkpoints:
         return {
             **versions(),
             "machine": platform.machine(),
-            "processor": torch.backends.cpu.get_cpu_capability(),
+            "processor": f"{_maker()} {torch.backends.cpu.get_cpu_capability()}",
             "threads": str(torch.get_num_threads()),
             "device": str(self._model.device),
         }
@@ -224,6 +224,16 @@ def _named_segments(run: RunDirectory) -> list[Segment]:
         except ArtifactError:  # a damaged checkpoint needs no segments any more
             continue
     return named
+
+
+def _maker() -> str:
+    """Return who made the processor, where the system says it: libraries choose their code by that too."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or "unknown"
+    found = (line.partition(":")[2].strip() for line in lines if line.startswith(("vendor_id", "CPU implementer")))
+    return next(found, "unknown")
 
 
 def differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
