@@ -95,11 +95,16 @@ def as_taken(action: Any, space: spaces.Space[Any]) -> Any:
 
 def recorded_actions(episode: RecordedEpisode, env: Env, path: Path | None = None) -> Choose:
     """Return the actions of an episode, one after the other; raises `ArtifactError` if they are for another space."""
-    given, wanted = episode.actions.shape[1:], env.action_space.shape or ()
+    check_actions(episode, env.action_space.shape or (), path)
+    return lambda _, step: episode.actions[step] if step < len(episode.actions) else None
+
+
+def check_actions(episode: RecordedEpisode, wanted: tuple[int, ...], path: Path | None = None) -> None:
+    """Raise `ArtifactError` if an action of an episode has not the shape that its task wants now."""
+    given = episode.actions.shape[1:]
     if given != wanted:
         name = path or f"episode of {episode.info.task}"
         raise ArtifactError(f"{name}: its actions have shape {given}, those of {episode.info.task} have {wanted}")
-    return lambda _, step: episode.actions[step] if step < len(episode.actions) else None
 
 
 def present_versions(task: str) -> dict[str, str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from rlctl import output
 from rlctl.errors import UsageError
 from rlctl.replay.difference import find_difference
-from rlctl.replay.live import Lived, live, present_versions, recorded_actions
+from rlctl.replay.live import Lived, check_actions, live, present_versions, recorded_actions
 from rlctl.replay.report import Verification
 from rlctl.replay.watching import Tell, watch, watched_env
 from rlctl.rollout.workers import Workers
@@ -47,6 +47,7 @@ def live_failed(episode: RecordedEpisode) -> None:
     Raises the `TaskError` that it failed with if it fails again.
     """
     with Workers(episode.info.env_spec(), 1) as workers:
+        check_actions(episode, workers.arrays.action.shape[1:])
         workers.arrays.next_seed[:] = -1
         workers.reset({0: episode.info.seed})
         for action in episode.actions:

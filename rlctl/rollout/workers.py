@@ -48,7 +48,6 @@ _BOOTSTRAP = (
 
 # A PyBullet world is one block of 28 MB, which huge pages fill in half the time. Other C libraries ignore this.
 _TUNED = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0
@@ -308,17 +307,16 @@ class Workers:
         if kind is TaskError and self._spec.task not in message.partition("\n")[0]:
             message = f"task {self._spec.task!r}: {message}"
         if place is not None:
-            message += self._told(*place)
-        if place is not None and kind is TaskError:
-            return EpisodeFailed(message, *place, details=details)
+            failed = EpisodeFailed(message, *place, hint=self._hint, details=details)
+            if kind is TaskError:
+                return failed
+            message = str(failed)
         result: RlctlError = kind(message, details=details)
         return result
 
-    def _told(self, env: int, seed: int, step: int) -> str:
-        return (
-            f"\nin environment {env}, episode seed {seed}, step {step}; "
-            f"to see it alone: rlctl check-env {self._spec.task}"
-        )
+    @property
+    def _hint(self) -> str:
+        return f"to see it alone: rlctl check-env {self._spec.task}"
 
     def _stopped(self, worker: int, message: str) -> TaskError:
         """Name the episode a worker was in when it stopped answering, or the environments it ran."""
@@ -326,7 +324,7 @@ class Workers:
         if self._ready:
             for env, (seed, step) in enumerate(self._arrays.inside[low:high].tolist(), start=low):
                 if step >= 0:
-                    return EpisodeFailed(message + self._told(env, seed, step), env, seed, step)
+                    return EpisodeFailed(message, env, seed, step, hint=self._hint)
         return TaskError(f"{message}\nit ran the environments {low} to {high - 1}")
 
     def _death(self, worker: int, doing: str) -> TaskError:

@@ -141,9 +141,11 @@ def _mismatch(episode: RecordedEpisode) -> str | None:
     if episode.terms.shape != (steps, names) or episode.terms.dtype != np.float64:
         return f"reward terms are {_told(episode.terms)}, not float64 of shape {(steps, names)}"
     parts = observations if isinstance(observations, dict) else {"": observations}
-    for name, values, count in (("actions", episode.actions, steps), *((k, v, steps + 1) for k, v in parts.items())):
+    # Of an episode that failed there are its actions alone, however many.
+    acted, observed = (None, 0) if episode.info.failure and not steps else (steps, steps + 1)
+    for name, values, count in (("actions", episode.actions, acted), *((k, v, observed) for k, v in parts.items())):
         label = name if name == "actions" else f"observations {name}".strip()
-        if values.ndim == 0 or len(values) != count:
+        if values.ndim == 0 or (count is not None and len(values) != count):
             return f"{label} are {_told(values)}, not {count} of them"
         if values.dtype.kind not in "biuf":
             return f"{label} are {_told(values)}, not numbers"

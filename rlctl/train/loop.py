@@ -10,20 +10,18 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from typing import Any
 
-import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from rlctl.errors import ArtifactError, DivergedError, Interrupted, RlctlError, TaskError, UsageError
-from rlctl.eval.statistics import mean_return, mean_terms, success_rate
+from rlctl.eval.statistics import mean_return, success_rate
 from rlctl.rollout.collect import Episode
 from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
-from rlctl.train import faults, snapshot
+from rlctl.train import faults, rows, snapshot
 from rlctl.train.checkpoint import Checkpoint
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
@@ -34,11 +32,6 @@ from rlctl.train.progress import Progress
 from rlctl.train.saving import Packed, Saver
 from rlctl.train.vec_env import WorkerVecEnv
 
-_LOSSES = (
-    "learning_rate", "loss", "policy_gradient_loss", "policy_loss", "value_loss", "entropy_loss", "approx_kl",
-    "clip_fraction", "clip_range", "explained_variance", "std", "actor_loss", "critic_loss", "ent_coef",
-    "ent_coef_loss", "n_updates",
-)  # fmt: skip
 # Explained variance, for one, is not a number where rewards are constant, and nothing is wrong.
 _MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", "actor_loss", "critic_loss")
 _OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
@@ -206,28 +199,19 @@ class TrainingLoop(BaseCallback):
         before, steps_before = self._last_row
         self._last_row = (now, steps)
         recent, self.progress.recent = self.progress.recent, []
-        row: dict[str, Any] = {
+        terms = list(self.env.workers.info.reward_weights)
+        row = {
             "steps": steps,
             "seconds": round(now - self._started, 3),
             "fps": round((steps - steps_before) / max(now - before, 1e-9), 1),
             **self.curriculum.columns(),
+            **rows.of_training(recent, terms, self.logger.name_to_value),
         }
-        terms = dict.fromkeys(self.env.workers.info.reward_weights)
-        row.update({"return": None, "length": None, "success": None})
-        if recent:
-            row["return"] = mean_return(recent)
-            row["length"] = float(np.mean([result.length for result in recent]))
-            row["success"] = success_rate(recent)
-            known = mean_terms(recent)
-            terms.update({name: known.get(name) for name in terms})
-        row.update({f"term/{name}": value for name, value in terms.items()})
-        losses = self.logger.name_to_value
-        row.update({name: losses.get(f"train/{name}") for name in _LOSSES})
         self.saver.row(self.saver.metrics, row)
         for name, number in self.curriculum.columns().items():
             self.logger.record(f"curriculum/{name}", number)
-        for name, value in terms.items():
-            if value is not None:
+        for name in terms:
+            if (value := row[f"term/{name}"]) is not None:
                 self.logger.record(f"reward_terms/{name}", value)
         self.display.metrics(steps, row["fps"], row["return"], row["success"])
 
@@ -260,9 +244,8 @@ class TrainingLoop(BaseCallback):
         progress, steps = self.progress, self.model.num_timesteps
         progress.failed_evaluations += 1
         progress.first_failure = progress.first_failure or f"at step {steps:,}: {error}"
-        told = [f"warning: evaluation at step {steps:,} failed, training goes on: {error}"]
-        told += faults.keep(error, self.curriculum.goal_spec, self.saver, self.episodes, steps)
-        self.display.message("\n".join(told))
+        error = faults.kept(error, self.curriculum.goal_spec, self.saver, self.episodes, steps)
+        self.display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
 
     def _take_note(self, episodes: list[Episode], packed: Packed) -> None:
         progress, steps = self.progress, self.model.num_timesteps
@@ -280,11 +263,7 @@ class TrainingLoop(BaseCallback):
             "steps": steps,
             "seconds": round(time.monotonic() - self._started, 3),
             **self.curriculum.columns(),
-            "episodes": len(results),
-            "success": success,
-            "return": mean,
-            "length": float(np.mean([result.length for result in results])),
-            **{f"term/{name}": value for name, value in mean_terms(results).items()},
+            **rows.of_evaluation(results),
         }
         self.saver.row(self.saver.evals, row)
         self.logger.record("eval/mean_reward", mean)

@@ -5,7 +5,7 @@ import os
 import sys
 from pathlib import Path
 
-from tests.crash import spare_workers
+from tests.crash import meddling, spare_workers
 from tests.crash.faulty_os import FaultyOs, FaultyShutil
 
 
@@ -25,6 +25,8 @@ def run(arguments, folder, plan):
     _announce(saving.Saver, log)
     files.os = FaultyOs(log, **plan.get("disk", {}))
     files.shutil = FaultyShutil(files.os)
+    if "meddle" in plan:
+        meddling.begin(**plan["meddle"])
     if "signal" in plan:
         from tests.crash import phases
 

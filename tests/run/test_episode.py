@@ -93,3 +93,15 @@ def test_what_is_no_episode(path):
     path.unlink()
     with pytest.raises(ArtifactError, match=r"000000.npz: no such file$"):
         load_episode(path)
+
+
+def test_of_an_episode_that_failed_there_are_the_actions_alone(path):
+    failed = INFO.model_copy(update={"failure": "RuntimeError", "term_names": []})
+    nothing = np.zeros(0)
+    actions = np.ones((3, 2), np.float32)
+    save_episode(path, RecordedEpisode(failed, actions, nothing, nothing, nothing.reshape(0, 0)))
+    np.testing.assert_array_equal(load_episode(path).actions, actions)
+    whole = failed.model_copy(update={"failure": ""})
+    save_episode(path, RecordedEpisode(whole, actions, nothing, nothing, nothing.reshape(0, 0)))
+    with pytest.raises(ArtifactError, match="not 0 of them"):
+        load_episode(path)

@@ -2,16 +2,28 @@ from pathlib import Path
 
 import pytest
 
+from rlctl.errors import TaskError
+from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.run import recipe
 from rlctl.run.directory import RunDirectory
+from rlctl.train import saving
 from rlctl.train.request import TrainRequest, TrainResult, run_training
 
 ENVS = Path(__file__).with_name("envs.py")
+FAULTY = ENVS.with_name("faulty_envs.py")
+FAULTY_SEED = EpisodeAddress(0, Stream.TRAIN, 1, 3).seed
+"""Of the fourth episode of the second environment: its seventh step is the 37th of them, in the third rollout."""
 
 SMALL = {
     "n_envs": 4,
     "total_timesteps": 256,
     "eval": {"episodes": 6, "every_steps": 128},
+}
+TINY = {
+    "n_envs": 2,
+    "total_timesteps": 128,
+    "eval": {"episodes": 1, "every_steps": 1_000_000},
+    "algo_kwargs": {"n_steps": 16, "batch_size": 32, "n_epochs": 1},
 }
 SMALL_PPO = {**SMALL, "algo_kwargs": {"n_steps": 16, "batch_size": 32, "n_epochs": 2}}
 
@@ -20,8 +32,8 @@ SMALL_PPO = {**SMALL, "algo_kwargs": {"n_steps": 16, "batch_size": 32, "n_epochs
 def train(tmp_path: Path):
     """Train on an environment of envs.py in this process, into a temporary folder."""
 
-    def run(env: str, settings: dict, **request) -> TrainResult:
-        task = f"{ENVS}:{env}" if env[0].isupper() else env
+    def run(env: str, settings: dict, envs: str | Path = ENVS, **request) -> TrainResult:
+        task = f"{envs}:{env}" if env[0].isupper() else env
         return run_training(TrainRequest(task, settings=settings, root=tmp_path / "runs", **request))
 
     return run
@@ -41,3 +53,23 @@ def resume(tmp_path: Path):
 @pytest.fixture
 def small_ppo() -> dict:
     return recipe.merge(SMALL_PPO, {})
+
+
+@pytest.fixture
+def every_boundary(monkeypatch):
+    """Write a checkpoint at every boundary, whatever it costs."""
+    monkeypatch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e9)
+
+
+@pytest.fixture
+def fail(train, tmp_path):
+    """Train into a fault; return the error and the run."""
+
+    def run(env="Faulty", settings=TINY, timeout_s=60.0, **parameters):
+        task = {"faulty_seed": FAULTY_SEED, **parameters}
+        with pytest.raises(TaskError) as caught:
+            train(env, {**settings, "task": task}, envs=FAULTY, env_timeout_s=timeout_s)
+        (folder,) = (tmp_path / "runs").glob("*/2*")
+        return caught.value, RunDirectory(folder)
+
+    return run

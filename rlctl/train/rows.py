@@ -1,0 +1,47 @@
+"""The columns of `metrics.csv` and `evals.csv`, beside those of steps, time and stage."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rlctl.eval.statistics import mean_return, mean_terms, success_rate
+from rlctl.rollout.workers import EpisodeResult
+
+_LOSSES = (
+    "learning_rate", "loss", "policy_gradient_loss", "policy_loss", "value_loss", "entropy_loss", "approx_kl",
+    "clip_fraction", "clip_range", "explained_variance", "std", "actor_loss", "critic_loss", "ent_coef",
+    "ent_coef_loss", "n_updates",
+)  # fmt: skip
+
+
+def of_training(recent: Sequence[EpisodeResult], terms: Iterable[str], log: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the episodes that ended lately have come to, and what SB3 logged of the last update.
+
+    `terms` are the names of the reward terms; what is not known is None.
+    """
+    known = mean_terms(recent) if recent else {}
+    return {
+        "return": mean_return(recent) if recent else None,
+        "length": _mean_length(recent) if recent else None,
+        "success": success_rate(recent) if recent else None,
+        **{f"term/{name}": known.get(name) for name in terms},
+        **{name: log.get(f"train/{name}") for name in _LOSSES},
+    }
+
+
+def of_evaluation(results: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Return what the episodes of an evaluation have come to."""
+    return {
+        "episodes": len(results),
+        "success": success_rate(results),
+        "return": mean_return(results),
+        "length": _mean_length(results),
+        **{f"term/{name}": value for name, value in mean_terms(results).items()},
+    }
+
+
+def _mean_length(results: Sequence[EpisodeResult]) -> float:
+    return float(np.mean([result.length for result in results]))

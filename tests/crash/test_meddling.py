@@ -1,0 +1,177 @@
+"""Files that are removed, edited or not writable while a training goes on, and a clock that jumps."""
+
+import shutil
+
+import pytest
+
+from rlctl.train import checkpoint
+from tests.crash.contract import assert_quiet, assert_same_end, assert_tidy
+from tests.crash.meddling import CLOCKS
+from tests.crash.trials import ARGUMENTS, only_run, resume
+from tests.train.comparing import rows
+
+NAME = "ppo, kept"  # boundaries at 16, 32, 48, 64 and 80; evaluations at 32, 64 and 80
+AFTER = 48
+
+
+@pytest.fixture
+def meddle(server, folders):
+    """Train while something happens after a step; return how it ended, its run, and the warnings."""
+
+    def run(what, name=NAME, **plan):
+        ended = server.run(ARGUMENTS[name], next(folders), meddle={"what": what, "after": AFTER, **plan})
+        assert_quiet(ended)
+        assert ended.code == 0, ended.stderr
+        warnings = [line for line in ended.stderr.splitlines() if line.startswith(("warning", "saved again"))]
+        return ended, only_run(ended.folder), warnings
+
+    return run
+
+
+def steps(file):
+    return [int(row["steps"]) for row in rows(file)]
+
+
+def assert_same_learnt(run, whole):
+    """Hold that the last checkpoints are the same; of tables and files there may be less."""
+    (ours, damage), (theirs, _) = checkpoint.newest(run), checkpoint.newest(whole)
+    assert damage == []
+    assert ours.state.step == theirs.state.step
+    for name, values in ours.tensors.items():
+        assert values.tobytes() == theirs.tensors[name].tobytes(), name
+    for file, other in ((run.best_policy, whole.best_policy), (run.last_policy, whole.last_policy)):
+        assert file.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize("what", ["run removed", "all runs removed"])
+def test_a_run_that_is_removed_is_there_again(server, whole, meddle, what):
+    ended, run, warnings = meddle(what)
+    assert warnings == [
+        f"warning: {relative(run, ended)} was removed while training: made anew, without what was in it"
+    ]
+    assert_same_learnt(run, only_run(whole(NAME).folder))
+    assert run.status()["status"] == "finished"
+    assert steps(run.metrics_file) == [64, 80]
+    assert steps(run.evals_file) == [64, 80]
+    assert [int(folder.name) for folder in run.checkpoints()] == [64, 80]
+    assert list(run.tensorboard.iterdir())
+    assert_tidy(run)
+    usable(server, run, ended.folder)
+
+
+def relative(run, ended):
+    return run.path.relative_to(ended.folder)
+
+
+def usable(server, run, folder):
+    for arguments, told in (
+        (["eval", str(run.path), "--episodes", "2"], "success rate"),
+        (["export", str(run.path), "--onnx"], "verified"),
+        ([*resume(run), "-n", "96"], ": 96 steps in "),
+    ):
+        ended = server.run(arguments, folder)
+        assert ended.code == 0, ended.stderr
+        assert told in ended.stdout + ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("what", "told"),
+    [
+        ("run.json removed", "run.json was removed while training: written again"),
+        ("lock removed", None),
+        ("episodes removed", None),
+        ("policies removed", None),
+        ("tensorboard removed", None),
+        ("event file removed", None),
+    ],
+)
+def test_what_is_removed_is_written_again(whole, meddle, what, told):
+    _, run, warnings = meddle(what)
+    assert_same_end(run, only_run(whole(NAME).folder))
+    assert list(run.tensorboard.iterdir())
+    assert [warning.endswith(str(told)) for warning in warnings] == ([True] if told else [])
+
+
+@pytest.mark.parametrize(
+    ("name", "what", "after"),
+    [
+        (NAME, "checkpoints removed", AFTER),
+        ("sac, kept", "checkpoints removed", 32),
+        ("sac, kept", "segments removed", 32),
+    ],
+)
+def test_the_next_checkpoint_is_whole(server, whole, meddle, name, what, after):
+    ended, run, warnings = meddle(what, name, after=after)
+    assert warnings == []
+    assert_same_end(run, only_run(whole(name).folder))
+    again = server.run([*resume(run), "-n", "96"], ended.folder)
+    assert again.code == 0, again.stderr
+    assert f"going on at step {checkpoint.newest(only_run(whole(name).folder))[0].state.step}, as if" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("what", "left"),
+    [
+        ("metrics removed", [64, 80]),
+        ("metrics emptied", [64, 80]),
+        ("metrics cut", [16, 32, 64, 80]),
+        ("metrics longer", [16, 32, 48, 64, 80]),
+        ("metrics sorted out", [64, 80]),
+    ],
+)
+def test_a_table_that_is_meddled_with_has_whole_rows_from_then_on(whole, meddle, what, left):
+    _, run, warnings = meddle(what)
+    before = only_run(whole(NAME).folder)
+    assert warnings == []
+    assert_same_learnt(run, before)
+    ours, theirs = rows(run.metrics_file), rows(before.metrics_file)
+    assert ours == [row for row in theirs if int(row["steps"]) in left]
+    assert rows(run.evals_file) == rows(before.evals_file)
+
+
+def test_evaluations_table_removed(whole, meddle):
+    _, run, _ = meddle("evals removed")
+    before = only_run(whole(NAME).folder)
+    assert rows(run.evals_file) == rows(before.evals_file)[1:]
+    assert rows(run.metrics_file) == rows(before.metrics_file)
+
+
+@pytest.mark.parametrize(
+    ("what", "told"), [("read-only", "Read-only file system"), ("full", "No space left on device")]
+)
+def test_a_disk_that_takes_nothing_for_a_while(whole, meddle, what, told):
+    _, run, warnings = meddle(what, after=16, until=64)
+    assert warnings[0].startswith("warning: not saved: ")
+    assert warnings[0].endswith(f"{told}; training goes on")
+    assert warnings[-1] == "saved again, at step 64"
+    assert_same_end(run, only_run(whole(NAME).folder))
+
+
+def test_latest_is_not_ours_any_more(server, whole, meddle):
+    ended, run, _ = meddle("latest replaced", after=16)
+    assert_same_end(run, only_run(whole(NAME).folder))
+    assert (ended.folder / "runs" / "latest" / "mine").exists()
+    assert server.run(["train", "--resume", "latest"], ended.folder).code == 0
+
+
+@pytest.mark.parametrize("what", CLOCKS)
+def test_a_clock_that_jumps_changes_nothing(whole, meddle, what):
+    _, run, warnings = meddle(what)
+    assert warnings == []
+    assert_same_end(run, only_run(whole(NAME).folder))
+
+
+def test_latest_after_the_clock_was_set_back(server, folders):
+    folder = next(folders)
+    short = [*ARGUMENTS[NAME], "-n", "16"]
+    first = server.run(short, folder)
+    second = server.run([*short, "--seed", "1"], folder, meddle={"what": "clock back"})
+    assert (first.code, second.code) == (0, 0)
+    older, newer = sorted((folder / "runs" / "Line").iterdir(), reverse=True)
+    assert (older.name[-2:], newer.name[-2:]) == ("s0", "s1")
+    again = server.run(["train", "--resume", "latest", "-n", "32"], folder)
+    assert again.code == 0, again.stderr
+    assert newer.name in again.stdout
+    shutil.rmtree(newer)  # the link leads nowhere, and the time in the names decides
+    again = server.run(["train", "--resume", "latest", "-n", "32"], folder)
+    assert older.name in again.stdout

@@ -1,0 +1,151 @@
+"""What a worker says of what environments do and return: here in this process, without one."""
+
+import os
+import threading
+
+import pytest
+
+from rlctl.env_spec import EnvSpec
+from rlctl.rollout.failures import FailedInEpisode, as_message
+from rlctl.rollout.printed import LONGEST_LINE, MOST_LINES_PER_S, forward, printable
+from rlctl.rollout.shared_arrays import anonymous_file
+from rlctl.rollout.worker_process import _Worker
+from tests.train import faulty_envs
+
+ENVS = faulty_envs.__file__
+
+
+def failure(env, **parameters):
+    """Return what a worker tells of the episode of seed 7."""
+    worker = _Worker(anonymous_file(), EnvSpec(f"{ENVS}:{env}", parameters), 0, 1, 1)
+    worker.attach()
+    worker.arrays.next_seed[:] = -1
+    with pytest.raises(FailedInEpisode) as caught:
+        live(worker)
+    return as_message(caught.value)
+
+
+def live(worker):
+    worker.reset([(0, 7)])
+    for _ in range(10):
+        worker.step()
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("nan reward", "reward is nan"),
+        ("inf reward", "reward is inf"),
+        ("no reward", "reward is None, not a number"),
+        ("text reward", "reward is '1.0', not a number"),
+        ("two rewards", "reward is array([1., 1.]), not a number"),
+        ("nan observation", "observation is not finite: element 0 is nan"),
+        ("shape", "observation has shape (2,), the space has (1,)"),
+        ("no observation", "observation has shape (), the space has (1,)"),
+        ("objects", "observation is [{}], not numbers"),
+        (
+            "nothing",
+            "step returned None, and not (observation, reward, terminated, truncated, info), as Gymnasium wants it",
+        ),
+        (
+            "old gym",
+            "step returned 4 values, and not (observation, reward, terminated, truncated, info), as Gymnasium wants it",
+        ),
+        ("no info", "info is None, not a dict"),
+        ("text flag", "terminated is 'False', not a bool"),
+        ("text term", "info['reward_terms'] is {'speed': 'fast'}, not a dict of numbers"),
+        ("term list", "info['reward_terms'] is [1.0], not a dict of numbers"),
+        ("text success", "info['is_success'] is 'yes', not a number"),
+    ],
+)
+def test_what_is_returned(fault, told):
+    assert failure("Faulty", fault=fault) == {
+        "message": f"ValueError: {told}",
+        "kind": None,
+        "traceback": None,
+        "env": 0,
+        "seed": 7,
+        "step": 7,
+    }
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("raise", "RuntimeError: the gripper fell off"),
+        ("unprintable", "Unprintable: (its text cannot be had: ZeroDivisionError)"),
+        ("local class", "Local: nobody can import this"),
+        ("long text", f"RuntimeError: one line and another {'x' * 379}..."),
+        ("interrupt", "KeyboardInterrupt"),
+        ("exit", "SystemExit: 0"),
+        ("generator exit", "GeneratorExit"),
+        ("recursion", "RecursionError: maximum recursion depth exceeded"),
+        ("memory", "MemoryError"),
+    ],
+)
+@pytest.mark.parametrize("at_reset", [False, True])
+def test_what_is_raised(fault, told, at_reset):
+    found = failure("Faulty", fault=fault, at_reset=at_reset)
+    assert found["message"] == told
+    assert found["step"] == (0 if at_reset else 7)
+    assert found["traceback"].splitlines()[1].startswith(f'  File "{ENVS}"')
+    assert "worker_process.py" not in found["traceback"]
+
+
+def test_a_category_that_the_space_has_not():
+    assert failure("Category")["message"] == "ValueError: observation is 3, the space has 0 to 2"
+
+
+def test_functions_that_call_each_other_for_ever():
+    from rlctl.errors import their_traceback
+
+    def one():
+        other()
+
+    def other():
+        one()
+
+    with pytest.raises(RecursionError) as caught:
+        one()
+    lines = their_traceback(caught.value).splitlines()
+    assert len(lines) == 81
+    assert lines[40].endswith(" lines left out ...")
+
+
+def told_of(content: bytes, receive=None):
+    told = []
+    read_end, write_end = os.pipe()
+    thread = threading.Thread(target=forward, args=(read_end, receive or told.append))
+    thread.start()
+    with os.fdopen(write_end, "wb") as pipe:
+        pipe.write(content)
+    thread.join(timeout=20)
+    assert not thread.is_alive()
+    return told
+
+
+def test_what_is_printed_comes_line_by_line():
+    assert told_of(b"one\ntwo\n\ntwo\ntwo\nthree") == ["one", "two", "", "two", "three"]
+
+
+def test_what_would_upset_a_terminal():
+    assert told_of(b"\x1b[2J\x07\x00 caf\xc3\xa9 \xff\tend\r\n") == ["\ufffd[2J\ufffd\ufffd caf\u00e9 \ufffd\tend"]
+    assert printable("\u202eabc") == "\ufffdabc"
+
+
+def test_a_flood_is_counted():
+    told = told_of(b"".join(b"%d\n" % number for number in range(200_000)) + b"z" * 10 * LONGEST_LINE)
+    assert told[:2] == ["0", "1"]
+    assert max(map(len, told)) <= LONGEST_LINE
+    left_out = [int(line.split()[0].strip("(").replace(",", "")) for line in told if "left out" in line]
+    # The last line comes in ten parts, all alike: one of them counts.
+    assert sum(left_out) + len(told) - len(left_out) == 200_001
+    assert len(told) < 200_000 / 100
+    assert len(told) > MOST_LINES_PER_S
+
+
+def test_nobody_to_tell():
+    def closed(_):
+        raise BrokenPipeError
+
+    told_of(b"one line\nand another\n" * 50_000, closed)

@@ -1,0 +1,136 @@
+"""Environments that go wrong in a training: what is told, what is left running, and that the run goes on after it."""
+
+import time
+
+import psutil
+import pytest
+
+from rlctl.errors import TaskError
+from rlctl.train import checkpoint, saving
+from tests.train import faulty_envs
+from tests.train.comparing import assert_same_run
+from tests.train.conftest import FAULTY as ENVS
+from tests.train.conftest import FAULTY_SEED as SEED
+from tests.train.conftest import TINY
+
+PLACE = f"in environment 1, episode seed {SEED}, step 7; "
+
+
+pytestmark = pytest.mark.usefixtures("every_boundary")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The run that nothing stops."""
+    from rlctl.train.request import TrainRequest, run_training
+
+    root = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e9)
+        return run_training(TrainRequest(f"{ENVS}:Faulty", settings={**TINY, "task": {"fault": ""}}, root=root)).run
+
+
+# The same faults without a training, and many more, are in tests/rollout/test_returned.py.
+ENDS = {
+    "raise": "RuntimeError: the gripper fell off",
+    "unprintable": "Unprintable: (its text cannot be had: ZeroDivisionError)",
+    "exit": "SystemExit: 0",
+    "nan reward": "ValueError: reward is nan",
+    "_exit": "worker 1 died while stepping (exit code 0)",
+    "segfault": "worker 1 died while stepping (SIGSEGV)",
+    "abort": "worker 1 died while stepping (SIGABRT)",
+    "out of memory": "worker 1 died while stepping (SIGKILL: the system does that when memory runs out; "
+    "fewer environments (--n-envs) need less)",
+}
+HANGS = ("stopped", "endless", "sleep")
+QUICK = ("raise", "out of memory")
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [each if each in QUICK else pytest.param(each, marks=pytest.mark.slow) for each in (*ENDS, *HANGS)],
+)
+@pytest.mark.usefixtures("no_child_left")
+def test_a_fault_is_named_and_the_run_goes_on_after_it(fail, resume, monkeypatch, whole, fault):
+    began = time.monotonic()
+    error, run = fail(fault=fault, timeout_s=3.0 if fault in HANGS else 60.0)
+    assert time.monotonic() - began < 60
+    told = ENDS.get(fault, "no answer for 3 s while stepping; if that may take so long, raise --env-timeout")
+    assert str(error).splitlines() == [
+        f"task '{ENVS}:Faulty': {told}",
+        f"{PLACE}to live it again: rlctl replay {run.episode_file(0)}",
+        f"the checkpoint of step 64 stands; go on with: rlctl train --resume {run.path}",
+    ]
+    assert error.exit_code == 3
+    assert run.status()["status"] == "failed"
+    assert [int(folder.name) for folder in run.checkpoints()][-1] == 64
+    monkeypatch.setenv("MENDED", "1")
+    resume(run)
+    assert_same_run(whole, run)
+
+
+@pytest.mark.usefixtures("no_child_left")
+def test_a_reset_that_fails_is_the_next_episodes(fail):
+    error, _ = fail(fault="raise", at_reset=True)
+    first, second, *_ = str(error).splitlines()
+    assert first.endswith("RuntimeError: the gripper fell off")
+    assert second.startswith(PLACE.replace("step 7", "step 0"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_child_left")
+def test_a_reset_that_hangs(fail):
+    error, _ = fail(fault="sleep", at_reset=True, timeout_s=3.0)
+    assert "no answer for 3 s while stepping" in str(error)
+    assert ", step 0; " in str(error)
+
+
+def test_connections_closed_by_the_environment(fail, capfd):
+    error, _ = fail(fault="closes files")
+    assert "worker 1 died while " in str(error)
+    assert "has an environment closed a file that is not its own?" in capfd.readouterr().err
+
+
+def test_an_environment_that_cannot_be_built_leaves_no_run(train, tmp_path):
+    with pytest.raises(TaskError, match=r"RuntimeError: no licence \(envs.py:"):
+        train("Unbuilt", TINY)
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.usefixtures("no_child_left")
+def test_bad_manners_change_nothing(train, whole, capfd):
+    run = train("Rude", TINY, envs=ENVS).run
+    assert_same_weights(whole, run)
+    assert ["sleep", "300.0625"] not in [process.info["cmdline"] for process in psutil.process_iter(["cmdline"])]
+    told = capfd.readouterr().err
+    assert "more lines of what environments print are left out" in told
+    assert "warning: closing environment 0: RuntimeError: closed twice" in told
+    assert "\x1b" not in told
+    assert "Traceback" not in told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("manners", faulty_envs.RUDE)
+@pytest.mark.usefixtures("no_child_left")
+def test_one_of_the_bad_manners_alone(train, whole, manners):
+    assert_same_weights(whole, train("Rude", {**TINY, "task": {"manners": manners}}, envs=ENVS).run)
+
+
+def assert_same_weights(one, other):
+    (ours, _), (theirs, _) = checkpoint.newest(one), checkpoint.newest(other)
+    different = [name for name, values in ours.tensors.items() if values.tobytes() != theirs.tensors[name].tobytes()]
+    assert different == []
+
+
+def test_observations_outside_their_space_are_counted_and_said(train, capfd):
+    run = train("Outside", {**TINY, "total_timesteps": 64}, envs=ENVS).run
+    told = capfd.readouterr().err.splitlines()
+    assert (
+        "warning: observation is outside its space: element 0 is 12.5, not -10 to 10; "
+        "such observations are counted, and taken as they are"
+    ) in told
+    assert "warning: observation comes as float64, its space says float32: cast, and counted" in told
+    # Each of two environments took 32 steps, in four episodes that began with an observation each; three had a fifth.
+    assert run.status()["observations_outside"] == 2 * 3
+    assert run.status()["observations_cast"] == 2 * (32 + 4)
+    assert "warning: observations 6 outside their space and 72 of another dtype" in told
