@@ -57,16 +57,21 @@ class TaskError(RlctlError):
 
 
 class EpisodeFailed(TaskError):
-    """An environment failed in an episode that is known: to be lived again."""
+    """An environment failed in an episode that is known: to be lived again, as `hint` says."""
 
-    def __init__(self, message: str, env: int, seed: int, step: int, *, details: str | None = None) -> None:
-        super().__init__(message, details=details)
+    def __init__(self, what: str, env: int, seed: int, step: int, *, hint: str, details: str | None = None) -> None:
+        super().__init__(f"{what}\nin environment {env}, episode seed {seed}, step {step}; {hint}", details=details)
+        self.what = what
         self.env = env
         self.seed = seed
         self.step = step
         """Number of the step that failed, from 1; 0 for the reset."""
         self.actions: Any = None
         """The actions of the episode, that of the failed step last, shape (step, ...); None if nobody knows them."""
+
+    def hinting(self, hint: str) -> EpisodeFailed:
+        """Return the same error with another hint."""
+        return EpisodeFailed(self.what, self.env, self.seed, self.step, hint=hint, details=self.details)
 
 
 class DivergedError(RlctlError):

@@ -9,6 +9,17 @@ import signal
 import subprocess
 import threading
 import time
+from collections.abc import Iterator
+
+
+@contextlib.contextmanager
+def signals_held() -> Iterator[None]:
+    """Hold back signals that ask to stop: a worker that is started meanwhile takes them when it is ready for them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def end(process: subprocess.Popen[bytes], deadline: float) -> None:

@@ -28,25 +28,26 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.rollout import goal_rewards
 from rlctl.rollout.printed import forward
-from rlctl.rollout.process_group import end
+from rlctl.rollout.process_group import end, signals_held
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
 from rlctl.run.env_info import EnvInfo
 
 Observations = NDArray[Any] | dict[str, NDArray[Any]]
 
 # Started this way a worker finds what its parent finds, and the caller's script is not run again.
-# Ctrl-C, a closed terminal and a service's stop reach the whole group, and the main process decides: ignored before
-# anything slow is imported. What the environments start has its own say in the latter two.
+# Who stops a service signals all of its processes, and the main process decides: ignored before anything slow is
+# imported, and held back until then. What the environments start has its own say.
 _BOOTSTRAP = (
-    "import json, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); "
-    "[signal.signal(number, lambda *_: None) for number in (signal.SIGTERM, signal.SIGHUP)]; "
+    "import signal; numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP); "
+    "[signal.signal(number, lambda *_: None) for number in numbers]; "
+    "signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers); "
+    "import json, sys; "
     "sys.path[:] = json.loads(sys.argv[3])['sys_path']; "
     "from rlctl.rollout.worker_process import main; main()"
 )
 
 # A PyBullet world is one block of 28 MB, which huge pages fill in half the time. Other C libraries ignore this.
 _TUNED = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0
@@ -131,7 +132,7 @@ class Workers:
             "MKL_NUM_THREADS": "1",
         }
         passed = (theirs.fileno(), self._memory, lifeline)
-        with theirs, open(lifeline, "rb"):
+        with theirs, open(lifeline, "rb"), signals_held():
             process = subprocess.Popen(
                 [sys.executable, "-c", _BOOTSTRAP, *map(str, passed[:2]), json.dumps(job), str(lifeline)],
                 pass_fds=passed,
@@ -306,17 +307,16 @@ class Workers:
         if kind is TaskError and self._spec.task not in message.partition("\n")[0]:
             message = f"task {self._spec.task!r}: {message}"
         if place is not None:
-            message += self._told(*place)
-        if place is not None and kind is TaskError:
-            return EpisodeFailed(message, *place, details=details)
+            failed = EpisodeFailed(message, *place, hint=self._hint, details=details)
+            if kind is TaskError:
+                return failed
+            message = str(failed)
         result: RlctlError = kind(message, details=details)
         return result
 
-    def _told(self, env: int, seed: int, step: int) -> str:
-        return (
-            f"\nin environment {env}, episode seed {seed}, step {step}; "
-            f"to see it alone: rlctl check-env {self._spec.task}"
-        )
+    @property
+    def _hint(self) -> str:
+        return f"to see it alone: rlctl check-env {self._spec.task}"
 
     def _stopped(self, worker: int, message: str) -> TaskError:
         """Name the episode a worker was in when it stopped answering, or the environments it ran."""
@@ -324,7 +324,7 @@ class Workers:
         if self._ready:
             for env, (seed, step) in enumerate(self._arrays.inside[low:high].tolist(), start=low):
                 if step >= 0:
-                    return EpisodeFailed(message + self._told(env, seed, step), env, seed, step)
+                    return EpisodeFailed(message, env, seed, step, hint=self._hint)
         return TaskError(f"{message}\nit ran the environments {low} to {high - 1}")
 
     def _death(self, worker: int, doing: str) -> TaskError:

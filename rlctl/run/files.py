@@ -192,11 +192,7 @@ def digest(content: bytes) -> str:
 
 def check_digest(path: Path, expected: str) -> None:
     """Raise `ArtifactError` if a file is not there, or not what it was when `expected` was its digest."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ArtifactError(f"{path}: {error.strerror or error}") from None
-    if digest(content) != expected:
+    if digest(untrusted.read_bytes(path)) != expected:
         raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
 
 

@@ -24,7 +24,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from rlctl.errors import ArtifactError
-from rlctl.run import files
+from rlctl.run import files, untrusted
 from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import PolicyInfo, policy_bytes, versions
 from rlctl.train import replay_segments, snapshot
@@ -124,7 +124,7 @@ class Checkpoints:
         return {
             **versions(),
             "machine": platform.machine(),
-            "processor": torch.backends.cpu.get_cpu_capability(),
+            "processor": f"{_maker()} {torch.backends.cpu.get_cpu_capability()}",
             "threads": str(torch.get_num_threads()),
             "device": str(self._model.device),
         }
@@ -179,6 +179,7 @@ def read(folder: Path) -> Checkpoint:
     """Read a checkpoint and check all of it; raises `ArtifactError` if something is missing, damaged or not ours."""
     state = _read_state(folder)
     for name in (_POLICY, _TENSORS):
+        untrusted.check_safetensors(folder / name)
         files.check_digest(folder / name, state.sha256.get(name, ""))
     replay_segments.check(folder.parent / "replay", state.segments)
     try:
@@ -223,6 +224,16 @@ def _named_segments(run: RunDirectory) -> list[Segment]:
         except ArtifactError:  # a damaged checkpoint needs no segments any more
             continue
     return named
+
+
+def _maker() -> str:
+    """Return who made the processor, where the system says it: libraries choose their code by that too."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or "unknown"
+    found = (line.partition(":")[2].strip() for line in lines if line.startswith(("vendor_id", "CPU implementer")))
+    return next(found, "unknown")
 
 
 def differences(before: dict[str, str], now: dict[str, str]) -> list[str]:

@@ -14,23 +14,22 @@ from rlctl.train.vec_env import WorkerVecEnv
 
 def explained(error: TaskError, run: RunDirectory, env: WorkerVecEnv, saver: Saver, keeper: EpisodeKeeper) -> TaskError:
     """Keep the actions of the training episode that failed, and return the error with what to do next."""
-    told = [str(error)]
-    if saver.saved_step is not None:
-        told.append(f"the checkpoint of step {saver.saved_step:,} stands; go on with: rlctl train --resume {run.path}")
     if isinstance(error, EpisodeFailed):
         lived = env.history.of(error.env)
         # A reset that fails is that of the next episode: none of the actions is its own.
         error.actions = None if lived is None else lived[: error.step]
-        told += keep(error, env.workers.spec, saver, keeper)
+    told = [str(kept(error, env.workers.spec, saver, keeper))]
+    if saver.saved_step is not None:
+        told.append(f"the checkpoint of step {saver.saved_step:,} stands; go on with: rlctl train --resume {run.path}")
     return TaskError("\n".join(told), details=error.details)
 
 
-def keep(
+def kept(
     error: RlctlError, spec: EnvSpec, saver: Saver, keeper: EpisodeKeeper, evaluated_at: int | None = None
-) -> list[str]:
-    """Write the actions of an episode that failed, if they are known; return what to tell of it."""
+) -> RlctlError:
+    """Write the actions of an episode that failed, if they are known; return the error, which says where then."""
     if not isinstance(error, EpisodeFailed) or error.actions is None:
-        return []
+        return error
     files: list[Path] = []
     saver.attempt("failed episode", lambda: files.append(keeper.keep_failed(spec, error, evaluated_at)))
-    return [f"to live its actions again: rlctl replay {file}" for file in files]
+    return error.hinting(f"to live it again: rlctl replay {files[0]}") if files else error

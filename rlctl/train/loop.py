@@ -244,9 +244,8 @@ class TrainingLoop(BaseCallback):
         progress, steps = self.progress, self.model.num_timesteps
         progress.failed_evaluations += 1
         progress.first_failure = progress.first_failure or f"at step {steps:,}: {error}"
-        told = [f"warning: evaluation at step {steps:,} failed, training goes on: {error}"]
-        told += faults.keep(error, self.curriculum.goal_spec, self.saver, self.episodes, steps)
-        self.display.message("\n".join(told))
+        error = faults.kept(error, self.curriculum.goal_spec, self.saver, self.episodes, steps)
+        self.display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
 
     def _take_note(self, episodes: list[Episode], packed: Packed) -> None:
         progress, steps = self.progress, self.model.num_timesteps

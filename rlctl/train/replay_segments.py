@@ -22,7 +22,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from rlctl.errors import ArtifactError
-from rlctl.run import files
+from rlctl.run import files, untrusted
 
 Tensors = dict[str, NDArray[Any]]
 
@@ -118,6 +118,7 @@ class ReplaySegments:
 def check(folder: Path, segments: Iterable[Segment]) -> None:
     """Raise `ArtifactError` if a segment is not there, or not as it was written."""
     for segment in segments:
+        untrusted.check_safetensors(folder / segment.name)
         files.check_digest(folder / segment.name, segment.sha256)
 
 

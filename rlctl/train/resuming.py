@@ -39,12 +39,6 @@ class Start:
         """Stage of the curriculum, from 1."""
         return (self.checkpoint.progress.stage or 1) if self.checkpoint else 1
 
-    def nothing_to_do(self) -> bool:
-        """Whether the checkpoint is the end of the training."""
-        if self.checkpoint is None or not self.checkpoint.progress.done:
-            return False
-        return self.checkpoint.state.step >= self.recipe.total_timesteps or self.recipe.stop_success is not None
-
 
 def resumed(word: str | None, settings: Mapping[str, Any], root: Path, *, force: bool) -> Start:
     """Find a run, lock it, and read its newest good checkpoint; nothing is changed yet.

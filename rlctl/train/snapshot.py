@@ -56,8 +56,9 @@ def put_back(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> N
         _put_back_variables(model, tensors)
         _put_back_normalizer(model, tensors)
         _put_back_rollout(model, tensors, plain["axes"])
-        for name, value in plain["counters"].items():
-            setattr(model, name, value)
+        for name in _COUNTERS:  # no other: a file does not choose what is set
+            if name in plain["counters"]:
+                setattr(model, name, plain["counters"][name])
         _put_back_log(model, plain)
         put_back_randomness(model, tensors, plain)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:

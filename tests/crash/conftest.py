@@ -9,7 +9,7 @@ from tests.crash.trials import ARGUMENTS, ForkServer
 
 pytest.register_assert_rewrite("tests.crash.contract", "tests.train.comparing")
 
-PARTS = 17
+PARTS = 61
 """A test that repeats itself is in so many parts, of which the first runs with all other tests."""
 
 

@@ -13,9 +13,10 @@ _NEED_ROOM = ("open", "write", "fsync", "ftruncate", "makedirs")
 class FaultyOs:
     """Hands everything on to `os`, and fails at the operation number `at`.
 
-    `fault` is `kill`, `half` (killed after half of a write, or after the operation), `short` (half of a write is
-    taken), or the name of an error such as `ENOSPC`; None lets everything pass. `lasting` errors go on: a full disk
-    then still removes and renames, and other broken disks do nothing any more.
+    `fault` is `kill`, `half` (killed after half of a write, or after the operation), `power` (killed, and what was
+    written and not flushed to the disk is lost), `short` (half of a write is taken), or the name of an error such as
+    `ENOSPC`; None lets everything pass. `lasting` errors go on: a full disk then still removes and renames, and other
+    broken disks do nothing any more.
     """
 
     def __init__(self, log, fault=None, at=0, lasting=False):
@@ -24,6 +25,8 @@ class FaultyOs:
         self._fault = fault
         self._at = at
         self._lasting = lasting
+        self._unsynced = {}
+        """inode -> descriptor of ours, and how much of the file is on the disk for sure."""
 
     def __getattr__(self, name):
         original = getattr(os, name)
@@ -33,15 +36,29 @@ class FaultyOs:
         def operation(*arguments, **options):
             self.count += 1
             self._log(f"operation {self.count} {name} {arguments[0]}")
+            self._take_note(name, *arguments)
             return self._operate(name, original, arguments, options)
 
         return operation
+
+    def _take_note(self, name, first, *_):
+        if name not in ("write", "fsync"):
+            return
+        told = os.fstat(first)
+        if name == "fsync" and not self._hit(name) and told.st_ino in self._unsynced:
+            os.close(self._unsynced.pop(told.st_ino)[0])
+        if name == "write" and told.st_ino not in self._unsynced:
+            self._unsynced[told.st_ino] = (os.dup(first), told.st_size)
 
     def _operate(self, name, original, arguments, options):
         if not self._hit(name):
             return original(*arguments, **options)
         self._log(f"fault {name} {arguments[0]}")
         if self._fault == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self._fault == "power":
+            for descriptor, size in self._unsynced.values():
+                os.ftruncate(descriptor, size)
             os.kill(os.getpid(), signal.SIGKILL)
         if self._fault == "half":
             self._half(name, original, arguments, options)

@@ -3,6 +3,8 @@
 import itertools
 import os
 
+import psutil
+
 import rlctl.rollout.workers
 import rlctl.run.files
 import rlctl.train.evaluation
@@ -28,15 +30,20 @@ PHASES = {
 """Phase -> the function that is in it, and which call of it."""
 
 
-def send(number, phase, group=False, again=False):
-    """Send a signal at the start of a phase, to this process or to all of its group, and once more with `again`."""
+def send(number, phase, everybody=False, again=False):
+    """Send a signal at the start of a phase, to this process or to all below it too, and once more with `again`.
+
+    To all is what a service manager does, as the machine or the job of a cluster ends.
+    """
     owner, name, call = PHASES[phase]
     original, counter = getattr(owner, name), itertools.count(1)
 
     def called(*arguments, **options):
         if next(counter) == call:
             for _ in range(2 if again else 1):
-                os.killpg(0, number) if group else os.kill(os.getpid(), number)
+                for each in psutil.Process().children(recursive=True) if everybody else ():
+                    each.send_signal(number)
+                os.kill(os.getpid(), number)
         return original(*arguments, **options)
 
     setattr(owner, name, called)

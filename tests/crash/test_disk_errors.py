@@ -9,9 +9,10 @@ from tests.crash.trials import ARGUMENTS, only_run
 ERRORS = {"ENOSPC": "No space left on device", "EIO": "Input/output error", "EACCES": "Permission denied"}
 
 
-def errors(part, operations):
-    """Return the number of each operation, and an error, that a part tries."""
-    tried = [(at, error) for at in range(1, operations + 2) for error in ERRORS]
+def errors(part, operations, each=3):
+    """Return the number of each operation, and an error, that a part tries: `each` of the errors by turns."""
+    names = list(ERRORS)
+    tried = [(at, names[(at + turn) % 3]) for at in range(1, operations + 2) for turn in range(each)]
     return tried[part::PARTS]
 
 
@@ -48,7 +49,7 @@ def test_short_writes_cost_nothing(server, whole, folders, name, part):
 def test_a_disk_that_has_failed_for_good(server, whole, folders, name, part):
     before = whole(name)
     final = before.announced
-    for at, error in errors(part, before.operations):
+    for at, error in errors(part, before.operations, each=1):
         disk = {"fault": error, "at": at, "lasting": True}
         ended = server.run(ARGUMENTS[name], next(folders), disk=disk)
         assert_quiet(ended)

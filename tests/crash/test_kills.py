@@ -1,4 +1,4 @@
-"""Killed at every operation on the disk, before it and in the middle of it; and killed again while resuming."""
+"""Killed at every operation on the disk, before it, in the middle of it, by a power cut; and again while resuming."""
 
 import signal
 
@@ -15,7 +15,7 @@ def every(part, operations):
 
 
 @parts
-@pytest.mark.parametrize("fault", ["kill", "half"])
+@pytest.mark.parametrize("fault", ["kill", "half", "power"])
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_killed_at_an_operation(server, whole, folders, name, fault, part):
     before = whole(name)

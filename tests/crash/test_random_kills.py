@@ -26,7 +26,9 @@ def test_killed_at_any_moment(server, whole, folders, part):
         assert_nothing_lost(server, ARGUMENTS[name], ended, only_run(before.folder))
 
 
-@pytest.mark.parametrize("how", ["asleep", "busy", "in a library"])
+@pytest.mark.parametrize(
+    "how", [*(pytest.param(how, marks=pytest.mark.crash) for how in ("asleep", "busy")), "in a library"]
+)
 def test_killed_while_the_workers_are_stuck(server, tmp_path, how):
     (tmp_path / "stuck").write_text(how)
     ended = server.run(STUCK, tmp_path, real_workers=True, cores=2, send=[["stuck.log", signal.SIGKILL]])

@@ -76,7 +76,8 @@ def test_a_worker_that_is_killed_while_idle(spec, start):
     with pytest.raises(TaskError) as caught:
         workers.step()
     assert str(caught.value).startswith(f"task '{ENVS}:Walk': worker 1 died while ")
-    assert str(caught.value).endswith("need less)\nit ran the environments 2 to 3")
+    assert "(SIGKILL: the system does that when memory runs out" in str(caught.value)
+    assert str(caught.value).endswith("\nit ran the environments 2 to 3")
 
 
 def test_an_environment_that_cannot_be_built(spec, start):
@@ -128,11 +129,15 @@ def test_workers_end_with_a_killed_parent(first_seed):
     assert alive == []
 
 
-def test_ctrl_c_is_for_the_main_process(spec, start):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("built", [True, False])
+def test_to_stop_is_for_the_main_process(spec, start, number, built):
     workers = start(spec("Walk"), 2, n_workers=2)
-    workers.reset({0: 0, 1: 1})
+    if built:
+        workers.reset({0: 0, 1: 1})
     for process in workers._processes:
-        os.kill(process.pid, signal.SIGINT)
+        os.kill(process.pid, number)
+    workers.reset({0: 0, 1: 1})
     workers.arrays.action[:] = 0.0
     for _ in range(3):
         workers.step()

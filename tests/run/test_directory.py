@@ -11,6 +11,7 @@ import pytest
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory, find_policy, find_run
+from rlctl.run.recipe import Recipe
 
 
 @pytest.fixture
@@ -37,6 +38,17 @@ def error(kind, call, *arguments):
     with pytest.raises(kind) as caught:
         call(*arguments)
     return str(caught.value)
+
+
+def test_a_recipe_that_was_edited_is_refused(make_run):
+    run = make_run("reach", "2026-01-01_00-00-00_s0")
+    run.write_recipe(Recipe(algo="ppo", total_timesteps=100, n_envs=4, seed=3))
+    assert run.recipe().seed == 3
+    run.recipe_file.write_text(run.recipe_file.read_text().replace("seed: 3", "seed: 4"))
+    with pytest.raises(
+        ArtifactError, match=r"recipe.yaml: not as the training wrote it: edited, or damaged. For a new"
+    ):
+        run.recipe()
 
 
 def test_a_new_run(root):

@@ -155,3 +155,20 @@ def test_a_tree_is_removed(tmp_path):
     files.remove_tree(tmp_path / "a")
     files.remove_tree(tmp_path / "a")
     assert os.listdir(tmp_path) == []
+
+
+def test_a_sealed_file_tells_whether_it_was_changed(tmp_path):
+    path = tmp_path / "recipe.yaml"
+    files.write_sealed(path, "seed: 0\n")
+    assert path.read_text().splitlines()[0] == "seed: 0"
+    assert files.is_as_sealed(path)
+    sealed = path.read_bytes()
+    # Each single bit of it, and each length.
+    for bit in range(8 * len(sealed)):
+        flipped = bytearray(sealed)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        assert not files.is_as_sealed(path)
+    for length in range(len(sealed)):
+        path.write_bytes(sealed[:length])
+        assert not files.is_as_sealed(path)

@@ -84,3 +84,15 @@ def test_a_file_that_was_removed_begins_anew(table):
     table.path.unlink()
     add(table, {"steps": 128})
     assert table.path.read_text() == "steps\n128\n"
+
+
+def test_the_digest_is_of_the_rows_and_nothing_after_them(table):
+    assert table.digest() == files.digest(b"")
+    add(table, {"steps": 64})
+    before = table.digest()
+    assert before == files.digest(b"steps\n64\n")
+    with table.path.open("a") as file:
+        file.write("12,half a row")
+    assert table.digest() == before
+    table.path.write_text("steps\n65\n")
+    assert table.digest() != before

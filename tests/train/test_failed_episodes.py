@@ -35,16 +35,16 @@ QUICK = ("plain", "discrete", "reset")
 def test_it_fails_again_as_it_did(fail, rlctl, case):
     env, settings, parameters = CASES[case]
     error, run = fail(env, {**TINY, **settings}, **{"fault": "raise", **parameters})
-    first, place, *_, hint = str(error).splitlines()
+    first, place, *_ = str(error).splitlines()
     file = run.episode_file(0)
-    assert hint == f"to live its actions again: rlctl replay {file}"
+    assert place.endswith(f"; to live it again: rlctl replay {file}")
     episode = load_episode(file)
     assert episode.info.failure == first
     assert episode.info.seed == FAULTY_SEED
     assert len(episode.actions) == (0 if case == "reset" else 7)
     again, place_again = lived_again(file).splitlines()
     assert again.replace("worker 0", "worker 1") == first
-    assert place_again.replace("environment 0", "environment 1") == place
+    assert place_again.replace("environment 0", "environment 1").partition(";")[0] == place.partition(";")[0]
     with pytest.raises(UsageError, match=r"the episode failed \(task .*\), so there is nothing to compare"):
         run_replay(ReplayRequest(None, verify=file))
 
@@ -60,8 +60,8 @@ def test_the_command_that_the_error_names(rlctl, tmp_path):
     (begin,) = (number for number, line in enumerate(told) if line.startswith("Traceback"))
     error = next(number for number, line in enumerate(told) if line.startswith("error: "))
     assert not [line for line in told[begin:error] if "/rlctl/" in line]
-    assert len(told) - error == 4
-    command = told[-1].partition(": rlctl ")[2].split()
+    assert len(told) - error == 3
+    command = told[error + 1].partition(": rlctl ")[2].split()
     replayed = rlctl(*command)
     assert replayed.returncode == 3
     assert "RuntimeError: the gripper fell off" in replayed.stderr

@@ -13,7 +13,7 @@ from tests.train.conftest import FAULTY as ENVS
 from tests.train.conftest import FAULTY_SEED as SEED
 from tests.train.conftest import TINY
 
-PLACE = f"in environment 1, episode seed {SEED}, step 7; to see it alone: rlctl check-env {ENVS}:"
+PLACE = f"in environment 1, episode seed {SEED}, step 7; "
 
 
 pytestmark = pytest.mark.usefixtures("every_boundary")
@@ -58,9 +58,8 @@ def test_a_fault_is_named_and_the_run_goes_on_after_it(fail, resume, monkeypatch
     told = ENDS.get(fault, "no answer for 3 s while stepping; if that may take so long, raise --env-timeout")
     assert str(error).splitlines() == [
         f"task '{ENVS}:Faulty': {told}",
-        f"{PLACE}Faulty",
+        f"{PLACE}to live it again: rlctl replay {run.episode_file(0)}",
         f"the checkpoint of step 64 stands; go on with: rlctl train --resume {run.path}",
-        f"to live its actions again: rlctl replay {run.episode_file(0)}",
     ]
     assert error.exit_code == 3
     assert run.status()["status"] == "failed"
@@ -75,7 +74,7 @@ def test_a_reset_that_fails_is_the_next_episodes(fail):
     error, _ = fail(fault="raise", at_reset=True)
     first, second, *_ = str(error).splitlines()
     assert first.endswith("RuntimeError: the gripper fell off")
-    assert second == PLACE.replace("step 7", "step 0") + "Faulty"
+    assert second.startswith(PLACE.replace("step 7", "step 0"))
 
 
 @pytest.mark.slow
