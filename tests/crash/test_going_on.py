@@ -1,9 +1,16 @@
 """Runs that are gone on with, for longer, or when nothing is left to do."""
 
+import dataclasses
+
 import pytest
 
+from rlctl.rollout.seeds import EpisodeAddress, Stream
 from tests.crash.contract import assert_quiet, assert_same_end
 from tests.crash.trials import ARGUMENTS, only_run, resume
+from tests.train.conftest import ENVS
+
+SEED = EpisodeAddress(0, Stream.TRAIN, 1, 3).seed
+"""Of the fourth episode of the second environment: its seventh step is the 37th, in the fifth rollout of eight."""
 
 SDE = [*ARGUMENTS["ppo, kept"], "--set", "algo_kwargs.use_sde=true"]
 # As long as one evaluation is the end of the shorter run: it would have one more otherwise.
@@ -55,3 +62,38 @@ def test_killed_before_its_first_checkpoint(server, whole, folders):
     assert again.code == 0, again.stderr
     assert "no checkpoint yet: the training begins at its first step" in again.stderr
     assert_same_end(run, only_run(before.folder))
+
+
+MENDABLE = f"""
+import sys; sys.path.append({str(ENVS.parent)!r})
+import envs
+class Line(envs.Line):
+    broken = True
+    def step(self, action):
+        if self.broken and self.np_random_seed == {SEED} and self.steps == 6:
+            raise RuntimeError("the gripper fell off")
+        return super().step(action)
+"""
+
+
+def test_an_environment_that_is_mended(server, folders):
+    folder = next(folders)
+    folder.mkdir()
+    file = folder / "mine.py"
+    file.write_text(MENDABLE)
+    arguments = ["train", f"{file}:Line", *ARGUMENTS["ppo, kept"][2:]]
+    ended = server.run(arguments, folder)
+    assert ended.code == 3
+    assert_quiet(dataclasses.replace(ended, stderr=ended.stderr.replace("Traceback", "")))
+    run = only_run(folder)
+    assert [int(each.name) for each in run.checkpoints()] == [32, 48, 64]
+    file.write_text(MENDABLE.replace("broken = True", "broken = False"))
+    refused = server.run(resume(run), folder)
+    assert refused.code == 2
+    assert "mine.py is not what it was when the run began. What was learnt may not fit any more; " in refused.stderr
+    forced = server.run([*resume(run), "--force"], folder)
+    assert forced.code == 0, forced.stderr
+    assert "going on at step 64, not bit-exact: " in forced.stderr
+    whole = server.run(arguments, next(folders))
+    assert whole.code == 0, whole.stderr
+    assert_same_end(run, only_run(whole.folder))  # what was mended had not happened yet

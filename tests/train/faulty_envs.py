@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import locale
 import os
 import signal
 import subprocess
@@ -242,6 +243,7 @@ RUDE = {
     "starts threads": wait_for_ever,
     "starts a process": lambda: subprocess.Popen(["sleep", "300.0625"]),
     "sets signal handlers": handlers,
+    "changes the locale": lambda: locale.setlocale(locale.LC_ALL, "C"),
     "changes numpy's errors": lambda: np.seterr(all="raise"),
     "goes elsewhere": elsewhere,
     "closes stdout": close_stdout,
