@@ -119,7 +119,7 @@ def test_a_broken_plugin_harms_only_itself(rlctl, importable, tmp_path):
         env={**os.environ, "PYTHONPATH": str(importable)},
     )
     assert result.stdout.splitlines() == [
-        "raises TaskError task 'raises': import failed: RuntimeError: boom",
+        "raises TaskError task 'raises': import failed: RuntimeError: boom and more (raises.py:2)",
         "leaves TaskError task 'leaves': import failed: SystemExit: 0 (leaves.py:1)",
         "absent TaskError task 'absent' of some-robots 1.2: module 'some_robots.absent' is missing",
         "hello from a plugin",

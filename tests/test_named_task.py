@@ -119,7 +119,7 @@ def test_a_run_that_names_a_function_runs_nothing(run, tmp_path):
     mark = tmp_path / "ran"
     run.write_status({"task": "os:system"})
     recipe = run.recipe().model_copy(update={"task": {"command": f"touch {mark}"}, "total_timesteps": 128})
-    files.write_text(run.recipe_file, recipe.to_yaml())
+    files.write_sealed(run.recipe_file, recipe.to_yaml())
     with pytest.raises(ArtifactError, match=r"^run.json names 'os:system' as its task"):
         run_training(TrainRequest(None, resume=str(run.path)))
     assert not mark.exists()

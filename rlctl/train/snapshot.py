@@ -256,8 +256,9 @@ def _put_back_rollout(model: BaseAlgorithm, tensors: Tensors, axes: dict[str, li
     model._last_episode_starts = tensors["rollout/starts"].copy()
     for name in _OBSERVED:
         prefix = f"rollout/{name}/"
+        # In the order of `axes`: a file of tensors has them by name, a dict observation as its space has them.
         parts = {
-            key[len(prefix) :]: _laid_out(value, axes[key]) for key, value in tensors.items() if key.startswith(prefix)
+            key[len(prefix) :]: _laid_out(tensors[key], order) for key, order in axes.items() if key.startswith(prefix)
         }
         setattr(model, name, parts.get("", parts or None))
     if getattr(model, "_last_lstm_states", None) is not None:

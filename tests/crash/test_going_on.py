@@ -7,7 +7,6 @@ import pytest
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from tests.crash.contract import assert_quiet, assert_same_end
 from tests.crash.trials import ARGUMENTS, only_run, resume
-from tests.train.conftest import ENVS
 
 SEED = EpisodeAddress(0, Stream.TRAIN, 1, 3).seed
 """Of the fourth episode of the second environment: its seventh step is the 37th, in the fifth rollout of eight."""
@@ -65,8 +64,7 @@ def test_killed_before_its_first_checkpoint(server, whole, folders):
 
 
 MENDABLE = f"""
-import sys; sys.path.append({str(ENVS.parent)!r})
-import envs
+from tests.train import envs
 class Line(envs.Line):
     broken = True
     def step(self, action):

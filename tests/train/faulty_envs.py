@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 from gymnasium import spaces
 
-sys.path.append(str(Path(__file__).parent))
-from envs import Line
+from tests.train.envs import Line
 
 STEP = 7
 

@@ -16,9 +16,8 @@ from tests.train.conftest import ENVS, TINY
 
 pytestmark = pytest.mark.usefixtures("every_boundary")
 
-PLUGIN = f"""
-import sys; sys.path.append({str(ENVS.parent)!r})
-from envs import Staged
+PLUGIN = """
+from tests.train.envs import Staged
 class Mine(Staged):
     size = 1
     def __init__(self):
@@ -186,7 +185,7 @@ def test_an_environment_that_fails_when_lived_again_begins_new_episodes(killed, 
         "fragile.py",
         f"""
         import os, sys; sys.path.append({str(ENVS.parent)!r})
-        from envs import Line
+        from tests.train.envs import Line
         class Fragile(Line):
             def step(self, action):
                 if os.path.exists({str(tmp_path / "fragile")!r}) and self.steps == 1:
@@ -213,7 +212,7 @@ def meddler(write_module):
         f"""
         import os, signal, sys; sys.path.append({str(ENVS.parent)!r})
         import numpy as np
-        from envs import Line
+        from tests.train.envs import Line
         os.chdir("/")
         os.umask(0o777)
         np.seterr(all="raise")

@@ -12,6 +12,7 @@ from rlctl.rollout.workers import Workers
 from rlctl.run import recipe as recipes
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.policy import load_policy
+from rlctl.train import checkpoint
 from rlctl.train.algorithms import build_model
 from rlctl.train.curriculum import begin_next_episodes
 from rlctl.train.hindsight import replay_arguments
@@ -150,8 +151,8 @@ def goals(max_steps=None) -> EnvInfo:
 def test_a_task_that_computes_rewards(tmp_path):
     settings = {**SMALL_HER, "n_envs": 2, "total_timesteps": 110, "algo_kwargs": {"batch_size": 16}, "task": {}}
     run = run_training(TrainRequest(f"{tasks.__file__}:Place", settings=settings, root=tmp_path)).run
-    state = json.loads((run.checkpoints()[-1] / "state.json").read_text())
-    assert state["counters"]["_n_updates"] == 5 * 2  # after 102, 104, ..., 110 steps
+    found, _ = checkpoint.newest(run)
+    assert found.state.model["counters"]["_n_updates"] == 5 * 2  # after 102, 104, ..., 110 steps
     assert load_policy(run.best_policy).info.env.has_compute_reward
 
 

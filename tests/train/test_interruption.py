@@ -125,7 +125,10 @@ def test_a_full_disk_costs_warnings_and_an_exit_code(small_disk):
     assert "warning: not saved: " in stderr
     assert "No space left on device" in stderr
     assert "the training is done, but could not be saved" in stderr.strip().splitlines()[-1]
-    assert not list(small_disk.glob("runs/*/*/checkpoints/[0-9]*"))
+    filler.unlink()
+    done = subprocess.run([*COMMAND, "--resume", "latest"], cwd=small_disk, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "as if it had never stopped" in done.stderr
     assert "Traceback" not in stderr
 
 
