@@ -121,5 +121,5 @@ def test_a_run_that_names_a_function_runs_nothing(run, tmp_path):
     recipe = run.recipe().model_copy(update={"task": {"command": f"touch {mark}"}, "total_timesteps": 128})
     files.write_sealed(run.recipe_file, recipe.to_yaml())
     with pytest.raises(ArtifactError, match=r"^run.json names 'os:system' as its task"):
-        run_training(TrainRequest(None, resume=str(run.path)))
+        run_training(TrainRequest(None, resume=str(run.path), force=True))
     assert not mark.exists()

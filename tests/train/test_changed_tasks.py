@@ -254,5 +254,5 @@ def test_an_import_does_not_take_signals_from_a_training(train, meddler, monkeyp
 def test_a_task_that_cannot_be_imported_any_more(plugin, resume):
     folder, run = plugin
     change(folder, "class Mine", "raise SystemExit(0)\nclass Mine")
-    with pytest.raises(TaskError, match=r"task 'mine': import failed: SystemExit: 0 \(mine_plugin.py:4\)"):
+    with pytest.raises(TaskError, match=r"task 'mine': import failed: SystemExit: 0 \(mine_plugin.py:3\)"):
         resume(run, force=True)
