@@ -118,8 +118,8 @@ def test_an_episode_that_names_a_function_runs_nothing(tmp_path):
 def test_a_run_that_names_a_function_runs_nothing(run, tmp_path):
     mark = tmp_path / "ran"
     run.write_status({"task": "os:system"})
-    recipe = run.recipe().model_copy(update={"task": {"command": f"touch {mark}"}, "total_timesteps": 128})
+    recipe = run.recipe().model_copy(update={"task": {"command": f"touch {mark}"}})
     files.write_sealed(run.recipe_file, recipe.to_yaml())
     with pytest.raises(ArtifactError, match=r"^run.json names 'os:system' as its task"):
-        run_training(TrainRequest(None, resume=str(run.path), force=True))
+        run_training(TrainRequest(None, resume=str(run.path), settings={"total_timesteps": 256}, force=True))
     assert not mark.exists()
