@@ -19,7 +19,7 @@ def explained(error: TaskError, run: RunDirectory, env: WorkerVecEnv, saver: Sav
         # A reset that fails is that of the next episode: none of the actions is its own.
         error.actions = None if lived is None else lived[: error.step]
     told = [str(kept(error, env.workers.spec, saver, keeper))]
-    if saver.saved_step is not None:
+    if saver.saved_step:  # at step 0 there is nothing to keep
         told.append(f"the checkpoint of step {saver.saved_step:,} stands; go on with: rlctl train --resume {run.path}")
     return TaskError("\n".join(told), details=error.details)
 

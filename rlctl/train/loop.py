@@ -99,6 +99,9 @@ class TrainingLoop(BaseCallback):
             snapshot.put_back_randomness(self.model, resumed.tensors, resumed.state.model)
         if self.model.num_timesteps > 0:
             self.boundary()
+        elif self.saver.saved_step is None:
+            # The first update may be minutes away: better to know now what cannot be saved.
+            self.save_checkpoint()
 
     def boundary(self) -> None:
         """Do everything that is due after an update, and that a checkpoint resumed from does not say was done."""

@@ -46,7 +46,7 @@ class Saver:
         self._checkpoints = checkpoints
         self._warn = warn
         self._write_again = write_again
-        self._next_checkpoint = time.monotonic()  # the first boundary saves one
+        self._next_checkpoint = time.monotonic()
         self._last_bytes = 0
         self._reminded = 0.0
         self._best = _policy_of(run)

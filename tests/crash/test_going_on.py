@@ -52,7 +52,7 @@ def test_a_finished_run_has_nothing_to_do(server, folders, more):
 
 def test_killed_before_its_first_checkpoint(server, whole, folders):
     before = whole("ppo")
-    first = next(number for number, line in enumerate(before.log) if "000000016" in line)
+    first = next(number for number, line in enumerate(before.log) if "000000000" in line)
     at = int(before.log[first].split()[1])
     ended = server.run(ARGUMENTS["ppo"], next(folders), disk={"fault": "kill", "at": at})
     run = only_run(ended.folder)

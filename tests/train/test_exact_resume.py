@@ -5,7 +5,6 @@ import itertools
 import pytest
 
 from rlctl.run import recipe as recipes
-from rlctl.train import saving
 from rlctl.train.vec_env import WorkerVecEnv
 from tests.train.comparing import Killed, assert_same_run
 from tests.train.conftest import SMALL
@@ -16,8 +15,10 @@ OFF_POLICY = {"learning_starts": 40, "batch_size": 16, "buffer_size": 200}
 
 
 def settings(algo, **changes):
-    kwargs = ON_POLICY.get(algo, OFF_POLICY)
-    return recipes.merge({**SMALL, "algo": algo, "algo_kwargs": kwargs}, changes)
+    if algo in ON_POLICY:
+        return recipes.merge({**SMALL, "algo": algo, "algo_kwargs": ON_POLICY[algo]}, changes)
+    network = {"net_arch": [16]}
+    return recipes.merge({**SMALL, "algo": algo, "algo_kwargs": OFF_POLICY, "policy_kwargs": network}, changes)
 
 
 SDE = {"algo_kwargs": {"use_sde": True}}
@@ -39,7 +40,7 @@ CASES = {
     "ppo, on reach": ("reach", settings("ppo")),
     "a2c": ("Line", settings("a2c")),
     "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
-    "sac": ("Line", settings("sac")),
+    "sac": ("Line", settings("sac", policy_kwargs={"net_arch": [256, 256]})),
     "sac with gSDE": ("Line", settings("sac", **SDE)),
     "sac, normalised": ("Line", settings("sac", **NORMALIZED)),
     "sac, dict": ("DictObservation", settings("sac", **NORMALIZED)),
@@ -55,12 +56,6 @@ CASES = {
     "tqc": ("Line", settings("tqc")),
     "crossq": ("Line", settings("crossq")),
 }
-
-
-@pytest.fixture
-def every_boundary(monkeypatch):
-    """Write a checkpoint at every boundary, whatever it costs."""
-    monkeypatch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e9)
 
 
 @pytest.fixture
@@ -87,15 +82,17 @@ def kill_after(monkeypatch):
 def test_killed_and_resumed(train, resume, kill_after, case):
     env, given = CASES[case]
     whole = train(env, given).run
-    undo = kill_after(37)
+    undo = kill_after(0)  # in the first step
     with pytest.raises(Killed):
         train(env, given)
     undo()
     run = newest_other_than(whole)
-    undo = kill_after(11)
-    with pytest.raises(Killed):
-        resume(run)
-    undo()
+    assert [int(each.name) for each in run.checkpoints()] == [0]
+    for steps in (37, 11):
+        undo = kill_after(steps)
+        with pytest.raises(Killed):
+            resume(run)
+        undo()
     resume(run)
     assert_same_run(whole, run)
 
