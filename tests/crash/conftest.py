@@ -1,5 +1,6 @@
 """A server of trials for each process of tests, and the runs that nothing interrupted."""
 
+import collections
 import itertools
 import os
 
@@ -43,6 +44,27 @@ def whole(server, tmp_path_factory):
 
 
 @pytest.fixture
-def folders(tmp_path):
+def folders(request, tmp_path):
     """Folders for trials, each a new one."""
-    return (tmp_path / str(number) for number in itertools.count())
+    return _counted(request.node.user_properties, tmp_path)
+
+
+def _counted(properties, folder):
+    for number in itertools.count():
+        properties.append(("trial", number))
+        yield folder / str(number)
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Write a table of how many trials there were, and how many survived them."""
+    tried, died = collections.Counter(), collections.Counter()
+    for outcome in ("passed", "failed"):
+        for report in terminalreporter.stats.get(outcome, ()):
+            kind = report.nodeid.rpartition("/")[2].partition("[")[0]
+            trials = [name for name, _ in report.user_properties].count("trial")
+            tried[kind] += trials or 1  # a test that has no folders is a trial
+            died[kind] += outcome == "failed"
+    terminalreporter.section("trials")
+    for kind, count in {**tried, "all": tried.total()}.items():
+        survived = count - (died.total() if kind == "all" else died[kind])
+        terminalreporter.write_line(f"{survived:6,} of {count:6,} survived  {kind}")
