@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
 import fcntl
 import os
 import re
@@ -18,6 +19,7 @@ from rlctl.run.recipe import Recipe, read, validate
 
 ROOT = Path("runs")
 _DIGITS = 18  # of a training step
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 
 
 class RunDirectory:
@@ -150,6 +152,8 @@ class RunLock:
     """Keeps a second process from writing a run; the system lets go of it when the process ends, however it ends."""
 
     def __init__(self, folder: Path) -> None:
+        self.keeps_out = True
+        """Whether it does keep others out: some network file systems have no locks."""
         self._file = folder / ".lock"
         self._descriptor = self._claim()
 
@@ -163,6 +167,11 @@ class RunLock:
             raise UsageError(
                 f"{self._file.parent}: another process is writing this run ({owner or 'unknown'})"
             ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                os.close(descriptor)
+                raise
+            self.keeps_out = False
         with contextlib.suppress(OSError):  # a full disk: only the name of the owner is missing then
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"pid {os.getpid()} on {os.uname().nodename}".encode(), 0)

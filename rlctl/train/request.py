@@ -155,6 +155,8 @@ def _train(
         precheck.refuse_errors(display)
     run = start.run or directory.create(start.task, recipe.seed, request.root)
     with start.lock or run.lock() as lock:
+        if not lock.keeps_out:
+            display.message(f"warning: {run.path}: no locks on this file system: let no second process write this run")
         saver = _saver(request, start, run, lock, learner, display)
         evaluator = Evaluator(
             recipe, lambda: _workers(specs[-1], min(recipe.eval.episodes, _EVAL_ENVS), request, display)

@@ -1,5 +1,7 @@
 """The run folder: finding runs and policies, and keeping a second writer out."""
 
+import errno
+import fcntl
 import json
 import os
 import re
@@ -176,6 +178,18 @@ def test_a_second_writer_is_refused(root, make_run):
     assert told == f"{run.path}: another process is writing this run (pid {os.getpid()} on {os.uname().nodename})"
     lock.release()
     run.lock().release()
+
+
+def test_a_file_system_without_locks_keeps_nobody_out(monkeypatch, root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+
+    def flock(*_):
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    assert run.lock().keeps_out
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with run.lock() as lock, run.lock():
+        assert not lock.keeps_out
 
 
 def test_a_lock_ends_with_its_process(root, make_run):

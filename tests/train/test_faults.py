@@ -1,5 +1,8 @@
 """Environments that go wrong in a training: what is told, what is left running, and that the run goes on after it."""
 
+import errno
+import fcntl
+import os
 import time
 
 import psutil
@@ -134,3 +137,14 @@ def test_observations_outside_their_space_are_counted_and_said(train, capfd):
     assert run.status()["observations_outside"] == 2 * 3
     assert run.status()["observations_cast"] == 2 * (32 + 4)
     assert "warning: observations 6 outside their space and 72 of another dtype" in told
+
+
+def test_a_file_system_without_locks_is_said(train, monkeypatch, capfd):
+    def flock(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    run = train("Line", TINY).run
+    assert f"warning: {run.path}: no locks on this file system: let no second process write this run" in (
+        capfd.readouterr().err
+    )
