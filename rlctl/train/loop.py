@@ -101,6 +101,7 @@ class TrainingLoop(BaseCallback):
             self.boundary()
         elif self.saver.saved_step is None:
             # The first update may be minutes away: better to know now what cannot be saved.
+            self._take_ended()
             self.save_checkpoint()
 
     def boundary(self) -> None:

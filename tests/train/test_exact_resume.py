@@ -7,7 +7,7 @@ import pytest
 from rlctl.run import recipe as recipes
 from rlctl.train.vec_env import WorkerVecEnv
 from tests.train.comparing import Killed, assert_same_run
-from tests.train.conftest import SMALL
+from tests.train.conftest import FAULTY, SMALL
 
 ON_POLICY = {"ppo": {"n_steps": 16, "batch_size": 32, "n_epochs": 2}, "a2c": {"n_steps": 16}}
 ON_POLICY["recurrent_ppo"] = ON_POLICY["ppo"]
@@ -37,6 +37,7 @@ CASES = {
     "ppo, frame stack": ("Line", settings("ppo", frame_stack=3)),
     "ppo, curriculum": ("Staged", settings("ppo", **STAGES)),
     "ppo, stochastic evaluation": ("Line", settings("ppo", eval={"deterministic": False}, **SDE)),
+    "ppo, other observations than declared": (f"{FAULTY}:Outside", settings("ppo")),
     "ppo, on reach": ("reach", settings("ppo")),
     "a2c": ("Line", settings("a2c")),
     "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
