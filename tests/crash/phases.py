@@ -20,11 +20,12 @@ PHASES = {
     "first rollout": (rlctl.train.vec_env.WorkerVecEnv, "step_wait", 2),
     "boundary": (rlctl.train.loop.TrainingLoop, "boundary", 1),
     "evaluation": (rlctl.train.evaluation._Watched, "act", 3),
-    "checkpoint": (rlctl.run.files, "_take_place", 1),
-    "second checkpoint": (rlctl.run.files, "_take_place", 2),
+    "first checkpoint": (rlctl.run.files, "_take_place", 1),
+    "checkpoint": (rlctl.run.files, "_take_place", 2),
+    "evaluated checkpoint": (rlctl.run.files, "_take_place", 3),
     "final evaluation": (rlctl.train.evaluation._Watched, "act", 13),
     "the end": (rlctl.train.loop.TrainingLoop, "finish", 1),
-    "last checkpoint": (rlctl.run.files, "_take_place", 3),
+    "last checkpoint": (rlctl.run.files, "_take_place", 4),
     "done": (rlctl.train.status, "write_end", 1),
 }
 """Phase -> the function that is in it, and which call of it."""

@@ -28,22 +28,23 @@ def test_killed_at_an_operation(server, whole, folders, name, fault, part):
 
 @pytest.fixture(scope="session")
 def half_done(server, whole, tmp_path_factory):
-    """A run that was killed in the middle of a checkpoint, by name."""
+    """A run that was killed in the middle of a checkpoint, by name and the step of the one before."""
     ended = {}
 
     def get(name, saved):
-        if name not in ended:
+        key = (name, saved)
+        if key not in ended:
             at = operation_after(whole(name), saved) + 12
             folder = tmp_path_factory.mktemp(f"half of {name}")
-            ended[name] = server.run(ARGUMENTS[name], folder, disk={"fault": "half", "at": at})
-            assert ended[name].announced == saved
-        return ended[name]
+            ended[key] = server.run(ARGUMENTS[name], folder, disk={"fault": "half", "at": at})
+            assert ended[key].announced == saved
+        return ended[key]
 
     return get
 
 
 @parts
-@pytest.mark.parametrize(("name", "saved"), [("ppo", 16), ("sac", 16)])
+@pytest.mark.parametrize(("name", "saved"), [("ppo", 0), ("ppo", 16), ("sac", 16)])
 def test_killed_again_while_resuming(server, whole, half_done, folders, name, saved, part):
     before = half_done(name, saved)
     first = next(folders)
