@@ -118,9 +118,8 @@ class TrainingLoop(BaseCallback):
             if self._is_good_enough():
                 self._save_the_end(at_end=False)
                 raise TrainingStopped
-            self.save_checkpoint()
             self._stop_if_asked()
-        elif self.saver.checkpoint_is_due():
+        if self.saver.checkpoint_is_due():
             self.save_checkpoint()
 
     def _take_ended(self) -> None:

@@ -47,6 +47,8 @@ class Saver:
         self._warn = warn
         self._write_again = write_again
         self._next_checkpoint = time.monotonic()
+        self._unpaid = 1
+        """Checkpoints that come whether they are due or not: the last one."""
         self._last_bytes = 0
         self._reminded = 0.0
         self._best = _policy_of(run)
@@ -118,7 +120,8 @@ class Saver:
             self._tell_saved_again()
             self.attempt("old checkpoints", self._checkpoints.remove_old)
         now = time.monotonic()
-        self._next_checkpoint = now + (now - began) / TIME_FOR_CHECKPOINTS
+        self._next_checkpoint = now + (1 + self._unpaid) * (now - began) / TIME_FOR_CHECKPOINTS
+        self._unpaid = 0
         return saved
 
     def _tell_saved_again(self) -> None:
