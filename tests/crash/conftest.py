@@ -64,6 +64,8 @@ def pytest_terminal_summary(terminalreporter):
             trials = [name for name, _ in report.user_properties].count("trial")
             tried[kind] += trials or 1  # a test that has no folders is a trial
             died[kind] += outcome == "failed"
+    if not tried:
+        return
     terminalreporter.section("trials")
     for kind, count in {**tried, "all": tried.total()}.items():
         survived = count - (died.total() if kind == "all" else died[kind])
