@@ -5,8 +5,9 @@ import itertools
 import pytest
 
 from rlctl.run import recipe as recipes
+from rlctl.train import saving
 from rlctl.train.vec_env import WorkerVecEnv
-from tests.train.comparing import Killed, assert_same_run
+from tests.train.comparing import Killed, assert_same_run, rows
 from tests.train.conftest import FAULTY, SMALL
 
 ON_POLICY = {"ppo": {"n_steps": 16, "batch_size": 32, "n_epochs": 2}, "a2c": {"n_steps": 16}}
@@ -103,3 +104,19 @@ def newest_other_than(run):
 
     (other,) = (each for each in run.path.parent.iterdir() if each != run.path)
     return RunDirectory(other)
+
+
+@pytest.mark.parametrize("case", ["ppo", "dqn"])
+def test_an_evaluation_after_the_last_checkpoint(train, resume, kill_after, monkeypatch, case):
+    monkeypatch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e-9)
+    env, given = CASES[case]
+    whole = train(env, given).run
+    undo = kill_after(40)
+    with pytest.raises(Killed):
+        train(env, given)
+    undo()
+    run = newest_other_than(whole)
+    assert [int(each.name) for each in run.checkpoints()] == [0]
+    assert [row["steps"] for row in rows(run.evals_file)] == ["128"]
+    resume(run)
+    assert_same_run(whole, run)
