@@ -161,7 +161,7 @@ def train(
 ) -> None:
     """Train a policy, evaluate as it goes, and keep the best and the last."""
     _claim_stdout()
-    from rlctl.run.recipe import from_command_line
+    from rlctl.run.recipe import merge_flags
     from rlctl.train.request import TrainRequest, run_training
     from rlctl.train.summary import show
 
@@ -169,7 +169,7 @@ def train(
         task=task,
         resume=resume,
         config=config,
-        settings=from_command_line(
+        settings=merge_flags(
             settings, algo=algo, seed=seed, total_timesteps=total_timesteps, n_envs=n_envs, stop_success=stop_success
         ),
         device=device,
@@ -372,9 +372,9 @@ def _claim_stdout() -> None:
 
 def _task_settings(settings: list[str]) -> dict[str, Any]:
     """The constructor arguments in `--set task.key=value`, for the verbs that take nothing else."""
-    from rlctl.run.recipe import task_settings
+    from rlctl.run.recipe import parse_task_settings
 
-    return task_settings(settings)
+    return parse_task_settings(settings)
 
 
 def main() -> None:

@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from rlctl import named_task
-from rlctl.errors import RecipeError, TaskError, did_you_mean, shown
-from rlctl.registry import guarded, is_task, load
+from rlctl.errors import RecipeError, TaskError, did_you_mean, short_repr
+from rlctl.registry import call_plugin, is_task, load
 
 if TYPE_CHECKING:
     import gymnasium
@@ -65,7 +65,7 @@ class EnvSpec:
         from rlctl.task.events import EventSettings
 
         parameters = _task_parameters(constructor, self.parameters)
-        env: TaskEnv = guarded(
+        env: TaskEnv = call_plugin(
             self.task,
             lambda: TaskEnv(
                 constructor(**parameters),
@@ -82,7 +82,7 @@ class EnvSpec:
         _check_keywords(self.task, constructor, parameters)
         if render_mode is not None:
             parameters["render_mode"] = render_mode
-        env: gymnasium.Env[Any, Any] = guarded(self.task, lambda: constructor(**parameters))
+        env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
         if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
             raise TaskError(f"{self.task}: {type(env).__name__} is no Gymnasium environment (reset, step, spaces)")
         return env
@@ -138,7 +138,7 @@ def _task_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     import pydantic
 
     fields = task.parameters()
-    hints = guarded(task.__name__, lambda: typing.get_type_hints(task)) if given else {}
+    hints = call_plugin(task.__name__, lambda: typing.get_type_hints(task)) if given else {}
     checked = {}
     for key, value in given.items():
         if key not in fields:
@@ -148,14 +148,14 @@ def _task_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
             checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
         except pydantic.ValidationError as error:
             told = error.errors()[0]["msg"].removeprefix("Input ")
-            raise RecipeError(f"task.{key}: {told}, got {shown(repr(value))}") from None
+            raise RecipeError(f"task.{key}: {told}, got {short_repr(repr(value))}") from None
     return checked
 
 
 def _check_number(key: str, hint: Any, value: Any) -> None:
     """Raise `RecipeError` for what pydantic would make a number of: text and bools; and for what is none."""
     if hint in (int, float) and isinstance(value, bool | str):
-        raise RecipeError(f"task.{key}: expected a number, got {shown(repr(value))}")
+        raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
     if isinstance(value, float) and math.isnan(value):
         raise RecipeError(f"task.{key}: expected a number, got nan")
 

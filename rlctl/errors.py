@@ -69,7 +69,7 @@ class EpisodeFailed(TaskError):
         self.actions: Any = None
         """The actions of the episode, that of the failed step last, shape (step, ...); None if nobody knows them."""
 
-    def hinting(self, hint: str) -> EpisodeFailed:
+    def with_hint(self, hint: str) -> EpisodeFailed:
         """Return the same error with another hint."""
         return EpisodeFailed(self.what, self.env, self.seed, self.step, hint=hint, details=self.details)
 
@@ -94,7 +94,7 @@ class Interrupted(RlctlError):
         self.exit_code = 128 + signal_number
 
 
-def in_words(error: BaseException) -> str:
+def describe_exception(error: BaseException) -> str:
     """Return `RuntimeError: the gripper fell off`: a line, not too long, of whatever somebody else's code raised."""
     name = type(error).__name__
     try:
@@ -106,7 +106,7 @@ def in_words(error: BaseException) -> str:
     return f"{name}: {text}" if text else name
 
 
-def their_traceback(error: BaseException) -> str:
+def format_plugin_traceback(error: BaseException) -> str:
     """Return a traceback that begins where rlctl calls somebody else's code; empty if it never does."""
     frames = error.__traceback__
     while frames is not None and Path(frames.tb_frame.f_code.co_filename).is_relative_to(_OURS):
@@ -126,7 +126,7 @@ def did_you_mean(word: str, options: Iterable[str]) -> str:
     return f" Did you mean {close[0]!r}?" if close else ""
 
 
-def shown(value: object, length: int = 80) -> str:
+def short_repr(value: object, length: int = 80) -> str:
     """Return a value as Python writes it, text as it is, in one line of at most `length` characters."""
     try:
         text = value if isinstance(value, str) else repr(value)

@@ -9,7 +9,7 @@ import gymnasium
 
 from rlctl import registry
 
-for _entry in registry.installed():
+for _entry in registry.list_installed():
     if _entry.problem is None:
         gymnasium.register(
             id=f"rlctl/{_entry.name}-v0",

@@ -50,7 +50,7 @@ def _look_before_import(task: str, named_by: str) -> None:
     """Raise `ArtifactError` for what is no place of an environment, as its source has it: importing runs code."""
     by_id = _MODULE_ID.match(task)
     place, _, name = task.rpartition(":")
-    file = registry.source_file(f"{place}:_")  # of a Gymnasium id, the module that registers it
+    file = registry.find_source_file(f"{place}:_")  # of a Gymnasium id, the module that registers it
     if file is None or not file.is_file():
         if place.partition(".")[0] in sys.stdlib_module_names:
             raise _refused(task, named_by, "that is a part of Python")
@@ -117,7 +117,7 @@ def _may_be_called(task: str, constructor: Any) -> bool:
 
 def _module_of(task: str) -> str | None:
     """Return the name of the module that a task's own file is loaded as."""
-    file = registry.source_file(task)
+    file = registry.find_source_file(task)
     if file is None:
         return None
     wanted = str(file.expanduser().resolve())

@@ -54,7 +54,7 @@ class TaskEntry:
         return _existing(file.with_name(f"{self.name}.yaml")) or _existing(file.with_suffix(".yaml"))
 
 
-def installed() -> list[TaskEntry]:
+def list_installed() -> list[TaskEntry]:
     """Return every installed task, by name; of two with one name the bundled one, or the first, can be used."""
     found: list[TaskEntry] = []
     seen: set[tuple[str, str]] = set()
@@ -80,7 +80,7 @@ def installed() -> list[TaskEntry]:
 
 def find(name: str) -> TaskEntry | None:
     """Return the installed task that a name stands for."""
-    return next((entry for entry in installed() if entry.name == name), None)
+    return next((entry for entry in list_installed() if entry.name == name), None)
 
 
 def check_import(entry: TaskEntry, timeout_s: float = 60.0) -> str | None:
@@ -122,7 +122,7 @@ def load(task: str) -> Callable[..., Any]:
         return _load_gymnasium(task)
     if ":" in task:
         return _load_target(task, task)
-    names = [entry.name for entry in installed()]
+    names = [entry.name for entry in list_installed()]
     raise UsageError(
         f"no task {task!r}.{did_you_mean(task, names)} Installed: {', '.join(dict.fromkeys(names)) or 'none'}. "
         "Other forms: package.module:Class, path/to/file.py:Class, Pendulum-v1."
@@ -135,15 +135,15 @@ def is_task(constructor: Any) -> bool:
     return task_module is not None and inspect.isclass(constructor) and issubclass(constructor, task_module.Task)
 
 
-def recipe_file(task: str) -> Path | None:
+def find_recipe_file(task: str) -> Path | None:
     """Return the recipe that comes with a task: `<name>.yaml` beside its module, or `<file>.yaml` beside its file."""
     if entry := find(task):
         return entry.recipe_file
-    file = source_file(task)
+    file = find_source_file(task)
     return _existing(file.with_suffix(".yaml")) if file else None
 
 
-def source_file(task: str) -> Path | None:
+def find_source_file(task: str) -> Path | None:
     """Return the file that a task is written in, found without importing it; None for a Gymnasium id."""
     _put_current_folder_on_path()
     if entry := find(task):
@@ -158,14 +158,14 @@ def _existing(file: Path) -> Path | None:
     return file if file.is_file() else None
 
 
-def origin(task: str) -> dict[str, str]:
+def find_origin(task: str) -> dict[str, str]:
     """Return what to write down about where a task comes from: `distribution` and `version`, where known."""
     if entry := find(task):
         return {"distribution": entry.distribution, "version": entry.version}
     return {}
 
 
-def slug(task: str) -> str:
+def make_slug(task: str) -> str:
     """Return a folder name for a task: `reach`, `MyEnv`, `Pendulum-v1`."""
     return re.sub(r"[^\w.-]+", "-", task.rpartition(":")[2]).strip("-.") or "task"
 
@@ -213,7 +213,7 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
 def _import_module(task: str, name: str) -> Any:
     if _module_file(name) is None and name not in sys.modules:
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
-    return guarded(task, lambda: importlib.import_module(name), doing="import failed: ")
+    return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 
 def _import_file(task: str, file: Path) -> Any:
@@ -236,7 +236,7 @@ def _import_file(task: str, file: Path) -> Any:
     sys.modules[name] = module
     loader = spec.loader
     try:
-        guarded(task, lambda: loader.exec_module(module), doing="import failed: ")
+        call_plugin(task, lambda: loader.exec_module(module), doing="import failed: ")
     except BaseException:
         sys.modules.pop(name, None)
         raise
@@ -281,7 +281,7 @@ def _of_old_gym(name: str) -> bool:
     return name in getattr(known, "env_specs", known)
 
 
-def guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:
+def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
     """Run a plugin's code; whatever it raises, `SystemExit` included, becomes a `TaskError`."""
     try:
         return call()
@@ -294,5 +294,6 @@ def guarded(task: str, call: Callable[[], Any], doing: str = "") -> Any:
         if frames and not own and not frames[-1].filename.startswith("<frozen"):  # a syntax error names its place
             where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})"
         raise TaskError(
-            f"task {task!r}: {doing}{errors.in_words(error)}{where}", details=errors.their_traceback(error) or None
+            f"task {task!r}: {doing}{errors.describe_exception(error)}{where}",
+            details=errors.format_plugin_traceback(error) or None,
         ) from error

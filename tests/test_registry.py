@@ -225,21 +225,21 @@ def test_frames_are_stacked_oldest_first(my_env):
 
 
 def test_recipes_lie_beside_the_module(my_env, write_module):
-    assert registry.recipe_file("my_env.py:MyEnv") is None
+    assert registry.find_recipe_file("my_env.py:MyEnv") is None
     recipe = write_module("my_env.yaml", "algo: sac")
-    assert registry.recipe_file("my_env.py:MyEnv") == Path("my_env.yaml")
-    assert registry.recipe_file("my_env:MyEnv") == recipe
-    assert registry.recipe_file("reach").name == "reach.yaml"
-    assert registry.recipe_file("rlctl_manipulation.reach:Reach") == registry.recipe_file("reach")
-    assert registry.recipe_file("Pendulum-v1") is None
-    assert registry.recipe_file("nothing") is None
+    assert registry.find_recipe_file("my_env.py:MyEnv") == Path("my_env.yaml")
+    assert registry.find_recipe_file("my_env:MyEnv") == recipe
+    assert registry.find_recipe_file("reach").name == "reach.yaml"
+    assert registry.find_recipe_file("rlctl_manipulation.reach:Reach") == registry.find_recipe_file("reach")
+    assert registry.find_recipe_file("Pendulum-v1") is None
+    assert registry.find_recipe_file("nothing") is None
 
 
 def test_folder_names_of_tasks():
     names = {"reach": "reach", "a/b.py:MyEnv": "MyEnv", "pkg:ns/Env-v1": "ns-Env-v1", "x.py:../../..": "task"}
-    assert {task: registry.slug(task) for task in names} == names
+    assert {task: registry.make_slug(task) for task in names} == names
 
 
 def test_where_a_task_comes_from():
-    assert registry.origin("reach") == {"distribution": "rlctl", "version": rlctl.__version__}
-    assert registry.origin("Pendulum-v1") == {}
+    assert registry.find_origin("reach") == {"distribution": "rlctl", "version": rlctl.__version__}
+    assert registry.find_origin("Pendulum-v1") == {}

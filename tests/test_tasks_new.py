@@ -79,7 +79,7 @@ def test_its_own_tests_pass_before_it_is_installed(plugin, tmp_path):
 
 
 def test_its_recipe_is_found_installed_or_not(rlctl, plugin, install, tmp_path):
-    assert registry.recipe_file(PATH_FORM) == Path("my-arm/my_arm/task.yaml")
+    assert registry.find_recipe_file(PATH_FORM) == Path("my-arm/my_arm/task.yaml")
     files = {str(file): (plugin.folder / file).read_text() for file in plugin.files if file.parts[0] == "my_arm"}
     site = install("my-arm", {"my-arm": "my_arm.task:MyArm"}, files)
     shown = json.loads(rlctl("tasks", "show", "my-arm", "--json", "-", path=site).stdout)

@@ -51,7 +51,7 @@ class Report:
         built = self.evidence.built
         if built is not None and built.file is not None:
             return Path(built.file), built.line or 1
-        file = registry.source_file(self.task)
+        file = registry.find_source_file(self.task)
         return (file, 1) if file else None
 
 
@@ -101,7 +101,7 @@ def _normalizes(task: str) -> bool | None:
     """Say whether the recipe that comes with a task normalises observations."""
     from rlctl.run import recipe
 
-    if registry.recipe_file(task) is None:
+    if registry.find_recipe_file(task) is None:
         return None
     normalize = recipe.resolve(task, None, {}).normalize
     return normalize is not None and normalize.observation

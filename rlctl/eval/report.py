@@ -10,7 +10,7 @@ from rlctl import output
 from rlctl.env_spec import EnvSpec
 from rlctl.eval.evaluate import Evaluation
 from rlctl.eval.statistics import Spread
-from rlctl.run.policy import versions
+from rlctl.run.policy import collect_versions
 
 
 def show_all(results: Sequence[Evaluation], json: str | None) -> None:
@@ -109,7 +109,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
             "training_steps": info.training_steps,
             "versions": info.versions,
         },
-        "versions": versions(),
+        "versions": collect_versions(),
         "seed": result.seed,
         "deterministic": result.deterministic,
         "success_rate": result.success_rate,

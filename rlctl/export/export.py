@@ -64,7 +64,7 @@ def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) ->
     except (UsageError, TaskError) as error:
         message = f"{policy_file}: the export cannot be verified, its environment does not build: {error}"
         raise type(error)(message, details=error.details) from None
-    if difference := info.env.difference(built):
+    if difference := info.env.find_difference(built):
         raise ArtifactError(
             f"{policy_file}: the export cannot be verified, its environment has changed: {difference}; "
             "train again, or go back to the task's former version"

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import ArtifactError, RlctlError, TaskError, in_words, their_traceback
+from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.run.env_info import EnvInfo, describe
 from rlctl.run.episode import EpisodeInfo, Observations, RecordedEpisode
-from rlctl.run.policy import versions
+from rlctl.run.policy import collect_versions
 
 Env = gymnasium.Env[Any, Any]
 Choose = Callable[[Any, int], Any]
@@ -109,8 +109,8 @@ def check_actions(episode: RecordedEpisode, wanted: tuple[int, ...], path: Path 
 
 def present_versions(task: str) -> dict[str, str]:
     """Return the versions that an episode of a task depends on."""
-    origin = registry.origin(task)
-    return {**versions(), **({origin["distribution"]: origin["version"]} if origin else {})}
+    origin = registry.find_origin(task)
+    return {**collect_versions(), **({origin["distribution"]: origin["version"]} if origin else {})}
 
 
 @contextlib.contextmanager
@@ -122,9 +122,9 @@ def _blaming(task: str, seed: int, diary: _Diary) -> Iterator[None]:
         raise
     except BaseException as error:
         ours = isinstance(error, RlctlError)
-        what = str(error) if ours else in_words(error)
+        what = str(error) if ours else describe_exception(error)
         where = f"in the episode with seed {seed}, step {diary.next_step}; to see it alone: rlctl check-env {task}"
-        details = None if ours else their_traceback(error) or None
+        details = None if ours else format_plugin_traceback(error) or None
         raise TaskError(f"task {task!r}: {what}\n{where}", details=details) from error
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from rlctl import output
 from rlctl.errors import AnswerIsNo
 from rlctl.replay.difference import Difference
-from rlctl.run.policy import versions
+from rlctl.run.policy import collect_versions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +108,7 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
             for episode in result.episodes
         ],
         "open": open_command(result),
-        "versions": versions(),
+        "versions": collect_versions(),
     }
     if (verification := result.verification) is not None:
         difference = verification.difference

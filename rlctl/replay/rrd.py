@@ -34,7 +34,7 @@ def write_rrd(path: Path, watched: Watched, *, title: str, tell: Tell) -> None:
     """
     info = watched.lived.episode.info
     stream = rr.RecordingStream(
-        f"rlctl_{registry.slug(info.task)}", recording_id=_identity(watched.lived.episode), send_properties=False
+        f"rlctl_{registry.make_slug(info.task)}", recording_id=_identity(watched.lived.episode), send_properties=False
     )
     stream.set_log_time_enabled(False)
 
@@ -55,7 +55,7 @@ def _identity(episode: RecordedEpisode) -> str:
     content = hashlib.sha256(episode.info.model_dump_json().encode())
     content.update(episode.actions.tobytes())
     content.update(episode.rewards.tobytes())
-    return f"{registry.slug(episode.info.task)}-{episode.info.seed}-{content.hexdigest()[:12]}"
+    return f"{registry.make_slug(episode.info.task)}-{episode.info.seed}-{content.hexdigest()[:12]}"
 
 
 def _send(stream: rr.RecordingStream, watched: Watched, title: str, tell: Tell) -> rrb.Blueprint:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rlctl.errors import RlctlError, in_words, their_traceback
+from rlctl.errors import RlctlError, describe_exception, format_plugin_traceback
 from rlctl.rollout.returned import NotAsDeclared
 
 
@@ -16,7 +16,7 @@ class FailedInEpisode(Exception):
         self.where = {"env": env, "seed": seed, "step": step}
 
     def __str__(self) -> str:
-        cause = "" if self.__cause__ is None else f"{in_words(self.__cause__)} "
+        cause = "" if self.__cause__ is None else f"{describe_exception(self.__cause__)} "
         return "{}in environment {env}, episode seed {seed}, step {step},".format(cause, **self.where)
 
 
@@ -27,5 +27,5 @@ def as_message(error: BaseException) -> dict[str, Any]:
         where, error = error.where, error.__cause__ or error
     if isinstance(error, RlctlError):
         return {"message": str(error), "kind": type(error).__name__, "traceback": error.details, **where}
-    told = f"ValueError: {error}" if isinstance(error, NotAsDeclared) else in_words(error)
-    return {"message": told, "kind": None, "traceback": their_traceback(error) or None, **where}
+    told = f"ValueError: {error}" if isinstance(error, NotAsDeclared) else describe_exception(error)
+    return {"message": told, "kind": None, "traceback": format_plugin_traceback(error) or None, **where}

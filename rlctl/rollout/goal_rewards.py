@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load, save
 
-from rlctl.errors import TaskError, in_words, their_traceback
+from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
 
 QUESTION = b"rewards "
 """How the message begins."""
@@ -32,7 +32,9 @@ def answer(env: Any, message: bytes) -> list[float]:
     try:
         rewards = np.asarray(env.unwrapped.compute_reward(goals["achieved"], goals["desired"], infos))
     except BaseException as error:  # a plugin may raise anything, SystemExit too
-        raise TaskError(f"compute_reward raised {in_words(error)}", details=their_traceback(error)) from error
+        raise TaskError(
+            f"compute_reward raised {describe_exception(error)}", details=format_plugin_traceback(error)
+        ) from error
     if rewards.dtype.kind not in "fiub":
         raise TaskError(f"compute_reward returned an array of {rewards.dtype}, not of numbers")
     if rewards.shape != (count,):

@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlctl.env_spec import EnvSpec, make_several
-from rlctl.errors import in_words
+from rlctl.errors import describe_exception
 from rlctl.rollout import goal_rewards, returned
 from rlctl.rollout.failures import FailedInEpisode, as_message
 from rlctl.rollout.printed import say
@@ -173,7 +173,7 @@ class _Worker:
             try:
                 episode.env.close()
             except BaseException as error:  # what was lived is lived
-                say(f"warning: closing environment {episode.index}: {in_words(error)}")
+                say(f"warning: closing environment {episode.index}: {describe_exception(error)}")
         self.episodes = []
 
     def step(self) -> list[dict[str, Any]]:

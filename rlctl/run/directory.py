@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import registry
-from rlctl.errors import ArtifactError, UsageError, did_you_mean, shown
+from rlctl.errors import ArtifactError, UsageError, did_you_mean, short_repr
 from rlctl.run import files
 from rlctl.run.recipe import Recipe, read, validate
 
@@ -124,7 +124,7 @@ class RunDirectory:
                 raise ArtifactError(f"{self.path}: no {which} policy yet; {hint}")
             return file
         if not which.isdecimal() or len(which) > _DIGITS:
-            raise UsageError(f"--checkpoint {shown(which)!r}: give best, last, or the step of a checkpoint")
+            raise UsageError(f"--checkpoint {short_repr(which)!r}: give best, last, or the step of a checkpoint")
         file = self.checkpoint(int(which)) / "policy.safetensors"
         if not file.is_file():
             steps = ", ".join(str(int(each.name)) for each in self.checkpoints())
@@ -199,7 +199,7 @@ class RunLock:
 def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
     """Make a new run folder, `<root>/<task>/<time>_s<seed>`, and point `<root>/latest` to it."""
     now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder = root / registry.slug(task)
+    folder = root / registry.make_slug(task)
     for attempt in range(1000):
         name = f"{now}_s{seed}" + (f"_{attempt}" if attempt else "")
         try:
@@ -233,7 +233,7 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
         return newest
     if (Path(text) / "run.json").is_file():
         return RunDirectory(Path(text))
-    folder = root / registry.slug(text)
+    folder = root / registry.make_slug(text)
     if (newest := _newest(folder, depth=1)) is not None:
         return newest
     if Path(text).is_dir():

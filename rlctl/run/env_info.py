@@ -12,7 +12,7 @@ import pydantic
 from gymnasium import spaces
 
 from rlctl.env_spec import LARGEST_SPACE
-from rlctl.errors import ArtifactError, UsageError, shown
+from rlctl.errors import ArtifactError, UsageError, short_repr
 
 _ONE_HOT = 10
 """How many elements of a Box an alternative of a discrete space counts for."""
@@ -41,7 +41,7 @@ class EnvInfo(pydantic.BaseModel):
         """Return the observation and the action space."""
         return space_from_json(self.observation_space), space_from_json(self.action_space)
 
-    def difference(self, other: EnvInfo, whose: str = "the environment's") -> str | None:
+    def find_difference(self, other: EnvInfo, whose: str = "the environment's") -> str | None:
         """Say how the spaces of `other` differ from these, in a few words; None if they do not."""
         for name in ("observation", "action"):
             ours, theirs = getattr(self, f"{name}_space"), getattr(other, f"{name}_space")
@@ -129,7 +129,7 @@ def space_from_json(data: dict[str, Any]) -> spaces.Space[Any]:
             raise ValueError(f"{count:,} elements, at most {LARGEST_SPACE:,} are supported")
         return _built(data)
     except (KeyError, TypeError, ValueError, AttributeError, AssertionError, OverflowError, RecursionError) as error:
-        raise ArtifactError(f"not a space: {shown(str(error) or error)}") from None
+        raise ArtifactError(f"not a space: {short_repr(str(error) or error)}") from None
 
 
 def _elements(data: dict[str, Any]) -> int:
@@ -181,12 +181,12 @@ _SPACES: dict[str, Callable[[dict[str, Any]], spaces.Space[Any]]] = {
 
 def _whole(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError(f"expected a whole number, got {shown(value)}")
+        raise TypeError(f"expected a whole number, got {short_repr(value)}")
     return value
 
 
 def _shape(sizes: Any) -> tuple[int, ...]:
     shape = tuple(_whole(size) for size in (sizes if isinstance(sizes, list) else [sizes]))
     if min(shape, default=0) < 0 or len(shape) > _DIMENSIONS:
-        raise ValueError(f"shape {shown(list(shape))}")
+        raise ValueError(f"shape {short_repr(list(shape))}")
     return shape

@@ -122,7 +122,7 @@ def load_episode(path: Path) -> RecordedEpisode:
             raise ArtifactError(f"{path}: episode format {data['format']} is newer than this rlctl can read ({FORMAT})")
         info = EpisodeInfo.model_validate(data)
     except (ValueError, AttributeError, pydantic.ValidationError) as error:
-        raise ArtifactError(f"{path}: its description is damaged: {untrusted.explained(error)}") from None
+        raise ArtifactError(f"{path}: its description is damaged: {untrusted.explain_error(error)}") from None
     prefix = "observations/"
     parts = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
     observations: Observations = parts or arrays["observations"]

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rlctl.errors import did_you_mean, shown
+from rlctl.errors import did_you_mean, short_repr
 
 Rule = Callable[[Any], None]
 """Raises `ValueError`, which says what would be right, for a value that makes no sense."""
@@ -41,9 +41,9 @@ class Range:
             self._check_text(value)
             return
         if isinstance(value, bool) or not isinstance(value, int | float) or (self.integer and not _is_whole(value)):
-            raise ValueError(f"expected {self._kind()}, got {shown(value)}")
+            raise ValueError(f"expected {self._kind()}, got {short_repr(value)}")
         if not self._contains(value):
-            raise ValueError(f"{shown(value)} is not in {self}")
+            raise ValueError(f"{short_repr(value)} is not in {self}")
 
     def _contains(self, value: float) -> bool:
         above = self.low < value if self.open_low else self.low <= value
@@ -56,9 +56,11 @@ class Range:
             if allowed and text.startswith(prefix):
                 start = _number(text.removeprefix(prefix))
                 if start is None or not self._contains(start) or (prefix == "auto_" and start <= 0):
-                    raise ValueError(f"{shown(text)!r} is not {prefix} and a number in {self}, such as {prefix}0.1")
+                    raise ValueError(
+                        f"{short_repr(text)!r} is not {prefix} and a number in {self}, such as {prefix}0.1"
+                    )
                 return
-        raise ValueError(f"expected {self._kind()}, got {shown(text)!r}")
+        raise ValueError(f"expected {self._kind()}, got {short_repr(text)!r}")
 
     def _kind(self) -> str:
         kinds = ["a whole number" if self.integer else "a number"]
@@ -83,7 +85,7 @@ def _number(text: str) -> float | None:
 
 def _switch(value: Any) -> None:
     if not isinstance(value, bool):
-        raise ValueError(f"expected true or false, got {shown(value)}")
+        raise ValueError(f"expected true or false, got {short_repr(value)}")
 
 
 def _off(value: Any) -> None:
@@ -93,7 +95,7 @@ def _off(value: Any) -> None:
 
 def _name(value: Any) -> None:
     if not isinstance(value, str):
-        raise ValueError(f"expected a name, such as tanh, got {shown(value)}")
+        raise ValueError(f"expected a name, such as tanh, got {short_repr(value)}")
 
 
 def _one_of_no_use(value: float) -> Rule:
@@ -122,7 +124,7 @@ def _train_freq(value: Any) -> None:
         _COUNT(value)
         return
     if len(value) != 2 or value[1] not in ("step", "episode"):
-        raise ValueError(f"expected a number of steps, or a pair such as [1, episode], got {shown(value)}")
+        raise ValueError(f"expected a number of steps, or a pair such as [1, episode], got {short_repr(value)}")
     _COUNT(value[0])
 
 
@@ -131,7 +133,7 @@ def _mapping(rules: Mapping[str, Rule]) -> Rule:
         if value is None:
             return
         if not isinstance(value, Mapping):
-            raise ValueError(f"expected a mapping of {', '.join(rules)}, got {shown(value)}")
+            raise ValueError(f"expected a mapping of {', '.join(rules)}, got {short_repr(value)}")
         _check_all(value, rules, known_only=True)
 
     return check
@@ -139,7 +141,7 @@ def _mapping(rules: Mapping[str, Rule]) -> Rule:
 
 def _layers(value: Any) -> None:
     if not isinstance(value, list):
-        raise ValueError(f"expected a list of layer widths, such as [64, 64], got {shown(value)}")
+        raise ValueError(f"expected a list of layer widths, such as [64, 64], got {short_repr(value)}")
     if len(value) > _DEEPEST:
         raise ValueError(f"{len(value):,} layers; at most {_DEEPEST} make sense")
     for width in value:
@@ -155,7 +157,7 @@ def _net_arch(*parts: str) -> Rule:
             return
         if set(value) != set(parts):
             example = ", ".join(f"{part}: [64, 64]" for part in parts)
-            raise ValueError(f"expected [64, 64] or {{{example}}}, got {shown(value)}")
+            raise ValueError(f"expected [64, 64] or {{{example}}}, got {short_repr(value)}")
         for part, layers in value.items():
             _checked(part, layers, _layers)
 
@@ -244,7 +246,7 @@ def check_together(algo: str, values: Mapping[str, Any], policy: Mapping[str, An
     train_freq = values.get("train_freq")
     if n_envs > 1 and isinstance(train_freq, list) and train_freq[1] == "episode":
         raise ValueError(
-            f"algo_kwargs.train_freq: {shown(train_freq)} counts the episodes of one environment, and n_envs is "
+            f"algo_kwargs.train_freq: {short_repr(train_freq)} counts the episodes of one environment, and n_envs is "
             f"{n_envs}; count steps, such as train_freq: {train_freq[0]}, or set n_envs: 1"
         )
     dropped, quantiles = values.get("top_quantiles_to_drop_per_net", 0), policy.get("n_quantiles", _QUANTILES)
@@ -272,7 +274,9 @@ def _check_all(values: Mapping[str, Any], rules: Mapping[str, Rule], known_only:
         if name in rules:
             _checked(name, value, rules[name])
         elif known_only:
-            raise ValueError(f"no key {shown(name)!r}.{did_you_mean(str(name), rules)} Keys here: {', '.join(rules)}")
+            raise ValueError(
+                f"no key {short_repr(name)!r}.{did_you_mean(str(name), rules)} Keys here: {', '.join(rules)}"
+            )
 
 
 def _checked(name: str, value: Any, rule: Rule) -> None:

@@ -17,7 +17,7 @@ def available() -> int | None:
     return max(min(found), 0) if found else None
 
 
-def told(size: float) -> str:
+def format_bytes(size: float) -> str:
     """Return a number of bytes for people: `512 MB`, `1,024 GB`."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if size >= factor:

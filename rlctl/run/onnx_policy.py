@@ -13,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.env_spec import LARGEST_SPACE
-from rlctl.errors import ArtifactError, UsageError, shown
+from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.run import memory, onnx_file, untrusted
 from rlctl.run.policy import ROWS, Observations, Policy, PolicyInfo, State, parse_info
 
@@ -67,7 +67,7 @@ class OnnxPolicy(Policy):
             policy = cls(info, session)
             policy.try_once()
         except (ArtifactError, ValueError, TypeError, LookupError, MemoryError) as error:
-            told = shown(str(error), 200)
+            told = short_repr(str(error), 200)
             raise ArtifactError(f"{path}: its graph does not fit its description: {told}; export it again") from None
         return policy
 
@@ -113,7 +113,7 @@ class OnnxPolicy(Policy):
         try:
             actions, *after = self.session.run(self._outputs, batch)
         except Exception as error:  # onnxruntime's own errors have no public base class
-            raise ArtifactError(f"the exported policy cannot act: {shown(str(error), 200)}") from None
+            raise ArtifactError(f"the exported policy cannot act: {short_repr(str(error), 200)}") from None
         return actions, tuple(after) or None
 
     def _zeros(self, rows: int) -> State | None:
@@ -134,7 +134,7 @@ def _opened(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
     except Exception as error:  # onnxruntime's own errors have no public base class
         raise ArtifactError(
             f"{path}: damaged, or not an ONNX file that onnxruntime {onnxruntime.__version__} can read: "
-            f"{shown(str(error), 200)}"
+            f"{short_repr(str(error), 200)}"
         ) from None
 
 

@@ -24,7 +24,7 @@ from pydantic import Field
 
 import rlctl
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import ArtifactError, shown
+from rlctl.errors import ArtifactError, short_repr
 from rlctl.named_task import POLICY
 from rlctl.run import files, untrusted
 from rlctl.run.env_info import EnvInfo
@@ -111,11 +111,11 @@ class PolicyInfo(pydantic.BaseModel):
 
     def check_fits(self, env: EnvInfo, file: Path) -> None:
         """Raise `ArtifactError` if the policy in `file` was made for other spaces than `env` has."""
-        if difference := self.env.difference(env):
+        if difference := self.env.find_difference(env):
             raise ArtifactError(f"{file}: this policy is not for this task: {difference}")
 
 
-def versions() -> dict[str, str]:
+def collect_versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     return dict(_versions())
 
@@ -132,11 +132,11 @@ def _versions() -> dict[str, str]:
 
 
 def save_policy(path: Path, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
-    """Write a policy file, whole or not at all; see `policy_bytes`."""
-    files.write_bytes(path, policy_bytes(info, tensors))
+    """Write a policy file, whole or not at all; see `encode_policy`."""
+    files.write_bytes(path, encode_policy(info, tensors))
 
 
-def policy_bytes(info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> bytes:
+def encode_policy(info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> bytes:
     """Return the content of a policy file.
 
     `tensors` has the network's under `policy/`, and mean and variance per observation key under `normalize/`.
@@ -174,7 +174,7 @@ def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
         raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
     for name, values in tensors.items():
         if not np.isfinite(values).all():
-            raise ArtifactError(f"{path}: damaged: {shown(name)} is not finite")
+            raise ArtifactError(f"{path}: damaged: {short_repr(name)} is not finite")
     return info, tensors
 
 
@@ -191,7 +191,7 @@ def parse_info(text: str | None, path: Path) -> PolicyInfo:
             )
         return PolicyInfo.model_validate(data)
     except (ValueError, pydantic.ValidationError) as error:
-        raise ArtifactError(f"{path}: its rlctl metadata is damaged: {untrusted.explained(error)}") from None
+        raise ArtifactError(f"{path}: its rlctl metadata is damaged: {untrusted.explain_error(error)}") from None
 
 
 class Policy(abc.ABC):

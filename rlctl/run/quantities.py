@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import pydantic
 
-from rlctl.errors import shown
+from rlctl.errors import short_repr
 
 
 def _number(value: Any) -> Any:
@@ -27,7 +27,7 @@ def _switch(value: Any) -> Any:
 
 
 def _quoted(value: Any) -> str:
-    return repr(shown(value)) if isinstance(value, str) else shown(value)
+    return repr(short_repr(value)) if isinstance(value, str) else short_repr(value)
 
 
 Whole = Annotated[int, pydantic.BeforeValidator(_whole)]

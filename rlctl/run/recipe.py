@@ -15,7 +15,7 @@ from pydantic import Field
 
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import ArtifactError, RecipeError, did_you_mean, shown
+from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
 from rlctl.run import untrusted, yaml_text
 from rlctl.run.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.run.hyperparameters import check_algorithm, check_policy, check_together
@@ -166,15 +166,15 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
     for text in settings:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
-            raise RecipeError(f"--set {shown(text)!r}: write key=value, for example --set task.tolerance=0.02")
+            raise RecipeError(f"--set {short_repr(text)!r}: write key=value, for example --set task.tolerance=0.02")
         *path, last = key.strip().split(".")
         if len(path) >= _DEEPEST_KEY or not all((*path, last)):
-            raise RecipeError(f"--set {shown(text)!r}: a key is some names with a dot between, such as task.tolerance")
+            raise RecipeError(f"--set {short_repr(text)!r}: a key is names joined by dots, such as task.tolerance")
         place = result
         for part in path:
             place = place.setdefault(part, {})
             if not isinstance(place, dict):
-                raise RecipeError(f"--set {shown(text)!r}: {part!r} has been given a value already")
+                raise RecipeError(f"--set {short_repr(text)!r}: {part!r} has been given a value already")
         place[last] = yaml_text.load(value, f"--set {key}")
     return result
 
@@ -186,7 +186,7 @@ def resolve(
 
     `stages` are those that the task's class declares; a recipe that has the key replaces them.
     """
-    packaged_file = registry.recipe_file(task)
+    packaged_file = registry.find_recipe_file(task)
     packaged = read(packaged_file) if packaged_file else {}
     given = merge(read(config) if config else {}, settings)
     algo = given.get("algo", packaged.get("algo", "ppo"))
@@ -197,7 +197,7 @@ def resolve(
     if stages and "stages" not in merged:
         merged["stages"] = validate({"stages": list(stages)}, f"class of {task}").model_dump(by_alias=True)["stages"]
     source = "recipe" if not config else f"recipe {config}"
-    return with_defaults(validate(merged, source))
+    return fill_defaults(validate(merged, source))
 
 
 _OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
@@ -222,7 +222,7 @@ def validate(values: Mapping[str, Any], source: str) -> Recipe:
 
 
 def _explain(problem: Any) -> str:
-    path = [shown(str(part)) for part in problem["loc"]]
+    path = [short_repr(str(part)) for part in problem["loc"]]
     where = ""
     if path[:1] == ["stages"] and len(path) > 1:
         where, path = f"stage {problem['loc'][1] + 1}: ", path[2:]
@@ -235,8 +235,8 @@ def _explain(problem: Any) -> str:
     if problem["type"] == "value_error":
         between = "." if key in ("algo_kwargs", "policy_kwargs") else ": " if key else ""
         return f"{where}{key}{between}{message}"
-    given = problem["input"]
-    return f"{where}{key + ': ' if key else ''}{message}, got {shown(repr(given) if isinstance(given, str) else given)}"
+    given = repr(problem["input"]) if isinstance(problem["input"], str) else problem["input"]
+    return f"{where}{key + ': ' if key else ''}{message}, got {short_repr(given)}"
 
 
 _SECTIONS: dict[str, type[pydantic.BaseModel]] = {
@@ -248,7 +248,7 @@ _SECTIONS: dict[str, type[pydantic.BaseModel]] = {
 }
 
 
-def with_defaults(recipe: Recipe) -> Recipe:
+def fill_defaults(recipe: Recipe) -> Recipe:
     """Fill in what the algorithm decides: rollout length, normalisation, how often to evaluate."""
     changes: dict[str, Any] = {}
     kwargs = dict(recipe.algo_kwargs)
@@ -270,7 +270,7 @@ def with_defaults(recipe: Recipe) -> Recipe:
     return recipe.model_copy(update=changes)
 
 
-def task_settings(settings: list[str]) -> dict[str, Any]:
+def parse_task_settings(settings: list[str]) -> dict[str, Any]:
     """Return the constructor arguments in `--set task.key=value`; raises `RecipeError` for any other key."""
     values = parse_settings(settings)
     for key in values:
@@ -282,7 +282,7 @@ def task_settings(settings: list[str]) -> dict[str, Any]:
     return parameters
 
 
-def from_command_line(settings: list[str], **flags: Any) -> dict[str, Any]:
+def merge_flags(settings: list[str], **flags: Any) -> dict[str, Any]:
     """Return the settings of `--set` with those of the flags that were given put over them."""
     values = parse_settings(settings)
     for name, value in flags.items():

@@ -96,6 +96,6 @@ def check_promotions(stages: Sequence[Stage]) -> None:
             raise ValueError(f"stage {number} of {len(stages)} ({stage}) is the last: leave out its promote")
 
 
-def title(number: int, stages: Sequence[Stage]) -> str:
+def format_title(number: int, stages: Sequence[Stage]) -> str:
     """Return what people are told: `stage 2 of 3: tolerance 0.1`."""
     return f"stage {number} of {len(stages)}: {stages[number - 1]}"

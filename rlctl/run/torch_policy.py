@@ -19,7 +19,7 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.vec_env import VecTransposeImage
 from torch.overrides import TorchFunctionMode
 
-from rlctl.errors import ArtifactError, RecipeError, did_you_mean, shown
+from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
 from rlctl.run.policy import ROWS, Observations, Policy, PolicyInfo, State, read_policy
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -220,7 +220,9 @@ class TorchPolicy(Policy):
         except ArtifactError as error:
             raise ArtifactError(f"{path}: {error}") from None
         except Exception as error:  # whatever torch and SB3 raise for a description that nobody has checked
-            raise ArtifactError(f"{path}: its tensors do not fit its description: {shown(str(error), 200)}") from None
+            raise ArtifactError(
+                f"{path}: its tensors do not fit its description: {short_repr(str(error), 200)}"
+            ) from None
 
     @classmethod
     def _fitted(cls, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> TorchPolicy:

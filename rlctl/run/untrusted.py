@@ -16,7 +16,7 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
-from rlctl.errors import ArtifactError, shown
+from rlctl.errors import ArtifactError, short_repr
 from rlctl.run import memory
 
 JSON_LIMIT = 16 * 2**20  # [bytes]
@@ -29,7 +29,7 @@ _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
+def open_file(path: Path) -> Iterator[BinaryIO]:
     """Open a regular file; raises `ArtifactError` for one that is missing, unreadable, a folder, a pipe or a device."""
     try:
         # A pipe would otherwise wait for somebody who writes.
@@ -47,11 +47,13 @@ def opened(path: Path) -> Iterator[BinaryIO]:
 
 def read_bytes(path: Path, limit: int | None = None) -> bytes:
     """Read a regular file of at most `limit` bytes, by default of what fits into memory; raises `ArtifactError`."""
-    with opened(path) as file:
+    with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if limit is not None and size > limit:
-            raise ArtifactError(f"{path}: too large: {memory.told(size)}, at most {memory.told(limit)} are read")
-        if (problem := too_large(size)) is not None:
+            raise ArtifactError(
+                f"{path}: too large: {memory.format_bytes(size)}, at most {memory.format_bytes(limit)} are read"
+            )
+        if (problem := explain_size(size)) is not None:
             raise ArtifactError(f"{path}: too large: {problem}")
         try:
             return file.read()
@@ -59,22 +61,22 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
             raise ArtifactError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def too_large(size: int) -> str | None:
+def explain_size(size: int) -> str | None:
     """Say why so many bytes are not read into memory; None if they may be: up to half of what is there."""
     there = memory.available()
     if there is None or size <= there // 2:
         return None
-    return f"it needs {memory.told(size)} of memory, and {memory.told(there)} are free"
+    return f"it needs {memory.format_bytes(size)} of memory, and {memory.format_bytes(there)} are free"
 
 
 def check_safetensors(path: Path) -> None:
     """Raise `ArtifactError` for what is no regular file, or would take more memory than a policy may."""
-    with opened(path) as file:
-        if (problem := too_large(os.fstat(file.fileno()).st_size)) is not None:
+    with open_file(path) as file:
+        if (problem := explain_size(os.fstat(file.fileno()).st_size)) is not None:
             raise ArtifactError(f"{path}: too large: {problem}")
         header = int.from_bytes(file.read(8), "little")  # the format: a length, and as much JSON
     if header > JSON_LIMIT:
-        told = f"{memory.told(header)}, at most {memory.told(JSON_LIMIT)} are read"
+        told = f"{memory.format_bytes(header)}, at most {memory.format_bytes(JSON_LIMIT)} are read"
         raise ArtifactError(f"{path}: damaged, or not a .safetensors file: header too large: {told}")
 
 
@@ -101,13 +103,13 @@ def _within(value: dict[str, Any] | list[Any]) -> Any:
     return value.values() if isinstance(value, dict) else value
 
 
-def explained(error: Exception) -> str:
+def explain_error(error: Exception) -> str:
     """Return in a line what is wrong with a description; of pydantic's report the first problem, with its place."""
     if isinstance(error, pydantic.ValidationError):
         problem = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in problem["loc"]) or "it"
-        return shown(f"{place}: {problem['msg']}, got {shown(problem['input'])}", 200)
-    return shown(str(error), 200)
+        return short_repr(f"{place}: {problem['msg']}, got {short_repr(problem['input'])}", 200)
+    return short_repr(str(error), 200)
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -116,10 +118,10 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     Sizes are checked before anything is unpacked: what the archive, and each array's own header, says. Raises
     `ArtifactError` for what is no file or too large, and whatever numpy and zipfile raise for a damaged one.
     """
-    with opened(path) as file, zipfile.ZipFile(file) as archive:
+    with open_file(path) as file, zipfile.ZipFile(file) as archive:
         members = archive.infolist()
         _check_archive(members)
-        if (problem := too_large(sum(each.file_size for each in members))) is not None:
+        if (problem := explain_size(sum(each.file_size for each in members))) is not None:
             raise ArtifactError(f"{path}: too large: unpacked {problem}")
         return {each.filename.removesuffix(".npy"): _read_member(archive, each) for each in members}
 

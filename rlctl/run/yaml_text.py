@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from rlctl.errors import RecipeError, shown
+from rlctl.errors import RecipeError, short_repr
 
 _PREFIX = "tag:yaml.org,2002:"
 _DEEPEST = 50
@@ -44,9 +44,9 @@ class _Loader(yaml.SafeLoader):
         try:
             number = int(text, 0) if text.lstrip("+-").startswith(("0x", "0o")) else int(text)
         except ValueError:  # text with an explicit tag, or thousands of digits
-            raise _problem(f"{shown(text)} is not a whole number that can be read", node) from None
+            raise _problem(f"{short_repr(text)} is not a whole number that can be read", node) from None
         if abs(number) >= 2**63:
-            raise _problem(f"{shown(text)} is too large a number", node)
+            raise _problem(f"{short_repr(text)} is too large a number", node)
         return number
 
     def construct_float(self, node: yaml.ScalarNode) -> float:
@@ -54,18 +54,18 @@ class _Loader(yaml.SafeLoader):
         try:
             return float(text.replace(".inf", "inf").replace(".nan", "nan"))
         except ValueError:
-            raise _problem(f"{shown(text)!r} is not a number", node) from None
+            raise _problem(f"{short_repr(text)!r} is not a number", node) from None
 
     def construct_bool(self, node: yaml.ScalarNode) -> bool:
         text = self.construct_scalar(node).lower()
         if text not in ("true", "false"):
-            raise _problem(f"{shown(text)!r} is not true or false", node)
+            raise _problem(f"{short_repr(text)!r} is not true or false", node)
         return text == "true"
 
     def construct_text(self, node: yaml.ScalarNode) -> str:
         text: str = self.construct_scalar(node)
         if any("\ud800" <= character <= "\udfff" for character in text):
-            raise _problem(f"{shown(ascii(text))} has half a character, which no file can hold", node)
+            raise _problem(f"{short_repr(ascii(text))} has half a character, which no file can hold", node)
         return text
 
 
@@ -75,7 +75,7 @@ def _problem(told: str, node: yaml.Node) -> yaml.YAMLError:
 
 def _text_of_key(node: yaml.Node) -> str:
     if node.tag != f"{_PREFIX}str" or not isinstance(node.value, str):
-        told = shown(node.value) if isinstance(node.value, str) else "a list or a mapping"
+        told = short_repr(node.value) if isinstance(node.value, str) else "a list or a mapping"
         raise _problem(f"{told} cannot be a key: keys are text, numbers in quotes", node)
     if node.value == "<<":
         raise _problem("merge keys (<<) are not read: write the values out, or give them by name (*name)", node)
@@ -154,7 +154,7 @@ def load(text: str, source: str) -> Any:
         problem = getattr(error, "problem", None) or str(error)
         if isinstance(error, yaml.composer.ComposerError) and error.context:
             problem = f"{error.context}, {problem}"
-        raise RecipeError(f"{where}: {shown(problem, 200)}") from None
+        raise RecipeError(f"{where}: {short_repr(problem, 200)}") from None
 
 
 def dump(value: Any) -> str:

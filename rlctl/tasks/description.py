@@ -78,12 +78,12 @@ def describe(task: str) -> Description:
     env = spec.make()
     # Guarded: attributes of an environment are a plugin's code too.
     try:
-        description: Description = registry.guarded(task, lambda: _described(task, constructor, recipe, env))
+        description: Description = registry.call_plugin(task, lambda: _described(task, constructor, recipe, env))
     except TaskError:
         with contextlib.suppress(TaskError):
-            registry.guarded(task, lambda: env.close())
+            registry.call_plugin(task, lambda: env.close())
         raise
-    registry.guarded(task, lambda: env.close())
+    registry.call_plugin(task, lambda: env.close())
     return description
 
 
@@ -94,7 +94,7 @@ def _described(task: str, constructor: Any, recipe: recipes.Recipe, env: gymnasi
     cls = type(built.task if isinstance(built, TaskEnv) else built)
     target = f"{cls.__module__}:{cls.__qualname__}"
     distribution, version = _origin(task, target)
-    recipe_file = registry.recipe_file(task)
+    recipe_file = registry.find_recipe_file(task)
     max_steps: int | None
     if isinstance(built, TaskEnv):
         observations, accepted, max_steps = _observations(built), parameters.of_task(cls), built.max_steps
@@ -123,7 +123,7 @@ def _described(task: str, constructor: Any, recipe: recipes.Recipe, env: gymnasi
 
 
 def _origin(task: str, target: str) -> tuple[str | None, str | None]:
-    entry = registry.find(task) or next((each for each in registry.installed() if each.target == target), None)
+    entry = registry.find(task) or next((each for each in registry.list_installed() if each.target == target), None)
     if entry is not None:
         return entry.distribution, entry.version
     if task.rpartition(":")[0].endswith(".py"):  # any package may have a module of that name

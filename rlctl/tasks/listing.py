@@ -21,7 +21,7 @@ class ListedTask:
 def list_tasks(*, check: bool = False) -> list[ListedTask]:
     """List the installed tasks; `check` imports each in a child process."""
     listed = []
-    for entry in registry.installed():
+    for entry in registry.list_installed():
         problem = entry.problem
         algo = None
         try:

@@ -14,7 +14,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from rlctl.errors import RecipeError, UsageError, did_you_mean, shown
+from rlctl.errors import RecipeError, UsageError, did_you_mean, short_repr
 from rlctl.run.hyperparameters import with_whole_numbers
 from rlctl.run.recipe import Normalize, Recipe
 from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
@@ -62,7 +62,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
             **kwargs,
         )
     except (AssertionError, ValueError, TypeError, RuntimeError, MemoryError) as error:
-        raise RecipeError(f"{recipe.algo} cannot be used here: {shown(str(error), 300)}") from error
+        raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error), 300)}") from error
 
 
 def _check_device(device: str) -> None:

@@ -26,7 +26,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from rlctl.errors import ArtifactError
 from rlctl.run import files, untrusted
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import PolicyInfo, policy_bytes, versions
+from rlctl.run.policy import PolicyInfo, collect_versions, encode_policy
 from rlctl.train import replay_segments, snapshot
 from rlctl.train.curriculum import begin_next_episodes
 from rlctl.train.progress import Progress
@@ -101,7 +101,7 @@ class Checkpoints:
             segments = self._replay.save(self._added)
             tensors |= replay_segments.hindsight_tensors(self._replay.buffer)
         contents = {
-            _POLICY: policy_bytes(*packed),
+            _POLICY: encode_policy(*packed),
             _TENSORS: save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()}),
         }
         state = State(
@@ -122,7 +122,7 @@ class Checkpoints:
     def computed_with(self) -> dict[str, str]:
         """Return what the last bits of this training's results depend on."""
         return {
-            **versions(),
+            **collect_versions(),
             "machine": platform.machine(),
             "processor": f"{_maker()} {torch.backends.cpu.get_cpu_capability()}",
             "threads": str(torch.get_num_threads()),

@@ -15,7 +15,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
 from rlctl.rollout.workers import EpisodeResult, Workers
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.stages import Stage, StageContent, title
+from rlctl.run.stages import Stage, StageContent, format_title
 from rlctl.train.display import percent
 from rlctl.train.hindsight import HindsightBuffer
 from rlctl.train.progress import Progress
@@ -52,7 +52,7 @@ class Curriculum:
     @property
     def title(self) -> str:
         """The present stage for people: `stage 2 of 3: tolerance 0.1`."""
-        return title(self.number, self.stages)
+        return format_title(self.number, self.stages)
 
     def columns(self) -> dict[str, int]:
         """Return what tables say of the stage: nothing without stages."""
@@ -131,7 +131,7 @@ def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
         except RlctlError as error:
             raise type(error)(f"{where}: {error}", details=error.details) from None
         first = first or info
-        if difference := info.difference(first, "stage 1's"):
+        if difference := info.find_difference(first, "stage 1's"):
             raise RecipeError(
                 f"{where}: {difference}. One policy learns in all stages: leave out the task parameter that changes it"
             )

@@ -14,7 +14,7 @@ from rlctl.run import files
 from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
-from rlctl.run.policy import versions
+from rlctl.run.policy import collect_versions
 
 _LATEST = 1000
 _POLICY = "training step "
@@ -48,7 +48,7 @@ class EpisodeKeeper:
         policy = "training" if evaluated_at is None else f"{_POLICY}{evaluated_at}"
         failure = str(error).partition("\n")[0]
         info = EpisodeInfo.of(
-            spec, seed=error.seed, policy=policy, total_reward=0.0, versions=versions(), failure=failure
+            spec, seed=error.seed, policy=policy, total_reward=0.0, versions=collect_versions(), failure=failure
         )
         nothing = np.zeros(0)
         # Of a reset that failed there is no action to take the shape from.
@@ -71,7 +71,7 @@ class EpisodeKeeper:
             success=episode.result.success,
             total_reward=episode.result.total_reward,
             term_names=list(self.info.reward_weights),
-            versions=versions(),
+            versions=collect_versions(),
         )
         return RecordedEpisode(info, trajectory.actions, trajectory.observations, trajectory.rewards, trajectory.terms)
 

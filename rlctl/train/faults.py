@@ -32,4 +32,4 @@ def kept(
         return error
     files: list[Path] = []
     saver.attempt("failed episode", lambda: files.append(keeper.keep_failed(spec, error, evaluated_at)))
-    return error.hinting(f"to live it again: rlctl replay {files[0]}") if files else error
+    return error.with_hint(f"to live it again: rlctl replay {files[0]}") if files else error

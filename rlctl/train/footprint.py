@@ -42,8 +42,8 @@ def check(recipe: Recipe, observation_space: spaces.Space[Any], action_space: sp
     for name, size in needs.items():
         if size > _MOST_OF_IT * there:
             raise RecipeError(
-                f"{name}: {_value(recipe, name)} needs {memory.told(size)} of memory, and {memory.told(there)} are "
-                "free; give less"
+                f"{name}: {_value(recipe, name)} needs {memory.format_bytes(size)} of memory, and "
+                f"{memory.format_bytes(there)} are free; give less"
             )
 
 

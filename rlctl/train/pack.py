@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from rlctl.env_spec import EnvSpec
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.policy import PolicyInfo, versions
+from rlctl.run.policy import PolicyInfo, collect_versions
 from rlctl.run.stages import StageContent
 from rlctl.run.torch_policy import describe_network, policy_name
 
@@ -45,7 +45,7 @@ def pack(
         frame_stack=spec.frame_stack,
         stages=list(stages),
         training_steps=model.num_timesteps,
-        versions=versions(),
+        versions=collect_versions(),
     )
     return info, tensors
 

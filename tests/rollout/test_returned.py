@@ -97,7 +97,7 @@ def test_a_category_that_the_space_has_not():
 
 
 def test_functions_that_call_each_other_for_ever():
-    from rlctl.errors import their_traceback
+    from rlctl.errors import format_plugin_traceback
 
     def one():
         other()
@@ -107,7 +107,7 @@ def test_functions_that_call_each_other_for_ever():
 
     with pytest.raises(RecursionError) as caught:
         one()
-    lines = their_traceback(caught.value).splitlines()
+    lines = format_plugin_traceback(caught.value).splitlines()
     assert len(lines) == 81
     assert lines[40].endswith(" lines left out ...")
 

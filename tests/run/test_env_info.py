@@ -95,10 +95,10 @@ def test_differences_are_told_in_words():
         return EnvInfo(observation_space=space_to_json(observation), action_space=space_to_json(action))
 
     box, wide = spaces.Box(-1.0, 1.0, (2,)), spaces.Box(-1.0, 1.0, (3,))
-    assert info(box, box).difference(info(box, box)) is None
-    assert info(box, box).difference(info(wide, box)) == (
+    assert info(box, box).find_difference(info(box, box)) is None
+    assert info(box, box).find_difference(info(wide, box)) == (
         "its observation space is Box(-1.0, 1.0, (2,), float32), the environment's is Box(-1.0, 1.0, (3,), float32)"
     )
-    assert info(box, box).difference(info(box, spaces.Discrete(2))) == (
+    assert info(box, box).find_difference(info(box, spaces.Discrete(2))) == (
         "its action space is Box(-1.0, 1.0, (2,), float32), the environment's is Discrete(2)"
     )

@@ -6,7 +6,7 @@ import pytest
 
 from rlctl.errors import ArtifactError, RecipeError
 from rlctl.run import recipe
-from rlctl.run.recipe import Recipe, parse_settings, resolve, task_settings, validate
+from rlctl.run.recipe import Recipe, parse_settings, parse_task_settings, resolve, validate
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_defaults_for_an_environment_without_a_recipe():
 def test_every_packaged_recipe_is_valid():
     from rlctl import registry
 
-    for entry in registry.installed():
+    for entry in registry.list_installed():
         if entry.distribution == "rlctl":
             assert entry.recipe_file is not None, entry.name
             assert isinstance(resolve(entry.name, None, {}), Recipe)
@@ -157,7 +157,7 @@ def test_what_can_be(kwargs):
 
 
 def test_numbers_of_the_command_line():
-    values = recipe.from_command_line(["n_envs=4", "seed=1"], seed=7, total_timesteps="1e6", algo=None)
+    values = recipe.merge_flags(["n_envs=4", "seed=1"], seed=7, total_timesteps="1e6", algo=None)
     assert values == {"n_envs": 4, "seed": 7, "total_timesteps": 1e6}
     assert validate(values, "recipe").total_timesteps == 1_000_000
 
@@ -178,11 +178,11 @@ def test_settings_that_cannot_be_read(settings, message):
 
 
 def test_settings_of_verbs_that_take_the_task_only():
-    assert task_settings(["task.tolerance=0.02", "task.name=[a, b]"]) == {"tolerance": 0.02, "name": ["a", "b"]}
+    assert parse_task_settings(["task.tolerance=0.02", "task.name=[a, b]"]) == {"tolerance": 0.02, "name": ["a", "b"]}
     with pytest.raises(RecipeError, match=r"^--set taks: only task\.\* can be set here\. Did you mean 'task'\?$"):
-        task_settings(["taks.tolerance=1"])
+        parse_task_settings(["taks.tolerance=1"])
     with pytest.raises(RecipeError, match=r"^--set task: write task\.key=value$"):
-        task_settings(["task=1"])
+        parse_task_settings(["task=1"])
 
 
 def test_a_file_that_is_none(tmp_path, config):

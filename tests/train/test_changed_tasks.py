@@ -135,9 +135,9 @@ def test_other_spaces(plugin, resume):
 
 
 def test_other_libraries_are_named(killed, resume, monkeypatch, capfd):
-    versions = checkpoint.versions
+    versions = checkpoint.collect_versions
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "versions", lambda: {**versions(), "torch": "1.0", "numpy": "1.26.4"})
+        patch.setattr(checkpoint, "collect_versions", lambda: {**versions(), "torch": "1.0", "numpy": "1.26.4"})
         run = killed("Line")
     resume(run)
     now = versions()

@@ -39,7 +39,7 @@ def build():
     started = []
 
     def model(env: str, **settings):
-        recipe = recipes.with_defaults(recipes.validate({**SMALL_HER, **settings}, "test"))
+        recipe = recipes.fill_defaults(recipes.validate({**SMALL_HER, **settings}, "test"))
         started.append(Workers(recipe.env_specs(env if ":" in env else f"{ENVS}:{env}")[0], recipe.n_envs))
         return build_model(recipe, WorkerVecEnv(started[-1], recipe.seed), "cpu")
 
@@ -132,7 +132,7 @@ def test_an_episode_that_ended_with_its_stage_is_over(build):
 
 
 def test_learning_starts_by_which_every_first_episode_is_over():
-    recipe = recipes.with_defaults(recipes.validate({"algo": "sac", "her": {}, "n_envs": 4}, "test"))
+    recipe = recipes.fill_defaults(recipes.validate({"algo": "sac", "her": {}, "n_envs": 4}, "test"))
     assert replay_arguments(recipe, recipe.her, goals(max_steps=50))["learning_starts"] == 200
     assert replay_arguments(recipe, recipe.her, goals(max_steps=10))["learning_starts"] == 100  # SB3's own
     assert replay_arguments(recipe, recipe.her, goals(max_steps=None))["learning_starts"] == 100
@@ -220,7 +220,7 @@ def test_it_is_refused_before_there_is_a_run(train, tmp_path):
 def test_recipes_that_do_not_go_together_with_it(settings, told):
     recipe = recipes.validate({"algo": "sac", "her": {}, "n_envs": 4, **settings}, "test")
     with pytest.raises(RecipeError) as caught:
-        replay_arguments(recipes.with_defaults(recipe), recipe.her, goals(max_steps=50))
+        replay_arguments(recipes.fill_defaults(recipe), recipe.her, goals(max_steps=50))
     assert str(caught.value) == told
     assert caught.value.exit_code == 2
 
