@@ -1,7 +1,7 @@
 """What the five robots share: torques in, running towards a far target, the family's observations and rewards.
 
 These are the tasks of `AntBulletEnv-v0` and its family as pybullet-envs-gymnasium 0.6.0 has them from an instance's
-second episode on, which is what training sees. (In the first one the floor joins the mean of the body parts' places
+second episode on, which is what training sees. (In the first one the floor joins the mean of the body parts' positions
 only after the reset, and step 1 is rewarded for the jump.) Comments say where their behaviour is odd: published scores
 depend on it, so it stays.
 """
@@ -33,7 +33,7 @@ class Locomotion(Task):
     """Torque at action 1 [N m] of each joint, in the order of actions and observations, which is the model's."""
     torque_type: ClassVar[type[np.floating[Any]]] = np.float64
     alive_bonus: ClassVar[float] = 1.0
-    power_price, torque_price = 2.0, 0.1
+    power_weight, torque_weight = 2.0, 0.1
     """Of the mean |action * joint speed / 10|, and of the mean squared action."""
 
     control_dt, substeps, episode_s = 0.0165, 4, 16.5  # [s], -, [s]
@@ -63,6 +63,7 @@ class Locomotion(Task):
         raise NotImplementedError
 
     def build(self, sim: Sim) -> None:
+        """Load the floor and the robot, its motors switched off."""
         sim.set_gravity(9.8)
         sim.set_contact_stiffness(0.9)
         self.floor = sim.load("floor", "plane_stadium.sdf")
@@ -71,10 +72,10 @@ class Locomotion(Task):
         self.body.disable_motors()
         for link in ("torso", *self.feet):
             self.body.mass_state(link)  # raises for one that the model does not have
-        places = self.body.joint_places(self.motors)
-        if places != list(range(places[0], places[0] + len(places))):
+        joints = self.body.find_joints(self.motors)
+        if joints != list(range(joints[0], joints[0] + len(joints))):
             raise ValueError(f"{self.model}: name the motors one after the other, as the model has them")
-        self.joints = slice(places[0], places[0] + len(places))  # twice as fast as a list
+        self.joints = slice(joints[0], joints[0] + len(joints))  # twice as fast as a list
         self.top_torques = np.array(list(self.motors.values()), self.torque_type)
         self.joint_low = self.body.joint_low[self.joints]
         self.joint_range = self.body.joint_high[self.joints] - self.joint_low
@@ -85,29 +86,31 @@ class Locomotion(Task):
         self.parts = [1, torso, *(part for part in range(2, len(names)) if part != torso)]
 
     def reset(self, rng: np.random.Generator) -> None:
+        """Start every motor's joint within 0.1 rad of 0."""
         positions = self.body.joint_positions.copy()
         positions[self.joints] = rng.uniform(-START_NOISE, START_NOISE, len(self.motors))
         self.body.set_joints(positions)
         self.start_height = self.body.mass_state("torso").position[2]
         self.feet_contact = self.last_feet_contact = np.zeros(len(self.feet), np.float32)
-        self.look()
+        self.update()
 
-    def look(self) -> None:
-        """Work out what both rewards and observations need, once per step."""
-        places = self.body.mass_positions
+    def update(self) -> None:
+        """Compute what both rewards and observations need, once per step."""
+        positions = self.body.mass_positions
         count = len(self.parts) + 1  # the family's mean has the floor, at 0, among the parts
-        x = np.add.reduce([places[part][0] for part in self.parts]) / count
-        y = np.add.reduce([places[part][1] for part in self.parts]) / count
+        x = np.add.reduce([positions[part][0] for part in self.parts]) / count
+        y = np.add.reduce([positions[part][1] for part in self.parts]) / count
         self.to_target = np.array([TARGET_Y - y, TARGET_X - x])  # [m]
         # -1 and 1 at the limits.
-        positions = 2 * (self.body.joint_positions[self.joints] - self.joint_low) / self.joint_range - 1
-        self.joint_states = np.array((positions, 0.1 * self.body.joint_velocities[self.joints]), np.float32)
+        angles = 2 * (self.body.joint_positions[self.joints] - self.joint_low) / self.joint_range - 1
+        self.joint_states = np.array((angles, 0.1 * self.body.joint_velocities[self.joints]), np.float32)
 
     def potential(self) -> float:
         """Minus the time [s] to the target at 1 m per control step; its change is the speed [m/s] towards it."""
         return -math.sqrt(self.to_target.dot(self.to_target)) / self.control_dt
 
     def act(self, action: np.ndarray) -> None:
+        """Apply a torque to every motor's joint: 1 is its top torque."""
         # Contacts are observed, and by the half-cheetah judged, one step late.
         self.last_feet_contact = self.feet_contact
         self.last_potential = self.potential()
@@ -115,7 +118,8 @@ class Locomotion(Task):
         self.body.set_torques(self.torques)
 
     def rewards(self, action: np.ndarray) -> dict[str, float]:
-        self.look()
+        """Return the family's terms."""
+        self.update()
         touching = self.body.links_touching(self.floor)
         self.feet_contact = np.array([foot in touching for foot in self.feet], np.float32)
         power = np.add.reduce(np.abs(action * self.joint_states[1])) / action.size
@@ -123,7 +127,7 @@ class Locomotion(Task):
         return {
             "alive": self.alive(),
             "progress": self.potential() - self.last_potential,
-            "electricity": self.power_price * float(power) + self.torque_price * float(torque),
+            "electricity": self.power_weight * float(power) + self.torque_weight * float(torque),
             "joints_at_limit": float(np.count_nonzero(np.abs(self.joint_states[0]) > AT_LIMIT)),
             "feet_collision": float(len(self.body.links_touching(self.body).intersection(self.feet))),
         }
@@ -134,9 +138,11 @@ class Locomotion(Task):
         return self.alive_bonus if self.stands(torso.position[2], torso.roll_pitch_yaw[1]) else -1.0
 
     def is_terminated(self) -> bool:
+        """End the episode when the robot does not stand."""
         return self.alive() < 0
 
     def observe(self) -> dict[str, np.ndarray]:
+        """Return what the family observes."""
         torso = self.body.mass_state("torso")
         roll, pitch, yaw = torso.roll_pitch_yaw
         heading = math.atan2(*self.to_target) - yaw

@@ -35,6 +35,7 @@ class Ant(Locomotion):
     }
 
     def stands(self, height: float, pitch: float) -> bool:
+        """The belly is off the floor."""
         return height > 0.26  # [m]; the belly has a radius of 0.25
 
 
@@ -57,11 +58,13 @@ class HalfCheetah(Locomotion):
     rlctl_ignore = PLANAR
 
     def stands(self, height: float, pitch: float) -> bool:
+        """The pitch is below 1 rad, and only feet touch the floor."""
         _, fshin, fthigh, _, bshin, bthigh = self.last_feet_contact
         return abs(pitch) < 1.0 and not (fshin or fthigh or bshin or bthigh)
 
     def is_terminated(self) -> bool:
-        return False  # what does not count as standing costs the bonus, and no more
+        """Never: not standing costs the bonus, and no more."""
+        return False
 
 
 class Hopper(Locomotion):
@@ -76,6 +79,7 @@ class Hopper(Locomotion):
     rlctl_ignore = PLANAR
 
     def stands(self, height: float, pitch: float) -> bool:
+        """Higher than 0.8 m, the pitch below 1 rad."""
         return height > 0.8 and abs(pitch) < 1.0
 
 
@@ -98,6 +102,7 @@ class Walker2D(Locomotion):
     rlctl_ignore = PLANAR
 
     def stands(self, height: float, pitch: float) -> bool:
+        """Higher than 0.8 m, the pitch below 1 rad."""
         return height > 0.8 and abs(pitch) < 1.0
 
 
@@ -124,7 +129,7 @@ class Humanoid(Locomotion):
     fast_reset = False  # its limbs touch each other, and such contacts come in another order after a restore
     torque_type = np.float32  # the family rounds the humanoid's torques; another last bit is another fall
     alive_bonus = 2.0  # seventeen noisy motors cost a lot: living must be better than falling
-    power_price, torque_price = 4.25 * 2.0, 4.25 * 0.1
+    power_weight, torque_weight = 4.25 * 2.0, 4.25 * 0.1
     action_space = Box(-1.0, 1.0, (17,), np.float32)
     events = pushes(force=40.0)
     rlctl_ignore = {
@@ -134,8 +139,10 @@ class Humanoid(Locomotion):
     }
 
     def reset(self, rng: np.random.Generator) -> None:
+        """Start as the others do."""
         super().reset(rng)
         self.start_height = 0.8  # [m]; the torso starts at 1.4, and this is what its observed height is counted from
 
     def stands(self, height: float, pitch: float) -> bool:
+        """Higher than 0.78 m."""
         return height > 0.78

@@ -41,23 +41,27 @@ class Reach(Task):
     }
 
     def build(self, sim: Sim) -> None:
+        """Load the floor and the arm."""
         sim.load("plane", "plane.urdf", fixed=True)
         self.arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
         self.arm.cap_joint_speed(SPEED_LIMIT.max())  # a blow on the floor would turn joints faster than any motor
         self.max_speed, self.max_torque = MAX_SPEED.tolist(), self.arm.joint_max_force.tolist()
 
     def reset(self, rng: np.random.Generator) -> None:
+        """Start near the home position, with a goal in a box."""
         self.arm.set_joints(HOME + rng.uniform(-HOME_NOISE, HOME_NOISE, 7))
         self.goal = rng.uniform(GOAL_LOW, GOAL_HIGH)
         self.last_action = self.action_change = np.zeros(7, np.float32)
 
     def act(self, action: np.ndarray) -> None:
+        """Move every joint's target: the joint's angle plus a step."""
         target = self.arm.joint_positions + JOINT_STEP * action
         target = np.minimum(np.maximum(target, self.arm.joint_low), self.arm.joint_high)
         self.arm.drive_to(target, max_speed=self.max_speed, max_force=self.max_torque, gain=GAIN)
         self.action_change, self.last_action = action - self.last_action, action
 
     def observe(self) -> dict[str, np.ndarray]:
+        """Return the arm's state and where the goal is, seen from the hand."""
         return {
             "joint_positions": self.arm.joint_positions,
             "joint_velocities": self.arm.joint_velocities,
@@ -66,6 +70,7 @@ class Reach(Task):
         }
 
     def rewards(self, action: np.ndarray) -> dict[str, float]:
+        """Return the distance, how near the goal is, and the size of the action and of its change."""
         distance = self.distance()
         return {
             "distance": distance,
@@ -79,7 +84,9 @@ class Reach(Task):
         return rewards.distance(self.arm.link_position(HAND), self.goal)
 
     def is_success(self) -> bool:
+        """The hand is within `tolerance` of the goal."""
         return self.distance() < self.tolerance
 
     def markers(self) -> dict[str, np.ndarray]:
+        """The goal."""
         return {"goal": self.goal}

@@ -67,11 +67,12 @@ class Body(Properties):
 
     @property
     def link_names(self) -> list[str]:
+        """Names of all links but the base."""
         return list(self._links)
 
-    def joint_places(self, joints: Iterable[str]) -> list[int]:
-        """Return where joints stand in joint arrays; raises `TaskError` for a name that the file does not have."""
-        return self._joint_places(list(joints))
+    def find_joints(self, joints: Iterable[str]) -> list[int]:
+        """Return the indices of joints in joint arrays; raises `TaskError` for a name that the file does not have."""
+        return self._find_joints(list(joints))
 
     def _joint_states(self) -> tuple[Array, Array]:
         state = self._cache.get("joints")
@@ -208,7 +209,7 @@ class Body(Properties):
             self.joint_indices,
             pybullet.POSITION_CONTROL,
             targetPositions=positions.tolist(),  # half the time of an array
-            forces=self._weakened(self._motor_impulses),
+            forces=self._apply_strength(self._motor_impulses),
             positionGains=self._motor_gains,
             physicsClientId=self.client,
         )
@@ -224,7 +225,7 @@ class Body(Properties):
             )
 
     def disable_motors(self) -> None:
-        """Take the force from the motors that PyBullet gives every joint, so that only `set_torques` moves it."""
+        """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves it."""
         count = len(self.joint_indices)
         pybullet.setJointMotorControlArray(
             self.id,
@@ -245,7 +246,7 @@ class Body(Properties):
             self.id,
             self.joint_indices,
             pybullet.TORQUE_CONTROL,
-            forces=self._weakened(torques.tolist()),
+            forces=self._apply_strength(torques.tolist()),
             physicsClientId=self.client,
         )
 

@@ -43,11 +43,11 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         if render_mode not in (None, "human", "rgb_array"):
             raise RecipeError(f"render_mode {render_mode!r} is not one of: human, rgb_array")
         self.render_mode = render_mode
-        self.reward_weights = _weights(task, reward_weights or {})
+        self.reward_weights = _merge_weights(task, reward_weights or {})
         self.events = (events or EventSettings()).apply(task.events)
         self.has_success = has_success(task)
         if has_compute_reward(task):
-            # Only then: who wants to exchange goals looks whether an environment has it.
+            # Only then: whatever relabels goals looks whether an environment has it.
             self.compute_reward = task.compute_reward
         self.max_steps = task.max_steps
         # A space holds a random generator: one on the class would be shared by every instance.
@@ -65,12 +65,12 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._markers: dict[str, int] = {}
         try:
             self._build()
-            self._acting.rehearse(["reset"], self.sim)
+            self._acting.try_once(["reset"], self.sim)
             task.reset(np.random.default_rng(0))
-            self._acting.rehearse(["start", "interval"], self.sim)
+            self._acting.try_once(["start", "interval"], self.sim)
             first = task.observe()
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
-            self._signals.rehearse()
+            self._signals.try_once()
             # A task knows its markers once an episode has begun; they join the world as it was built.
             markers = list(task.markers()) if render_mode is not None else []
             if self.events or render_mode is not None:
@@ -152,7 +152,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         if not self._running:
             raise TaskError(f"{self.name}: step() before reset(), or after the episode's end")
         task = self.task
-        action = self._checked(action)
+        action = self._check_action(action)
         task.act(self._signals.act(action))
         self.sim.step()
         self._step += 1
@@ -161,7 +161,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         raw = task.rewards(action)
         weights = self.reward_weights
         if raw.keys() != weights.keys():
-            raise _terms_differ(self.name, raw, weights)
+            raise _term_mismatch(self.name, raw, weights)
         terms = {name: weight * raw[name] for name, weight in weights.items()}
         reward = float(sum(terms.values()))
         if not math.isfinite(reward):
@@ -181,7 +181,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self._move_markers()
         return observation, reward, terminated, truncated, info
 
-    def _checked(self, action: Any) -> Any:
+    def _check_action(self, action: Any) -> Any:
         space = self.action_space
         if not isinstance(space, spaces.Box):
             if not space.contains(action):
@@ -200,33 +200,33 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         if self.task.observation_layout == "dict":
             dictionary = {name: np.array(value, np.float32) for name, value in parts.items()}
             if {name: value.shape for name, value in dictionary.items()} != self._shapes:
-                raise self._observation_differs(parts)
+                raise self._shape_mismatch(parts)
             if not all(math.isfinite(value.sum()) for value in dictionary.values()):
                 raise self._not_finite(parts)
             for name, (lowest, highest) in self.task.observation_bounds.items():
-                dictionary[name] = self._bounded(dictionary[name], lowest, highest, parts)
+                dictionary[name] = self._clip_rounding(dictionary[name], lowest, highest, parts)
             return dictionary
         try:
             observation = np.concatenate(list(parts.values()), axis=None, dtype=np.float32)
         except ValueError:
-            raise self._observation_differs(parts) from None
+            raise self._shape_mismatch(parts) from None
         if observation.shape != self.observation_space.shape:
-            raise self._observation_differs(parts)
+            raise self._shape_mismatch(parts)
         if not math.isfinite(np.add.reduce(observation)):
             raise self._not_finite(parts)
         if self.task.observation_bounds:
             low, high = self.observation_space.low, self.observation_space.high  # type: ignore[attr-defined]
-            observation = self._bounded(observation, low, high, parts)
+            observation = self._clip_rounding(observation, low, high, parts)
         return observation
 
-    def _bounded(self, values: NDArray[np.float32], low: Any, high: Any, parts: Mapping[str, Any]) -> Any:
+    def _clip_rounding(self, values: NDArray[np.float32], low: Any, high: Any, parts: Mapping[str, Any]) -> Any:
         # Float rounding only: a value well outside its declared range is an error of the task.
         clipped = np.minimum(np.maximum(values, low), high)
         if np.abs(clipped - values).max() > 1e-4:
             raise self._out_of_bounds(parts)
         return clipped
 
-    def _observation_differs(self, parts: Mapping[str, Any]) -> TaskError:
+    def _shape_mismatch(self, parts: Mapping[str, Any]) -> TaskError:
         now = {name: np.shape(value) for name, value in parts.items()}
         names = [name for name in {**self._shapes, **now} if self._shapes.get(name) != now.get(name)]
         name = names[0] if names else "order"
@@ -265,10 +265,11 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         return None
 
     def close(self) -> None:
+        """End the simulation."""
         self.sim.close()
 
 
-def _weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:
+def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:
     weights = {name: float(weight) for name, weight in task.reward_weights.items()}
     for name, weight in changes.items():
         if name not in weights:
@@ -280,8 +281,8 @@ def _weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:
     return weights
 
 
-def _terms_differ(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:
+def _term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:
     if extra := [name for name in raw if name not in weights]:
         return TaskError(f"{task}: reward term {extra[0]!r} has no weight.{did_you_mean(extra[0], weights)}")
     missing = next(name for name in weights if name not in raw)
-    return TaskError(f"{task}: rewards() gave no term {missing!r}, which reward_weights names")
+    return TaskError(f"{task}: rewards() returned no term {missing!r}, which reward_weights names")

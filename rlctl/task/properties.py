@@ -73,7 +73,7 @@ class Properties:
 
     @cached_property
     def _damping(self) -> list[float]:
-        pybullet.syncBodyInfo(physicsClientId=self.client)  # getJointInfo tells what was loaded, until then
+        pybullet.syncBodyInfo(physicsClientId=self.client)  # getJointInfo returns what was loaded, until then
         return [pybullet.getJointInfo(self.id, i, physicsClientId=self.client)[6] for i in self.joint_indices]
 
     @cached_property
@@ -85,7 +85,7 @@ class Properties:
             colors[shape[1], index] = shape[7]
         return colors
 
-    def _weakened(self, forces: list[float]) -> list[float]:
+    def _apply_strength(self, forces: list[float]) -> list[float]:
         # What the motors give of what they are asked for: one element per joint.
         return forces if self.motor_strength is None else (self.motor_strength * forces).tolist()
 
@@ -103,8 +103,8 @@ class Properties:
             )
         return self._links[link]
 
-    def _joint_places(self, joints: Sequence[str] = ()) -> list[int]:
-        # Where they stand in joint arrays.
+    def _find_joints(self, joints: Sequence[str] = ()) -> list[int]:
+        # Their indices in joint arrays.
         for joint in joints:
             if joint not in self.joint_names:
                 raise TaskError(
@@ -119,12 +119,12 @@ class Properties:
         # A link's index, or -1 for the base, by its name.
         return -1 if part == self.base_name and part not in self._links else self._link_index(part)
 
-    def _chosen(self, links: Sequence[str]) -> list[int]:
+    def _select_links(self, links: Sequence[str]) -> list[int]:
         return [self._part_index(link) for link in links] or list(range(-1, len(self._links)))
 
     def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
         """Set mass and inertia to `factor` times the built world's values, until the next reset."""
-        chosen, nominal = self._chosen(links), self._dynamics
+        chosen, nominal = self._select_links(links), self._dynamics
         self._dynamics_changed = True
         for link in chosen:
             mass, _, inertia = nominal[link]
@@ -132,7 +132,7 @@ class Properties:
 
     def set_friction(self, friction: float, links: Sequence[str] = ()) -> None:
         """Set the lateral friction, until the next reset."""
-        chosen, _ = self._chosen(links), self._dynamics
+        chosen, _ = self._select_links(links), self._dynamics
         self._dynamics_changed = True
         for link in chosen:
             self._change(link, lateralFriction=friction)
@@ -140,21 +140,21 @@ class Properties:
     def scale_joint_damping(self, factor: float, joints: Sequence[str] = ()) -> None:
         """Set the joints' damping to `factor` times the built world's values, until the next reset."""
         nominal = self._damping
-        self._set_damping({place: factor * nominal[place] for place in self._joint_places(joints)})
+        self._set_damping({index: factor * nominal[index] for index in self._find_joints(joints)})
 
     def set_joint_damping(self, damping: float, joints: Sequence[str] = ()) -> None:
         """Set the joints' damping [N m s/rad or N s/m], until the next reset."""
-        self._set_damping(dict.fromkeys(self._joint_places(joints), damping))
+        self._set_damping(dict.fromkeys(self._find_joints(joints), damping))
 
     def _set_damping(self, values: dict[int, float]) -> None:
         _ = self._damping  # nominal values are read before the first change
         self._damping_changed = True
-        for place, damping in values.items():
-            self._change(self.joint_indices[place], jointDamping=damping)
+        for index, damping in values.items():
+            self._change(self.joint_indices[index], jointDamping=damping)
 
     def set_color(self, rgb: Sequence[float], links: Sequence[str] = ()) -> None:
         """Paint the links: red, green, blue in [0, 1]; how opaque they are stays. Until the next reset."""
-        chosen, nominal = self._chosen(links), self._colors
+        chosen, nominal = self._select_links(links), self._colors
         self._colors_changed = True
         for (link, shape), color in nominal.items():
             if link in chosen:
@@ -164,8 +164,8 @@ class Properties:
         """Let the joints' motors give `factor` times the force they are asked for, until the next reset."""
         built = np.ones(len(self.joint_indices)) if self._built_strength is None else self._built_strength
         strength = built.copy() if self.motor_strength is None else self.motor_strength.copy()
-        places = self._joint_places(joints)
-        strength[places] = factor * built[places]
+        indices = self._find_joints(joints)
+        strength[indices] = factor * built[indices]
         self.motor_strength = strength
 
     def _mass_centre(self, link: int) -> tuple[float, ...]:

@@ -77,7 +77,7 @@ def posture(orientation: Array) -> float:
     """Return roll^2 + pitch^2 [rad^2] of a quaternion (x, y, z, w): 0 upright, whatever the heading.
 
     With the z-y-x (yaw, pitch, roll) angles of a unit quaternion: roll = atan2(2 (w x + y z), 1 - 2 (x^2 + y^2)),
-    pitch = asin(2 (w y - z x)). Where the pitch is a right angle no roll can be told, and it counts as 0.
+    pitch = asin(2 (w y - z x)). Where the pitch is a right angle the roll is undefined, and it counts as 0.
     """
     x, y, z, w = orientation.tolist()
     sine = 2 * (w * y - z * x)

@@ -92,24 +92,24 @@ class Sim:
         if path.suffix in (".xml", ".sdf"):
             if fixed or any(position) or tuple(orientation) != (0, 0, 0, 1):
                 raise TaskError(f"{path.name} says itself where its body is: position, orientation, fixed are for URDF")
-            body_id = self._load_placed(path, flags)
+            body_id = self._load_scene(path, flags)
             # A base without mass stays where it is.
             fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0
         else:
-            body_id = self._loaded(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
+            body_id = self._call_loader(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
         self.bodies[name] = Body(self.client, int(self._settings["numSubSteps"]), name, body_id, path, fixed)
         return self.bodies[name]
 
-    def _load_placed(self, path: Path, flags: int) -> int:
+    def _load_scene(self, path: Path, flags: int) -> int:
         if path.suffix == ".xml":
-            ids = self._loaded(path, pybullet.loadMJCF, flags=flags)
+            ids = self._call_loader(path, pybullet.loadMJCF, flags=flags)
         else:
-            ids = self._loaded(path, pybullet.loadSDF)
+            ids = self._call_loader(path, pybullet.loadSDF)
         if len(ids) != 1:
             raise TaskError(f"{path} holds {len(ids)} bodies; load takes files of one, so split it")
         return int(ids[0])
 
-    def _loaded(self, path: Path, load: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    def _call_loader(self, path: Path, load: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         try:
             return load(str(path), *args, **kwargs, physicsClientId=self.client)
         except pybullet.error as error:

@@ -31,7 +31,7 @@ def test_names_of_a_model(leg):
     assert leg.base_name == "torso"
     assert leg.joint_names == ["knee"]
     with pytest.raises(TaskError, match=r"^leg.xml has no joint 'nee'\. Did you mean 'knee'\? It has: knee\.$"):
-        leg.joint_places(["nee"])
+        leg.find_joints(["nee"])
     with pytest.raises(TaskError, match=r"^leg.xml has no link 'shim'\. Did you mean 'shin'\? It has: "):
         leg.mass_state("shim")
 

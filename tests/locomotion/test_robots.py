@@ -69,8 +69,8 @@ def test_the_terms_of_a_falling_ant():
     env.close()
 
 
-@pytest.mark.parametrize(("robot", "price"), [(Hopper, 1.0), (Humanoid, 4.25)])
-def test_electricity_by_hand(robot, price):
+@pytest.mark.parametrize(("robot", "weight"), [(Hopper, 1.0), (Humanoid, 4.25)])
+def test_electricity_by_hand(robot, weight):
     env = TaskEnv(robot())
     env.reset(seed=0)
     task, motors = env.task, env.action_space.shape[0]
@@ -81,7 +81,7 @@ def test_electricity_by_hand(robot, price):
     action[:2] = 1.0, 0.5
     task.last_potential = 0.0
     # 2 * (1 * 0.2 + 0.5 * 0.4) + 0.1 * (1 + 0.25) = 0.8 + 0.125, a mean over all motors
-    assert task.rewards(action)["electricity"] == pytest.approx(price * 0.925 / motors)
+    assert task.rewards(action)["electricity"] == pytest.approx(weight * 0.925 / motors)
     env.close()
 
 

@@ -45,12 +45,12 @@ RANGE = "Write [low, high], a number, or {from: [low, high], to: [low, high]}."
         ({"mass": {"factor": 0}}, "events.mass.factor: 0 is not above 0."),
         ({"friction": {"friction": [-0.1, 1.0]}}, "events.friction.friction: -0.1 is not at least 0."),
         ({"color": {"red": [0.0, 255]}}, "events.color.red: 255 is not at most 1."),
-        ({"mass": {"factor": "big"}}, f"events.mass.factor: 'big' is no range of finite numbers. {RANGE}"),
-        ({"mass": {"factor": [1, 2, 3]}}, f"events.mass.factor: [1, 2, 3] is no range of finite numbers. {RANGE}"),
-        ({"mass": {"factor": [1, True]}}, f"events.mass.factor: [1, True] is no range of finite numbers. {RANGE}"),
+        ({"mass": {"factor": "big"}}, f"events.mass.factor: 'big' is not a range of finite numbers. {RANGE}"),
+        ({"mass": {"factor": [1, 2, 3]}}, f"events.mass.factor: [1, 2, 3] is not a range of finite numbers. {RANGE}"),
+        ({"mass": {"factor": [1, True]}}, f"events.mass.factor: [1, True] is not a range of finite numbers. {RANGE}"),
         (
             {"mass": {"factor": [0.5, float("inf")]}},
-            f"events.mass.factor: [0.5, inf] is no range of finite numbers. {RANGE}",
+            f"events.mass.factor: [0.5, inf] is not a range of finite numbers. {RANGE}",
         ),
         ({"mass": {"factor": {"from": [1, 1]}}}, f"events.mass.factor: 'to' is missing. {RANGE}"),
         (
@@ -59,7 +59,7 @@ RANGE = "Write [low, high], a number, or {from: [low, high], to: [low, high]}."
         ),
         ({"mass": {"factor": {"from": 1, "to": [-1, 2]}}}, "events.mass.factor.to: -1 is not above 0."),
         ({"push": {"every_s": 0}}, "events.push.every_s: 0 is not above 0."),
-        ({"push": {"every_s": "often"}}, f"events.push.every_s: 'often' is no range of finite numbers. {RANGE}"),
+        ({"push": {"every_s": "often"}}, f"events.push.every_s: 'often' is not a range of finite numbers. {RANGE}"),
         (
             {"mass": {"every_s": 1}},
             "events.mass: no parameter 'every_s'. It has: body, factor, links.",

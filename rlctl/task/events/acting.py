@@ -25,20 +25,21 @@ class ActingEvents:
         self._periods = [max(1, round(event.event.every_s / control_dt)) for event in self._events["interval"]]
 
     def run(self, when: When, sim: Sim, rng: np.random.Generator, level: float) -> dict[str, Drawn]:
-        """Let the events of `when` act; returns what they drew, by name."""
+        """Call the events of `when`; returns what they drew, by name."""
         return {event.name: event(sim, rng, level) for event in self._events[when]}
 
     def run_due(self, step: int, sim: Sim, rng: np.random.Generator, level: float) -> dict[str, Drawn]:
-        """Let the interval events act whose period ends at `step`."""
+        """Call the interval events whose period ends at `step`."""
         due = zip(self._events["interval"], self._periods, strict=True)
         return {event.name: event(sim, rng, level) for event, period in due if step % period == 0}
 
     @property
     def has_intervals(self) -> bool:
+        """Whether any event acts during an episode."""
         return bool(self._periods)
 
-    def rehearse(self, moments: Iterable[When], sim: Sim) -> None:
-        """Let events act once, for their mistakes: a name that is not in this world, or a result that is none."""
+    def try_once(self, moments: Iterable[When], sim: Sim) -> None:
+        """Call events once, to find mistakes: a name that is not in this world, or a result of the wrong type."""
         for when in moments:
             for event in self._events[when]:
                 try:
@@ -63,7 +64,7 @@ class Signals:
     ) -> None:
         self._on_observation = [event for event in events.values() if event.event.when == "observation"]
         self._on_action = [event for event in events.values() if event.event.when == "action"]
-        self._of = {event.name: _observed_names(event, first) for event in self._on_observation}
+        self._of = {event.name: _find_observed(event, first) for event in self._on_observation}
         self._first = first
         self._space = action_space
         for event in self._on_action:
@@ -82,18 +83,18 @@ class Signals:
         self.drawn = {}
         self._rng, self._level = rng, level
         self._observation_signals = None  # begins with the first observation
-        self._action_signals = [self._started(event, self._neutral_action()) for event in self._on_action]
+        self._action_signals = [self._start(event, self._zero_action()) for event in self._on_action]
 
-    def rehearse(self) -> None:
-        """Begin every signal once, for its mistakes."""
+    def try_once(self) -> None:
+        """Begin every signal once, to find mistakes."""
         self.begin(np.random.default_rng(0), 1.0)
         self.observe(self._first)
 
-    def _neutral_action(self) -> Parts:
+    def _zero_action(self) -> Parts:
         low, high = self._space.low, self._space.high  # type: ignore[attr-defined]
         return {_ACTION: np.clip(np.zeros_like(low), low, high)}
 
-    def _started(self, event: BoundEvent, first: Parts) -> Signal:
+    def _start(self, event: BoundEvent, first: Parts) -> Signal:
         made = event(self._rng, first, self._level)
         if not (isinstance(made, tuple) and len(made) == 2 and callable(made[1])):
             raise TaskError(f"events.{event.name}: its function must return what it drew and a signal, not {made!r}")
@@ -107,19 +108,19 @@ class Signals:
         if self._observation_signals is None:
             return self._observe_first(parts)
         for names, signal in self._observation_signals:
-            parts = self._through(signal, names, parts)
+            parts = self._apply(signal, names, parts)
         return parts
 
     def _observe_first(self, parts: Parts) -> Parts:
         self._observation_signals = []
         for event in self._on_observation:
             names = self._of[event.name]
-            signal = self._started(event, {name: parts[name] for name in names})
+            signal = self._start(event, {name: parts[name] for name in names})
             self._observation_signals.append((names, signal))
-            parts = self._through(signal, names, parts)
+            parts = self._apply(signal, names, parts)
         return parts
 
-    def _through(self, signal: Signal, names: list[str], parts: Parts) -> Parts:
+    def _apply(self, signal: Signal, names: list[str], parts: Parts) -> Parts:
         changed = dict(signal({name: parts[name] for name in names}))
         for name in names:
             if name in self._bounds:
@@ -137,7 +138,7 @@ class Signals:
         return np.clip(parts[_ACTION], low, high).astype(self._space.dtype)
 
 
-def _observed_names(event: BoundEvent, first: Parts) -> list[str]:
+def _find_observed(event: BoundEvent, first: Parts) -> list[str]:
     of = event.event.of
     names = [of] if isinstance(of, str) else list(of)
     for name in names:

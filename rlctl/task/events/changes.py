@@ -91,17 +91,17 @@ def offset_joints(
     Every joint has draws of its own; positions stay inside the joint's limits.
     """
     moved = sim.body(body)
-    places = moved.joint_places(joints)
-    by_position = rng.uniform(*position, len(places))
-    by_velocity = rng.uniform(*velocity, len(places))
+    indices = moved.find_joints(joints)
+    by_position = rng.uniform(*position, len(indices))
+    by_velocity = rng.uniform(*velocity, len(indices))
     positions, velocities = moved.joint_positions.copy(), moved.joint_velocities.copy()
-    low, high = moved.joint_low[places], moved.joint_high[places]
-    started = positions[places] + by_position
+    low, high = moved.joint_low[indices], moved.joint_high[indices]
+    started = positions[indices] + by_position
     # A joint without limits says so by a lower one that is not below the upper.
-    positions[places] = np.where(low < high, np.clip(started, low, high), started)
-    velocities[places] += by_velocity
+    positions[indices] = np.where(low < high, np.clip(started, low, high), started)
+    velocities[indices] += by_velocity
     moved.set_joints(positions, velocities)
-    names = [moved.joint_names[place] for place in places]
+    names = [moved.joint_names[index] for index in indices]
     drawn = {f"{name} position": float(by) for name, by in zip(names, by_position, strict=True)}
     return drawn | {f"{name} velocity": float(by) for name, by in zip(names, by_velocity, strict=True)}
 

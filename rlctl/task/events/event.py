@@ -139,8 +139,8 @@ def _check_type(where: str, hint: Any, value: Any, error: type[RlctlError]) -> N
     try:
         pydantic.TypeAdapter(hint).validate_python(value)
     except pydantic.ValidationError as problem:
-        told = problem.errors()[0]["msg"].removeprefix("Input ")
-        raise error(f"{where}: {told}, got {value!r}") from None
+        message = problem.errors()[0]["msg"].removeprefix("Input ")
+        raise error(f"{where}: {message}, got {value!r}") from None
     except pydantic.errors.PydanticSchemaGenerationError:
         return  # a type of the author's own
 
@@ -168,7 +168,7 @@ class EventSettings:
     changes: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
     def apply(self, events: Mapping[str, Event]) -> dict[str, BoundEvent]:
-        """Return the events that act, by name; also looks at those that rest for mistakes."""
+        """Return the events that act, by name; checks the others for mistakes too."""
         for name in self.changes:
             if name not in events:
                 raise RecipeError(

@@ -30,7 +30,7 @@ class Limits:
     whole: bool = False
     """Whole numbers; `high` of the range is drawn too."""
 
-    def complaint(self, value: float) -> str:
+    def find_violation(self, value: float) -> str:
         """Say what is wrong with a value, or nothing."""
         if self.whole and value != int(value):
             return f"{value:g} is not a whole number"
@@ -79,13 +79,13 @@ _EXPECTED = "Write [low, high], a number, or {from: [low, high], to: [low, high]
 def _pair(where: str, value: Any, limits: Limits, error: type[Exception]) -> Range:
     numbers = list(value) if isinstance(value, list | tuple | np.ndarray) else [value, value]
     if len(numbers) != 2 or not all(_is_number(number) for number in numbers):
-        raise error(f"{where}: {value!r} is no range of finite numbers. {_EXPECTED}")
+        raise error(f"{where}: {value!r} is not a range of finite numbers. {_EXPECTED}")
     low, high = (float(number) for number in numbers)
     if low > high:
         raise error(f"{where}: [{low:g}, {high:g}] is reversed. Write the lower value first: [{high:g}, {low:g}].")
     for number in (low, high):
-        if complaint := limits.complaint(number):
-            raise error(f"{where}: {complaint}.")
+        if violation := limits.find_violation(number):
+            raise error(f"{where}: {violation}.")
     return low, high
 
 

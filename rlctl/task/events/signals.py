@@ -33,15 +33,15 @@ def delay(rng: Rng, first: Parts, *, steps: Steps) -> tuple[Drawn, Signal]:
     Until then an observation is the episode's first, and an action is 0, or what is nearest to 0 in the action space.
     """
     drawn = int(rng.integers(int(steps[0]), int(steps[1]) + 1))
-    past = deque([_copied(first)] * drawn, maxlen=drawn + 1)
+    past = deque([_copy_parts(first)] * drawn, maxlen=drawn + 1)
 
     def late(parts: Parts) -> Parts:
-        past.append(_copied(parts))
+        past.append(_copy_parts(parts))
         return past[0]
 
     return {"steps": float(drawn)}, late
 
 
-def _copied(parts: Parts) -> Parts:
+def _copy_parts(parts: Parts) -> Parts:
     # A task may go on writing into the arrays that it gave.
     return {name: np.array(value) for name, value in parts.items()}
