@@ -284,9 +284,7 @@ def replay(
     settings: Set = [],  # noqa: B006
     verify: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(
-            metavar="EPISODE", help="Live a recorded episode again; exit 1 unless identical.", show_default=False
-        ),
+        typer.Option(metavar="EPISODE", help="Replay a recorded episode; exit 1 unless identical.", show_default=False),
     ] = None,
     gui: Annotated[bool, typer.Option("--gui", help="Show it in PyBullet's window instead of recording.")] = False,
     output: Annotated[

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 from rerun.urdf import UrdfTree
+from scipy.spatial.transform import Rotation
 
-from rlctl.replay.scene import BodyMotion, Scene
-from rlctl.replay.shapes import draw_shapes, shape_centers
+from rlctl.replay.mjcf import Shape
+from rlctl.replay.scene import BodyMotion, Scene, Warn
 from rlctl.replay.timelines import Timelines
+from rlctl.task.bullet import pybullet
 
-Tell = Callable[[str], None]
 WORLD_FRAME = "tf#/"
 _MARKER_COLORS = [(40, 200, 90), (70, 150, 255), (240, 120, 200), (250, 180, 40)]
 _HALO_RADIUS = 0.09  # [m]
 _PATH_COLOR = (255, 80, 180)
 _GROUND_COLOR = (70, 74, 82)
+_MESHES = {".obj", ".stl", ".dae", ".glb", ".gltf"}
 
 
-def draw_scene(scene: Scene, timelines: Timelines, tell: Tell) -> str | None:
-    """Draw everything under `world/`; `tell` hears of what could not be drawn as it should be.
+def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> str | None:
+    """Draw everything under `world/`; `warn` receives what could not be drawn as it should be.
 
     Returns the entity that the camera is to follow: the trunk of the first robot that has one, if it was drawn.
     """
@@ -33,7 +33,7 @@ def draw_scene(scene: Scene, timelines: Timelines, tell: Tell) -> str | None:
         if body.ground_height is not None:
             _draw_ground(body, scene, timelines)
         else:
-            drawn = _draw_body(body, timelines, tell)
+            drawn = _draw_body(body, timelines, warn)
             if body.trunk is not None:
                 trunk = _entity("world", body.name, body.links[body.trunk]) + "/"
                 trunks += [entity for entity in drawn if entity.startswith(trunk)]
@@ -83,9 +83,8 @@ def _draw_ground(body: BodyMotion, scene: Scene, timelines: Timelines) -> None:
 
 def bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the lowest and highest coordinates [m] that links and markers reach, each of shape (3,)."""
-    places = [body.positions.reshape(-1, 3) for body in scene.bodies if body.ground_height is None]
-    places += list(scene.markers.values())
-    points = np.concatenate([*places, np.zeros((0, 3))])
+    paths = [body.positions.reshape(-1, 3) for body in scene.bodies if body.ground_height is None]
+    points = np.concatenate([*paths, *scene.markers.values(), np.zeros((0, 3))])
     return (points.min(axis=0), points.max(axis=0)) if len(points) else (-np.ones(3), np.ones(3))
 
 
@@ -100,24 +99,24 @@ def start_bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]
     for link, name in enumerate(body.links):
         shapes = [shape for shape in body.shapes if shape.link == name]
         for shape, center in zip(shapes, shape_centers(body, link)[:, 0], strict=True):
-            reach = 0.0 if shape.mesh else max(shape.size, default=0.0) / 2  # a mesh has a scale, and no size
+            reach = 0.0 if shape.mesh else max(shape.size, default=0.0) / 2  # a mesh has a scale instead of a size
             low.append(center - reach)
             high.append(center + reach)
     return np.min(low, axis=0), np.max(high, axis=0)
 
 
-def _draw_body(body: BodyMotion, timelines: Timelines, tell: Tell) -> list[str]:
+def _draw_body(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]:
     """Draw a body that moves; return the entities of its shapes."""
     if body.file.suffix == ".xml":
-        return draw_shapes(body, timelines, tell)
+        return draw_shapes(body, timelines, warn)
     try:
         tree = UrdfTree.from_file_path(
             body.file, frame_prefix=f"{body.name}/", static_transform_entity_path=_entity("tf", body.name, "fixed")
         )
     except Exception as error:  # Rerun's reader is stricter than PyBullet's, and raises what its parser raises
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        tell(f"{body.file.name}: drawn from PyBullet's shapes, Rerun cannot read it: {reason}")
-        return draw_shapes(body, timelines, tell)
+        warn(f"{body.file.name}: drawn from PyBullet's shapes, Rerun cannot read it: {reason}")
+        return draw_shapes(body, timelines, warn)
     _send_motion(tree, body, timelines)
     return _send_meshes(tree, body, timelines.stream)
 
@@ -173,19 +172,74 @@ def _send_motion(tree: UrdfTree, body: BodyMotion, timelines: Timelines) -> None
 
 
 def _draw_path(body: BodyMotion, timelines: Timelines) -> None:
-    """Draw the way of a robot's trunk, or else of an arm's last link: a segment per step."""
+    """Draw the path of a robot's trunk, or else of an arm's last link: a segment per step."""
     if not body.joint_names or (body.trunk is None and not body.chain):
         return
-    points = _traveller(body).astype(np.float32)
+    points = _path_points(body).astype(np.float32)
     entity = _entity("world", "paths", body.name)
     timelines.stream.log(entity, rr.LineStrips3D.from_fields(radii=0.004, colors=_PATH_COLOR), static=True)
     segments = [points[step - 1 : step + 1] for step in range(1, len(points))]
     timelines.send(entity, range(1, len(points)), rr.LineStrips3D.columns(strips=segments))
 
 
-def _traveller(body: BodyMotion) -> NDArray[np.float64]:
+def _path_points(body: BodyMotion) -> NDArray[np.float64]:
     if body.trunk is None:
         return body.positions[:, -1]
     centers = shape_centers(body, body.trunk)
     # The frame of an MJCF body may lie far outside of it.
     return centers[0] if body.file.suffix == ".xml" and len(centers) else body.positions[:, body.trunk]
+
+
+def shape_centers(body: BodyMotion, link: int) -> NDArray[np.float64]:
+    """Return the positions of the shapes of a link [m], world frame, shape (shapes, T + 1, 3)."""
+    offsets = [shape.position for shape in body.shapes if shape.link == body.links[link]]
+    turns, position = Rotation.from_quat(body.orientations[:, link]), body.positions[:, link]
+    centers = [position + turns.apply(offset) for offset in offsets]
+    return np.array(centers, np.float64).reshape(-1, *position.shape)
+
+
+def draw_shapes(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]:
+    """Draw every shape of every link, and move the links; return the entities of the shapes."""
+    drawn = []
+    for link, name in enumerate(body.links):
+        shapes = [shape for shape in body.shapes if shape.link == name]
+        if not shapes:
+            continue
+        entity = _entity("world", body.name, name)
+        columns = rr.Transform3D.columns(translation=body.positions[:, link], quaternion=body.orientations[:, link])
+        timelines.send(entity, range(len(body.positions)), columns)
+        for number, shape in enumerate(shapes):
+            archetype = _archetype(shape)
+            if archetype is None:
+                continue
+            part = f"{entity}/shape_{number}"
+            timelines.stream.log(part, archetype, static=True)
+            timelines.stream.log(part, _pose(shape), static=True)
+            drawn.append(part)
+    if len(drawn) < len(body.shapes) or not drawn:
+        warn(f"{body.file.name}: {len(drawn)} of {len(body.shapes)} shapes of {body.name!r} could be drawn")
+    return drawn
+
+
+def _pose(shape: Shape) -> rr.Transform3D:
+    scale = shape.size if shape.kind == pybullet.GEOM_MESH else None
+    return rr.Transform3D(translation=shape.position, quaternion=rr.Quaternion(xyzw=shape.orientation), scale=scale)
+
+
+def _archetype(shape: Shape) -> rr.AsComponents | None:
+    color = [round(255 * channel) for channel in shape.color]
+    solid = rr.components.FillMode.Solid
+    if shape.kind == pybullet.GEOM_BOX:
+        return rr.Boxes3D(half_sizes=[[extent / 2 for extent in shape.size]], colors=[color], fill_mode=solid)
+    if shape.kind == pybullet.GEOM_SPHERE:
+        return rr.Ellipsoids3D(half_sizes=[[shape.size[0]] * 3], colors=[color], fill_mode=solid)
+    if shape.kind == pybullet.GEOM_CYLINDER:
+        return rr.Cylinders3D(lengths=shape.size[0], radii=shape.size[1], colors=[color], fill_mode=solid)
+    if shape.kind == pybullet.GEOM_CAPSULE:
+        length, radius = shape.size[:2]
+        # Rerun's capsules start at the centre of one end; PyBullet's are centred.
+        half = [[0.0, 0.0, -length / 2]]
+        return rr.Capsules3D(lengths=length, radii=radius, translations=half, colors=[color], fill_mode=solid)
+    if shape.mesh and shape.mesh.is_file() and shape.mesh.suffix.lower() in _MESHES:
+        return rr.Asset3D(path=shape.mesh, albedo_factor=color)
+    return None

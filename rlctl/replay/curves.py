@@ -11,9 +11,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from rlctl.replay.live import Lived
-from rlctl.replay.pictures import jpeg
-from rlctl.replay.scene import Scene
+from rlctl.replay.recorder import Rollout
+from rlctl.replay.scene import Scene, encode_jpeg
 from rlctl.replay.timelines import Timelines
 
 Color = tuple[int, int, int]
@@ -36,12 +35,12 @@ class Plot:
     """reward, action, joints, observation or image."""
 
 
-def send_curves(lived: Lived, scene: Scene | None, timelines: Timelines) -> list[Plot]:
-    """Send rewards, actions, joints and observations; return the plots there are, in order."""
-    plots = _rewards(lived, timelines)
-    plots += _actions(lived, timelines)
-    plots += _joints(scene, timelines) if scene else []
-    return plots + _observations(lived, timelines)
+def send_curves(rollout: Rollout, timelines: Timelines) -> list[Plot]:
+    """Send rewards, actions, joints and observations; return the plots, in order."""
+    plots = _rewards(rollout, timelines)
+    plots += _actions(rollout, timelines)
+    plots += _joints(rollout.scene, timelines)
+    return plots + _observations(rollout, timelines)
 
 
 def palette(count: int) -> list[Color]:
@@ -73,21 +72,21 @@ def _single(timelines: Timelines, entity: str, values: NDArray[Any], name: str, 
     timelines.send(entity, range(1, len(scalars) + 1), rr.Scalars.columns(scalars=scalars))
 
 
-def _rewards(lived: Lived, timelines: Timelines) -> list[Plot]:
-    names = lived.episode.info.term_names
-    _single(timelines, "reward/total", lived.episode.rewards, "total", _TOTAL_COLOR, 2.5)
+def _rewards(rollout: Rollout, timelines: Timelines) -> list[Plot]:
+    names = rollout.episode.info.term_names
+    _single(timelines, "reward/total", rollout.episode.rewards, "total", _TOTAL_COLOR, 2.5)
     for index, (name, color) in enumerate(zip(names, palette(len(names)), strict=True)):
         entity = rr.new_entity_path(["reward", "terms", name])
-        _single(timelines, entity, lived.weighted_terms[:, index], name, color, 1.5)
-    if lived.successes is not None:
-        _single(timelines, "success", lived.successes, "success", _PALETTE[2], 1.5)
+        _single(timelines, entity, rollout.weighted_terms[:, index], name, color, 1.5)
+    if rollout.successes is not None:
+        _single(timelines, "success", rollout.successes, "success", _PALETTE[2], 1.5)
     return [Plot("reward, by weighted term" if names else "reward", "reward", "reward")]
 
 
-def _actions(lived: Lived, timelines: Timelines) -> list[Plot]:
-    actions = lived.episode.actions.reshape(lived.length, -1)
+def _actions(rollout: Rollout, timelines: Timelines) -> list[Plot]:
+    actions = rollout.episode.actions.reshape(rollout.length, -1)
     _send(timelines, "action", 1, actions, _numbered("action", actions.shape[1]))
-    meaning = lived.env.action_meaning
+    meaning = rollout.env.action_meaning
     return [Plot(f"action: {meaning}" if meaning else "action", "action", "action")]
 
 
@@ -110,10 +109,10 @@ def _numbered(name: str, count: int) -> list[str]:
     return [name] if count == 1 else [f"{name}[{index}]" for index in range(count)]
 
 
-def _observations(lived: Lived, timelines: Timelines) -> list[Plot]:
+def _observations(rollout: Rollout, timelines: Timelines) -> list[Plot]:
     plots = []
-    for name, values in named_observations(lived).items():
-        unit = lived.env.observation_units.get(name)
+    for name, values in named_observations(rollout).items():
+        unit = rollout.env.observation_units.get(name)
         entity = "observation" if not name else rr.new_entity_path(["observation", name])
         title = f"observed {name}" if name else "observation"
         if _is_image(values):
@@ -127,12 +126,12 @@ def _observations(lived: Lived, timelines: Timelines) -> list[Plot]:
     return plots
 
 
-def named_observations(lived: Lived) -> dict[str, NDArray[Any]]:
+def named_observations(rollout: Rollout) -> dict[str, NDArray[Any]]:
     """Return the observations by name, each of shape (T + 1, ...); under "" where there are no names.
 
     Of stacked observations it is the newest.
     """
-    observations, sizes = lived.episode.observations, lived.env.observation_sizes
+    observations, sizes = rollout.episode.observations, rollout.env.observation_sizes
     if isinstance(observations, dict):
         return observations
     if not sizes or observations.ndim != 2:
@@ -147,6 +146,6 @@ def _is_image(values: NDArray[Any]) -> bool:
 
 
 def _send_images(timelines: Timelines, entity: str, values: NDArray[Any]) -> None:
-    blobs = [jpeg(image) for image in values]
+    blobs = [encode_jpeg(image) for image in values]
     columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
     timelines.send(entity, range(len(blobs)), columns)

@@ -1,4 +1,4 @@
-"""Compares two lives of one episode, bit for bit."""
+"""Compares a recorded episode with a rollout of its actions, bit for bit."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.replay.live import Lived
+from rlctl.replay.recorder import Rollout
 from rlctl.run.episode import Observations, RecordedEpisode
 
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """Where two lives of an episode part."""
+    """Where a rollout begins to differ from the recorded episode."""
 
     step: int
     """The first step that differs; 0 is the reset."""
@@ -22,7 +22,7 @@ class Difference:
     recorded: str
     now: str
     size: float | None
-    """Absolute difference there; None where there is none to give."""
+    """Absolute difference there; None if it is not a finite number."""
     steps: int
     """How many steps differ; 0 if it is only the end that does."""
     length: int
@@ -72,12 +72,12 @@ def _bits(values: NDArray[Any]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(values).reshape(len(values), -1).view(np.uint8)
 
 
-def find_difference(recorded: RecordedEpisode, lived: Lived) -> Difference | None:
+def find_difference(recorded: RecordedEpisode, rollout: Rollout) -> Difference | None:
     """Compare observations, rewards, reward terms and the end; None if every bit is the same."""
     length = len(recorded.rewards)
     steps: set[int] = set()
     first: tuple[int, _Column] | None = None
-    for column in _columns(recorded, lived):
+    for column in _columns(recorded, rollout):
         found = column.differing().tolist()
         steps.update(found)
         # At the same step the earlier column counts: what is observed explains what is rewarded.
@@ -85,20 +85,20 @@ def find_difference(recorded: RecordedEpisode, lived: Lived) -> Difference | Non
             first = found[0], column
     if first is not None:
         return first[1].difference(first[0], len(steps), length)
-    return _different_end(recorded, lived, length)
+    return _different_end(recorded, rollout, length)
 
 
-def _columns(recorded: RecordedEpisode, lived: Lived) -> list[_Column]:
-    before, after = _parts(recorded.observations), _parts(lived.episode.observations)
+def _columns(recorded: RecordedEpisode, rollout: Rollout) -> list[_Column]:
+    before, after = _parts(recorded.observations), _parts(rollout.episode.observations)
     columns = [
-        _Column(_element_names(name, max(part.shape[1], 1), lived), 0, before.get(name, part[:, :0]), part)
+        _Column(_element_names(name, max(part.shape[1], 1), rollout), 0, before.get(name, part[:, :0]), part)
         for name, part in after.items()
     ]
     info = recorded.info
-    columns.append(_Column(["reward"], 1, recorded.rewards[:, None], lived.episode.rewards[:, None]))
-    if info.term_names == lived.episode.info.term_names and info.term_names:
+    columns.append(_Column(["reward"], 1, recorded.rewards[:, None], rollout.episode.rewards[:, None]))
+    if info.term_names == rollout.episode.info.term_names and info.term_names:
         names = [f"term {name}" for name in info.term_names]
-        columns.append(_Column(names, 1, recorded.terms, lived.episode.terms))
+        columns.append(_Column(names, 1, recorded.terms, rollout.episode.terms))
     return columns
 
 
@@ -107,20 +107,20 @@ def _parts(observations: Observations) -> dict[str, NDArray[Any]]:
     return {name: values.reshape(len(values), -1) for name, values in parts.items()}
 
 
-def _element_names(name: str, count: int, lived: Lived) -> list[str]:
-    sizes = lived.env.observation_sizes
+def _element_names(name: str, count: int, rollout: Rollout) -> list[str]:
+    sizes = rollout.env.observation_sizes
     if not name and sum(sizes.values()) == count:
         return [f"observation {part}[{index}]" for part, size in sizes.items() for index in range(size)]
     label = f"observation {name}" if name else "observation"
     return [f"{label}[{index}]" for index in range(count)]
 
 
-def _different_end(recorded: RecordedEpisode, lived: Lived, length: int) -> Difference | None:
-    before, after = recorded.info, lived.episode.info
-    if lived.length != length:
-        missing = abs(length - lived.length)
-        return Difference(min(length, lived.length), "length", str(length), str(lived.length), missing, 0, length)
-    if not lived.ended:
+def _different_end(recorded: RecordedEpisode, rollout: Rollout, length: int) -> Difference | None:
+    before, after = recorded.info, rollout.episode.info
+    if rollout.length != length:
+        missing = abs(length - rollout.length)
+        return Difference(min(length, rollout.length), "length", str(length), str(rollout.length), missing, 0, length)
+    if not rollout.ended:
         return Difference(length, "end of the episode", "here", "later", None, 0, length)
     for what, recorded_value, value in (
         ("names of the reward terms", before.term_names, after.term_names),

@@ -8,17 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import output
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.replay.live import Lived, recorded_actions
-from rlctl.replay.recording import record_episode, tell, verify_episode
+from rlctl.replay.recorder import Choose, Rollout, drawable_env, play_episode, recorded_actions
 from rlctl.replay.report import ReplayedEpisode, ReplayResult
-from rlctl.replay.rollouts import Actor, load_actor
-from rlctl.replay.targets import check_output, next_recording, recording_beside
-from rlctl.replay.watching import watch, watched_env
+from rlctl.replay.reproduce import print_warning, record_episode, verify_episode
+from rlctl.replay.scene import Env
 from rlctl.replay.window import open_window, show_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.run import directory
+from rlctl.run.directory import RunDirectory, find_policy
+from rlctl.run.env_info import describe
 from rlctl.run.episode import load_episode, save_episode
+from rlctl.run.policy import Policy, load_policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,8 +40,8 @@ class ReplayRequest:
 def run_replay(request: ReplayRequest) -> ReplayResult:
     """Record, show or verify what was asked for.
 
-    A recorded episode is lived again, and its recording goes beside it. With a policy new episodes are lived, and
-    each is written as an episode (`.npz`) and a recording (`.rrd`).
+    The actions of a recorded episode are replayed, and its recording goes beside it. With a policy new episodes are
+    played, and each is written as an episode (`.npz`) and a recording (`.rrd`).
     """
     _check_request(request)
     output.results()  # from here on what an environment, or PyBullet's window, prints goes to stderr
@@ -49,7 +50,8 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
     if _is_episode(request.source):
         path = Path(str(request.source))
         return _show_episode(path) if request.gui else _record_episode(path, request.output)
-    return _show_policy(request) if request.gui else _record_policy(request)
+    actor = _Actor(request)
+    return actor.show() if request.gui else actor.record()
 
 
 def _is_episode(source: str | None) -> bool:
@@ -57,29 +59,39 @@ def _is_episode(source: str | None) -> bool:
 
 
 def _check_request(request: ReplayRequest) -> None:
-    source = request.source
+    source, target = request.source, request.output
     if source is not None and Path(source).suffix == ".rrd":
         raise UsageError(f"{source} is a recording already; open it with: rerun {source}")
-    if request.verify is not None and (source is not None or request.gui or request.output is not None):
-        raise UsageError("--verify lives one recorded episode again and writes nothing: give only --verify EPISODE")
-    if request.gui and request.output is not None:
+    if request.verify is not None and (source is not None or request.gui or target is not None):
+        raise UsageError("--verify replays one recorded episode and writes nothing: give only --verify EPISODE")
+    if request.gui and target is not None:
         raise UsageError("--gui shows a window and writes nothing: leave out --output")
-    lived_before = request.verify is not None or _is_episode(source)
-    if lived_before and (request.task is not None or request.task_parameters or request.episodes != 1):
-        raise UsageError("a recorded episode is lived as it was: leave out --task, --set and --episodes")
-    check_output(request.output, request.episodes)
+    recorded = request.verify is not None or _is_episode(source)
+    if recorded and (request.task is not None or request.task_parameters or request.episodes != 1):
+        raise UsageError("a recorded episode is replayed as it was: leave out --task, --set and --episodes")
+    if target is None:
+        return
+    if target.suffix == ".rrd" and request.episodes > 1:
+        raise UsageError(f"--output {target}: a recording has one episode; give a folder for {request.episodes}")
+    if target.suffix == ".rrd" and target.is_dir():
+        raise UsageError(f"--output {target}: a folder whose name ends in .rrd; give a name inside it")
+    if target.suffix != ".rrd" and target.is_file():
+        raise UsageError(f"--output {target}: give a folder, or the name of a recording, which ends in .rrd")
 
 
 def _verify(path: Path) -> ReplayResult:
     episode = load_episode(path)
-    lived, verification = verify_episode(episode, path)
-    return ReplayResult(episode.info.task, episode.info.policy, [_replayed(lived)], verification)
+    rollout, verification = verify_episode(episode, path)
+    return ReplayResult(episode.info.task, episode.info.policy, [_summarize(rollout)], verification)
 
 
 def _record_episode(path: Path, where: Path | None) -> ReplayResult:
-    episode, target = load_episode(path), recording_beside(path, where)
-    lived = record_episode(episode, target, title=f"{episode.info.task} / episode {path.stem}")
-    return ReplayResult(episode.info.task, episode.info.policy, [_replayed(lived, target, path)])
+    episode = load_episode(path)
+    recording = path.with_suffix(".rrd")
+    if where is not None:
+        recording = where if where.suffix == ".rrd" else where / recording.name
+    rollout = record_episode(episode, recording, title=f"{episode.info.task} / episode {path.stem}")
+    return ReplayResult(episode.info.task, episode.info.policy, [_summarize(rollout, recording, path)])
 
 
 def _show_episode(path: Path) -> ReplayResult:
@@ -87,41 +99,66 @@ def _show_episode(path: Path) -> ReplayResult:
     info, spec = episode.info, episode.info.env_spec()
     with open_window(spec) as env:
         actions = recorded_actions(episode, env, path)
-        shown = show_episodes(env, spec, [info.seed], lambda: actions)
-    return ReplayResult(info.task, info.policy, [_replayed(lived) for lived in shown])
+        rollouts = show_episodes(env, spec, [info.seed], lambda: actions)
+    return ReplayResult(info.task, info.policy, [_summarize(rollout) for rollout in rollouts])
 
 
-def _actor(request: ReplayRequest) -> tuple[Actor, directory.RunDirectory | None]:
-    file, run = directory.find_policy(request.source, request.checkpoint)
-    return load_actor(file, request.task, request.task_parameters), run
+class _Actor:
+    """A policy and the environment it acts in."""
+
+    def __init__(self, request: ReplayRequest) -> None:
+        self._output = request.output
+        self._seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes)
+        self._file, self._run = find_policy(request.source, request.checkpoint)
+        if self._file.suffix == ".safetensors":
+            from rlctl.run.torch_policy import pin_threads
+
+            pin_threads()
+        self._policy: Policy = load_policy(self._file)
+        info = self._policy.info
+        self._spec: EnvSpec = info.env_spec(request.task, request.task_parameters)
+        self._name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
+
+    def show(self) -> ReplayResult:
+        with open_window(self._spec) as env:
+            self._check_fits(env)
+            rollouts = show_episodes(env, self._spec, self._seeds, self._begin)
+        return ReplayResult(self._spec.task, self._name, [_summarize(rollout) for rollout in rollouts])
+
+    def record(self) -> ReplayResult:
+        from rlctl.replay.rrd import write_rrd
+
+        spec, done = self._spec, []
+        with drawable_env(spec, print_warning) as env:
+            self._check_fits(env)
+            for seed in self._seeds:
+                rollout = play_episode(env, spec, seed, self._begin(), policy=self._name, draw=print_warning)
+                recording = self._next_recording()
+                episode = recording.with_suffix(".npz")
+                save_episode(episode, rollout.episode)
+                write_rrd(recording, rollout, title=f"{spec.task} / episode {recording.stem}", warn=print_warning)
+                done.append(_summarize(rollout, recording, episode))
+        return ReplayResult(spec.task, self._name, done)
+
+    def _check_fits(self, env: Env) -> None:
+        self._policy.info.check_fits(describe(env), self._file)
+
+    def _begin(self) -> Choose:
+        self._policy.reset()
+        return lambda observation, _: self._policy.predict(observation)
+
+    def _next_recording(self) -> Path:
+        """Return `--output`, or the next number in that folder, in the run, or (without a run) in ./episodes."""
+        if self._output is None:
+            owner = self._run or RunDirectory(Path())
+            return owner.episode_file(owner.next_episode_number()).with_suffix(".rrd")
+        if self._output.suffix == ".rrd":
+            return self._output
+        numbers = [int(each.stem) for each in self._output.glob("*.rrd") if each.stem.isdecimal()]
+        number = max(numbers, default=-1) + 1
+        return self._output / RunDirectory(self._output).episode_file(number).with_suffix(".rrd").name
 
 
-def _show_policy(request: ReplayRequest) -> ReplayResult:
-    actor, _ = _actor(request)
-    seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes)
-    with open_window(actor.spec) as env:
-        actor.check_fits(env)
-        shown = show_episodes(env, actor.spec, seeds, actor.episode)
-    return ReplayResult(actor.spec.task, actor.name, [_replayed(lived) for lived in shown])
-
-
-def _record_policy(request: ReplayRequest) -> ReplayResult:
-    from rlctl.replay.rrd import write_rrd
-
-    actor, run = _actor(request)
-    done = []
-    with watched_env(actor.spec, tell) as env:
-        actor.check_fits(env)
-        for seed in episode_seeds(request.seed, Stream.REPLAY, request.episodes):
-            watched = watch(env, actor.spec, seed, actor.episode(), policy=actor.name, tell=tell)
-            target = next_recording(request.output, run)
-            episode = target.with_suffix(".npz")
-            save_episode(episode, watched.lived.episode)
-            write_rrd(target, watched, title=f"{actor.spec.task} / episode {target.stem}", tell=tell)
-            done.append(_replayed(watched.lived, target, episode))
-    return ReplayResult(actor.spec.task, actor.name, done)
-
-
-def _replayed(lived: Lived, recording: Path | None = None, episode: Path | None = None) -> ReplayedEpisode:
-    info = lived.episode.info
-    return ReplayedEpisode(info.seed, lived.length, info.total_reward, info.success, recording, episode)
+def _summarize(rollout: Rollout, recording: Path | None = None, episode: Path | None = None) -> ReplayedEpisode:
+    info = rollout.episode.info
+    return ReplayedEpisode(info.seed, rollout.length, info.total_reward, info.success, recording, episode)

@@ -15,7 +15,7 @@ from rlctl.run.policy import collect_versions
 
 @dataclasses.dataclass(frozen=True)
 class ReplayedEpisode:
-    """One episode that was lived."""
+    """One episode that was played."""
 
     seed: int
     length: int
@@ -29,17 +29,17 @@ class ReplayedEpisode:
 
 @dataclasses.dataclass(frozen=True)
 class Verification:
-    """What came of living a recorded episode again."""
+    """How a recorded episode compares with a new rollout of its actions."""
 
     episode: Path
     difference: Difference | None
     other_versions: dict[str, tuple[str, str | None]]
-    """Name to recorded and present version, of those that differ."""
+    """Recorded and current version, by name, of those that differ."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ReplayResult:
-    """Episodes that were lived, and what came of verifying one."""
+    """Episodes that were played, and the verification of one."""
 
     task: str
     policy: str
@@ -47,7 +47,7 @@ class ReplayResult:
     verification: Verification | None = None
 
     def check(self) -> None:
-        """Raise `AnswerIsNo` if a recorded episode was not the same again."""
+        """Raise `AnswerIsNo` if a recorded episode could not be reproduced."""
         if self.verification is not None and self.verification.difference is not None:
             raise AnswerIsNo(f"{self.verification.episode}: not identical, {self.verification.difference}")
 

@@ -1,11 +1,18 @@
-"""What a PyBullet world looks like, step by step: read while an episode is lived, drawn afterwards."""
+"""What an episode looks like: the bodies of a PyBullet world, or camera pictures of any other environment.
+
+Read after every step, drawn when the episode is over.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import traceback
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,10 +22,17 @@ from rlctl.task.body import Body
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
 
+Env = gymnasium.Env[Any, Any]
 Array = NDArray[np.float64]
+Warn = Callable[[str], None]
+"""Receives a message for the user: what cannot be drawn as it should be."""
+
 _GROUND_SIZE = 8.0  # [m]; a body without joints that is wider both ways is the ground
 _INERTIAL_POSE = slice(3, 5)  # of getDynamicsInfo: the centre of mass in the link frame
 _LINK_POSE = slice(4, 6)  # of getLinkState: the link frame in the world
+_MOST_PICTURES = 100  # of an episode: drawing one takes up to 40 ms
+_LARGEST_PICTURE = 480  # [pixels]
+_JPEG_QUALITY = 80
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,33 +57,36 @@ class BodyMotion:
     """Shape (T + 1, links, 4)."""
     shapes: list[Shape]
     trunk: int | None
-    """Where in `links` the body is that goes places: a free base, or what sliding joints without limits carry."""
+    """Index in `links` of what moves about: a free base, or what sliding joints without limits carry; else None."""
     chain: bool
     """Whether the links follow each other in one line, as those of an arm do."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A world over T steps."""
+    """What can be drawn of an episode of T steps."""
 
-    bodies: list[BodyMotion]
-    markers: dict[str, Array]
+    bodies: list[BodyMotion] = dataclasses.field(default_factory=list)
+    markers: dict[str, Array] = dataclasses.field(default_factory=dict)
     """World positions [m], shape (T + 1, 3)."""
+    pictures: list[tuple[int, bytes]] = dataclasses.field(default_factory=list)
+    """Step and JPEG file."""
 
     def robots(self) -> list[BodyMotion]:
         """Return the bodies with joints."""
         return [body for body in self.bodies if body.joint_names]
 
 
-class SceneObserver:
-    """Reads bodies and markers after the reset and every step; changes nothing."""
+class SceneReader:
+    """Reads bodies and markers of a task's world; changes nothing."""
 
     def __init__(self, env: TaskEnv) -> None:
         self._env = env
         self._bodies: list[_BodyReader] = []
         self._markers: dict[str, list[Array]] = {}
 
-    def __call__(self, step: int) -> None:
+    def read(self, step: int) -> None:
+        """Read the world after a step; 0 is the reset."""
         if step == 0:  # only now: a reset may load the bodies anew
             self._bodies = [_BodyReader(body) for body in self._env.sim.bodies.values()]
             self._markers = {name: [] for name in self._marker_positions()}
@@ -88,7 +105,7 @@ class SceneObserver:
             raise TaskError(message, details=traceback.format_exc()) from error
 
     def scene(self) -> Scene:
-        """Return what was seen since the last reset."""
+        """Return what was read since the last reset."""
         return Scene(
             [reader.motion() for reader in self._bodies],
             {name: np.stack(history) for name, history in self._markers.items()},
@@ -171,7 +188,7 @@ class _BodyReader:
         if self.body.file.suffix == ".xml":
             try:
                 return read_shapes(self.body.file)
-            except ValueError:  # PyBullet's reader is laxer; that nothing is drawn is told
+            except ValueError:  # PyBullet's reader accepts more; the user is warned that nothing is drawn
                 return []
         shapes = []
         for data in pybullet.getVisualShapeData(self.body.id, physicsClientId=self.client):
@@ -179,3 +196,41 @@ class _BodyReader:
             file = Path(mesh.decode()) if mesh else None
             shapes.append(Shape(self.links[link + 1], kind, tuple(size), file, position, orientation, color))
         return shapes
+
+
+class Camera:
+    """Takes pictures of an environment, of long episodes only every few steps; one that cannot draw is asked once."""
+
+    def __init__(self, env: Env, warn: Warn) -> None:
+        self._env = env
+        self._warn = warn
+        self._works = env.render_mode == "rgb_array"
+        self._pictures: list[tuple[int, bytes]] = []
+        self._every = 1
+
+    def read(self, step: int) -> None:
+        """Take a picture after a step, if it is one to take."""
+        if not self._works or step % self._every:
+            return
+        try:
+            self._pictures.append((step, encode_jpeg(np.asarray(self._env.render()))))
+        except Exception as error:  # missing pygame, no OpenGL, no picture: the recording goes on without
+            self._works = False
+            self._warn(f"no camera pictures: {type(error).__name__}: {error}")
+        if len(self._pictures) > _MOST_PICTURES:  # the length of an episode is not known before its end
+            self._pictures, self._every = self._pictures[::2], 2 * self._every
+
+    def scene(self) -> Scene:
+        """Return the pictures."""
+        return Scene(pictures=self._pictures)
+
+
+def encode_jpeg(picture: NDArray[Any]) -> bytes:
+    """Return a picture of shape (height, width, 1 or 3), uint8, as a JPEG file of at most 480 pixels a side."""
+    from PIL import Image
+
+    image = Image.fromarray(np.squeeze(picture, axis=-1) if picture.shape[-1] == 1 else picture)
+    image.thumbnail((_LARGEST_PICTURE, _LARGEST_PICTURE))
+    file = io.BytesIO()
+    image.convert("RGB").save(file, "JPEG", quality=_JPEG_QUALITY)
+    return file.getvalue()

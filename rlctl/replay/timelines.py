@@ -17,7 +17,7 @@ class Timelines:
         self.dt = dt
 
     @property
-    def shown(self) -> str:
+    def default(self) -> str:
         """The timeline that the viewer opens with."""
         return "step" if self.dt is None else "sim_time"
 

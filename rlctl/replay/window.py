@@ -8,11 +8,13 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
-from rlctl.replay.live import Choose, Env, Lived, frame_time, live
+from rlctl.replay.recorder import Choose, Rollout, frame_time, play_episode
+from rlctl.replay.scene import Env
 
 _INSTEAD = "leave out --gui to write a recording instead"
 _DT = 1 / 30  # [s] a step, where an environment does not say
@@ -30,18 +32,30 @@ def open_window(spec: EnvSpec) -> Iterator[Env]:
         env.close()
 
 
-def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[], Choose]) -> list[Lived]:
-    """Live an episode per seed in real time; ends early, and well, when PyBullet's window is closed."""
-    pace = _RealTime(frame_time(env) or _DT)
-    shown: list[Lived] = []
+def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[], Choose]) -> list[Rollout]:
+    """Play an episode per seed in real time; closing PyBullet's window ends it early, without an error."""
+    shown: list[Rollout] = []
     for seed in seeds:
         try:
-            shown.append(live(env, spec, seed, begin(), observers=[pace]))
+            shown.append(play_episode(env, spec, seed, _in_real_time(begin(), frame_time(env) or _DT)))
         except TaskError as error:
             if "Not connected to physics server" not in str(error.__cause__):
                 raise
             break
     return shown
+
+
+def _in_real_time(choose: Choose, dt: float) -> Choose:
+    """Wait before each action until the simulated time has passed on the clock; `dt` [s] is that of a step."""
+    start: list[float] = []
+
+    def wait_and_choose(observation: Any, step: int) -> Any:
+        if not start:
+            start.append(time.monotonic())
+        time.sleep(max(0.0, start[0] + step * dt - time.monotonic()))
+        return choose(observation, step)
+
+    return wait_and_choose
 
 
 def _check_display(*, bullet: bool) -> None:
@@ -64,16 +78,3 @@ def _x_server_answers() -> bool:
     if connection:
         x11.XCloseDisplay(connection)
     return bool(connection)
-
-
-class _RealTime:
-    """Waits after every step until simulated time has passed on the clock."""
-
-    def __init__(self, dt: float) -> None:
-        self._dt = dt  # [s]
-        self._start = 0.0
-
-    def __call__(self, step: int) -> None:
-        if step == 0:
-            self._start = time.monotonic()
-        time.sleep(max(0.0, self._start + step * self._dt - time.monotonic()))

@@ -288,7 +288,7 @@ def _tell_failed_evaluations(run: RunDirectory, progress: Progress) -> None:
 def _record(loop: TrainingLoop, count: int) -> list[Path]:
     if not count:
         return []
-    from rlctl.replay.recording import record_episode
+    from rlctl.replay.reproduce import record_episode
 
     recordings = []
     for path, episode in loop.episodes.latest(count):

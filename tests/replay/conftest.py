@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rlctl.env_spec import EnvSpec
-from rlctl.replay.watching import Watched, watch, watched_env
+from rlctl.replay.recorder import Rollout, drawable_env, play_episode
 from rlctl.run.episode import save_episode
 from rlctl.task.bullet import pybullet
 from rlctl_manipulation.reach import JOINT_STEP
@@ -24,10 +24,10 @@ def strict(monkeypatch):
     rerun.set_strict_mode(True)
 
 
-def reach(seed: int = 5) -> Watched:
-    """Live an episode of reach that goes straight to the goal, by inverse kinematics."""
+def reach(seed: int = 5) -> Rollout:
+    """Play an episode of reach that goes straight to the goal, by inverse kinematics."""
     spec = EnvSpec("reach")
-    with watched_env(spec, print) as env:
+    with drawable_env(spec, print) as env:
         task, sim = env.unwrapped.task, env.unwrapped.sim
 
         def choose(observation, step):
@@ -37,27 +37,29 @@ def reach(seed: int = 5) -> Watched:
             )
             return np.clip((np.array(wanted) - arm.joint_positions) / JOINT_STEP, -1, 1).astype(np.float32)
 
-        return watch(env, spec, seed, choose, policy="inverse kinematics", tell=print)
+        return play_episode(env, spec, seed, choose, policy="inverse kinematics", draw=print)
 
 
-def lived(name: str, *, seed: int = 3, **parameters) -> tuple[Watched, list[str]]:
-    """Live an episode of an environment of envs.py with random actions; returns also what was told."""
-    spec, told = EnvSpec(f"{ENVS}:{name}", parameters), []
-    with watched_env(spec, told.append) as env:
+def play(name: str, *, seed: int = 3, **parameters) -> tuple[Rollout, list[str]]:
+    """Play an episode of an environment of envs.py with random actions; returns also the warnings."""
+    spec, warnings = EnvSpec(f"{ENVS}:{name}", parameters), []
+    with drawable_env(spec, warnings.append) as env:
         env.action_space.seed(0)
-        watched = watch(env, spec, seed, lambda o, k: env.action_space.sample(), policy="chance", tell=told.append)
-    return watched, told
+        rollout = play_episode(
+            env, spec, seed, lambda o, k: env.action_space.sample(), policy="chance", draw=warnings.append
+        )
+    return rollout, warnings
 
 
 @pytest.fixture(scope="session")
-def reached() -> Watched:
+def reached() -> Rollout:
     return reach()
 
 
 @pytest.fixture(scope="session")
 def episode_file(reached, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("episodes") / "000007.npz"
-    save_episode(path, reached.lived.episode)
+    save_episode(path, reached.episode)
     return path
 
 

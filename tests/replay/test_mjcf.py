@@ -7,13 +7,13 @@ import pytest
 from rerun.chunk import RrdReader
 
 from rlctl.env_spec import EnvSpec
+from rlctl.replay.bodies import shape_centers
 from rlctl.replay.mjcf import Shape, read_shapes
+from rlctl.replay.recorder import drawable_env, play_episode
 from rlctl.replay.rrd import write_rrd
-from rlctl.replay.scene import BodyMotion, SceneObserver
-from rlctl.replay.shapes import shape_centers
-from rlctl.replay.watching import watch, watched_env
+from rlctl.replay.scene import BodyMotion, SceneReader
 from rlctl.task.bullet import pybullet
-from tests.replay.conftest import lived
+from tests.replay.conftest import play
 from tests.replay.reading import column, entities, static
 
 ROBOTS = ("ant", "half-cheetah", "hopper", "walker2d", "humanoid")
@@ -42,9 +42,9 @@ def distance(point, low, high, radius):
 
 
 def look(env) -> BodyMotion:
-    observer = SceneObserver(env.unwrapped)
-    observer(0)
-    return next(body for body in observer.scene().bodies if body.name == "robot")
+    reader = SceneReader(env.unwrapped)
+    reader.read(0)
+    return next(body for body in reader.scene().bodies if body.name == "robot")
 
 
 def worst_error(env) -> float:
@@ -118,15 +118,15 @@ def test_thin_capsules_are_where_pybullet_has_them():
 def recordings(tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("mjcf"), {}
     for name in ("ant", "humanoid", "hopper"):
-        spec, told = EnvSpec(name, {}), []
-        with watched_env(spec, told.append) as env:
+        spec, warnings = EnvSpec(name, {}), []
+        with drawable_env(spec, warnings.append) as env:
             env.action_space.seed(0)
             actions = iter([env.action_space.sample() for _ in range(1000)])
-            watched = watch(env, spec, 3, lambda o, k, a=actions: next(a), policy="chance", tell=told.append)
+            rollout = play_episode(env, spec, 3, lambda o, k, a=actions: next(a), policy="chance", draw=warnings.append)
         path = folder / f"{name}.rrd"
-        write_rrd(path, watched, title=name, tell=told.append)
-        assert told == []
-        made[name] = path, watched
+        write_rrd(path, rollout, title=name, warn=warnings.append)
+        assert warnings == []
+        made[name] = path, rollout
     return made
 
 
@@ -136,10 +136,10 @@ def recordings(tmp_path_factory):
     ("name", "count"), [("ant", 1 + 4 * 3), ("humanoid", 3 + 1 + 1 + 2 * 3 + 2 * 3), ("hopper", 4)]
 )
 def test_every_geom_is_drawn_and_its_link_moves(recordings, name, count):
-    path, watched = recordings[name]
+    path, rollout = recordings[name]
     found = entities(path)
     assert len([entity for entity in found if entity.startswith("/world/robot/") and "/shape_" in entity]) == count
-    robot = watched.scene.robots()[0]
+    robot = rollout.scene.robots()[0]
     for link in {shape.link for shape in robot.shapes}:
         _, positions = column(path, f"/world/robot/{link}", "Transform3D:translation")
         np.testing.assert_allclose(positions[:, 0], robot.positions[:, robot.links.index(link)], atol=1e-5)
@@ -173,29 +173,29 @@ def test_camera_follows_the_torso(recordings, name, torso):
 
 
 def test_camera_follows_no_arm(reached, tmp_path):
-    write_rrd(tmp_path / "reach.rrd", reached, title="reach", tell=print)
+    write_rrd(tmp_path / "reach.rrd", reached, title="reach", warn=print)
     assert tracked(tmp_path / "reach.rrd") == []
 
 
 def test_camera_follows_a_free_urdf_robot(tmp_path):
-    watched, told = lived("Tumble", car="r2d2.urdf")
-    write_rrd(tmp_path / "r2d2.rrd", watched, title="r2d2", tell=told.append)
+    rollout, warnings = play("Tumble", car="r2d2.urdf")
+    write_rrd(tmp_path / "r2d2.rrd", rollout, title="r2d2", warn=warnings.append)
     assert tracked(tmp_path / "r2d2.rrd") == ["/world/car/base_link/visual_0"]
     assert "/world/car/base_link/visual_0" in entities(tmp_path / "r2d2.rrd")
 
 
 @pytest.mark.parametrize("name", ["ant", "hopper"])
-def test_file_that_only_pybullet_reads_is_told(tmp_path, monkeypatch, name):
+def test_file_that_only_pybullet_reads_costs_a_warning(tmp_path, monkeypatch, name):
     def refuse(file):
         raise ValueError(f"{file}: not well-formed")
 
     monkeypatch.setattr("rlctl.replay.scene.read_shapes", refuse)
-    told = []
-    with watched_env(EnvSpec(name), told.append) as env:
+    warnings = []
+    with drawable_env(EnvSpec(name), warnings.append) as env:
         action = np.zeros(env.action_space.shape, np.float32)
-        watched = watch(env, EnvSpec(name), 3, lambda o, k: action, policy="none", tell=told.append)
-    write_rrd(tmp_path / "r.rrd", watched, title=name, tell=told.append)
-    assert told == [f"{name}.xml: 0 of 0 shapes of 'robot' could be drawn"]
+        rollout = play_episode(env, EnvSpec(name), 3, lambda o, k: action, policy="none", draw=warnings.append)
+    write_rrd(tmp_path / "r.rrd", rollout, title=name, warn=warnings.append)
+    assert warnings == [f"{name}.xml: 0 of 0 shapes of 'robot' could be drawn"]
     assert tracked(tmp_path / "r.rrd") == []
 
 

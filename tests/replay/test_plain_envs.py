@@ -3,26 +3,26 @@ import pytest
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError
+from rlctl.replay.recorder import drawable_env, play_episode
 from rlctl.replay.rrd import write_rrd
-from rlctl.replay.watching import watch, watched_env
-from tests.replay.conftest import ENVS, lived
+from tests.replay.conftest import ENVS, play
 from tests.replay.reading import column, entities, jpegs
 
 
-def write(watched, tmp_path):
-    path, told = tmp_path / "plain.rrd", []
-    write_rrd(path, watched, title="plain", tell=told.append)
-    assert told == []
+def write(rollout, tmp_path):
+    path, warnings = tmp_path / "plain.rrd", []
+    write_rrd(path, rollout, title="plain", warn=warnings.append)
+    assert warnings == []
     return path
 
 
 def test_actions_rewards_observations_and_pictures(tmp_path):
-    watched, told = lived("Pixels")
-    assert told == []
-    path = write(watched, tmp_path)
+    rollout, warnings = play("Pixels")
+    assert warnings == []
+    path = write(rollout, tmp_path)
     steps, actions = column(path, "/action")
     assert steps.tolist() == list(range(1, 11))
-    np.testing.assert_array_equal(actions.ravel(), watched.lived.episode.actions)
+    np.testing.assert_array_equal(actions.ravel(), rollout.episode.actions)
     _, rewards = column(path, "/reward/total")
     np.testing.assert_array_equal(rewards, actions)  # its reward is the action
     _, counts = column(path, "/observation/count")
@@ -34,14 +34,14 @@ def test_actions_rewards_observations_and_pictures(tmp_path):
 
 
 def test_long_episodes_have_fewer_pictures():
-    watched, _ = lived("Pixels", steps=450)
+    rollout, _ = play("Pixels", steps=450)
     # More than 100: every second, and again, and again: every eighth step of 450.
-    assert [step for step, _ in watched.pictures] == list(range(0, 451, 8))
+    assert [step for step, _ in rollout.scene.pictures] == list(range(0, 451, 8))
 
 
 def test_time_follows_from_the_frame_rate(tmp_path):
-    watched, _ = lived("Pixels")
-    assert watched.lived.dt == 1 / 20
+    rollout, _ = play("Pixels")
+    assert rollout.dt == 1 / 20
 
 
 @pytest.mark.parametrize(
@@ -51,11 +51,11 @@ def test_time_follows_from_the_frame_rate(tmp_path):
         ("Blind", {}, "no camera pictures: "),
     ],
 )
-def test_missing_pictures_are_told_and_nothing_else_is_missing(name, parameters, reason, tmp_path):
-    watched, told = lived(name, **parameters)
-    assert len(told) == 1
-    assert told[0].startswith(reason)
-    found = entities(write(watched, tmp_path))
+def test_missing_pictures_cost_a_warning_and_nothing_else_is_missing(name, parameters, reason, tmp_path):
+    rollout, warnings = play(name, **parameters)
+    assert len(warnings) == 1
+    assert warnings[0].startswith(reason)
+    found = entities(write(rollout, tmp_path))
     assert "/camera" not in found
     assert {"/action", "/reward/total", "/observation/point"} <= found
 
@@ -63,16 +63,16 @@ def test_missing_pictures_are_told_and_nothing_else_is_missing(name, parameters,
 @pytest.mark.parametrize("task", ["Pendulum-v1", "CartPole-v1"])
 def test_gymnasium_environments(task, tmp_path):
     spec = EnvSpec(task)
-    with watched_env(spec, print) as env:
+    with drawable_env(spec, print) as env:
         env.action_space.seed(0)
-        watched = watch(env, spec, 1, lambda o, k: env.action_space.sample(), policy="", tell=print)
-    _, observations = column(write(watched, tmp_path), "/observation")
-    np.testing.assert_array_equal(observations, watched.lived.episode.observations)
+        rollout = play_episode(env, spec, 1, lambda o, k: env.action_space.sample(), policy="", draw=print)
+    _, observations = column(write(rollout, tmp_path), "/observation")
+    np.testing.assert_array_equal(observations, rollout.episode.observations)
 
 
 def test_error_of_the_environment_names_seed_and_step():
     with pytest.raises(TaskError) as raised:
-        lived("Pixels", seed=11, fault="step")
+        play("Pixels", seed=11, fault="step")
     assert str(raised.value) == (
         f"task '{ENVS}:Pixels': RuntimeError: lost a wheel\n"
         f"in the episode with seed 11, step 4; to see it alone: rlctl check-env {ENVS}:Pixels"

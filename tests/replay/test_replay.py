@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from rlctl.errors import ArtifactError
-from rlctl.replay.recording import record_episode
 from rlctl.replay.replay import ReplayRequest, run_replay
 from rlctl.replay.report import as_json
+from rlctl.replay.reproduce import record_episode
 from rlctl.run.episode import load_episode, save_episode
-from tests.replay.conftest import ENVS, lived
+from tests.replay.conftest import ENVS, play
 from tests.replay.reading import column, properties
 
 
@@ -29,7 +29,7 @@ def test_rollouts_go_into_the_run_and_are_numbered_on(run):
     assert recorded.info.versions.keys() >= {"rlctl", "pybullet", "torch"}
 
 
-def test_rollout_lived_again_is_identical(run, tmp_path):
+def test_rollout_is_reproduced_bit_for_bit(run, tmp_path):
     (episode,) = run_replay(ReplayRequest(str(run.run.path), seed=3, output=tmp_path)).episodes
     result = run_replay(ReplayRequest(None, verify=episode.episode))
     assert result.verification.difference is None
@@ -93,19 +93,19 @@ def test_recorded_episode_is_recorded_beside_itself(replay, episode_file, tmp_pa
     )
 
 
-def test_episode_that_goes_another_way_is_told_and_written(tmp_path):
-    watched, _ = lived("Chance")
-    told, path = [], tmp_path / "chance.rrd"
-    record_episode(watched.lived.episode, path, title="chance", tell=told.append)
+def test_episode_that_differs_is_reported_and_written(tmp_path):
+    rollout, _ = play("Chance")
+    warnings, path = [], tmp_path / "chance.rrd"
+    record_episode(rollout.episode, path, title="chance", warn=warnings.append)
     assert path.is_file()
-    (warning,) = told
-    assert warning.startswith("warning: chance: lived again it is not what was recorded; step 6 of 10: ")
+    (warning,) = warnings
+    assert warning.startswith("warning: chance: replayed, it differs from the recorded episode; step 6 of 10: ")
     assert warning.endswith("5 of 11 steps differ")
 
 
 def test_episode_of_a_plain_environment_from_the_command_line(replay, tmp_path):
-    watched, _ = lived("Pixels", fault="render")
-    save_episode(tmp_path / "one.npz", watched.lived.episode)
+    rollout, _ = play("Pixels", fault="render")
+    save_episode(tmp_path / "one.npz", rollout.episode)
     done = replay("one.npz", "-o", "recordings")
     assert done.returncode == 0
     assert done.stderr == "no camera pictures: OSError: no OpenGL\n"
@@ -113,8 +113,8 @@ def test_episode_of_a_plain_environment_from_the_command_line(replay, tmp_path):
 
 
 def test_what_an_environment_prints_stays_out_of_the_result(replay, tmp_path):
-    watched, _ = lived("Pixels", fault="talk")
-    save_episode(tmp_path / "one.npz", watched.lived.episode)
+    rollout, _ = play("Pixels", fault="talk")
+    save_episode(tmp_path / "one.npz", rollout.episode)
     done = replay("one.npz", "--json", "-")
     assert json.loads(done.stdout)["episodes"][0]["file"] == "one.rrd"
     assert done.stderr.count("a plugin talks") == 10
@@ -131,12 +131,12 @@ def test_what_an_environment_prints_stays_out_of_the_result(replay, tmp_path):
         (
             ["x.npz", "--set", "task.tolerance=1"],
             2,
-            "error: a recorded episode is lived as it was: leave out --task, --set and --episodes\n",
+            "error: a recorded episode is replayed as it was: leave out --task, --set and --episodes\n",
         ),
         (
             ["--verify", "x.npz", "-o", "y.rrd"],
             2,
-            "error: --verify lives one recorded episode again and writes nothing: give only --verify EPISODE\n",
+            "error: --verify replays one recorded episode and writes nothing: give only --verify EPISODE\n",
         ),
         (
             ["--episodes", "2", "-o", "y.rrd"],
@@ -167,9 +167,9 @@ def test_policy_for_another_task(run, tmp_path):
 
 
 def test_environment_that_fails(replay, tmp_path):
-    watched, _ = lived("Pixels")
-    info = watched.lived.episode.info.model_copy(update={"task_parameters": {"fault": "step"}})
-    save_episode(tmp_path / "x.npz", dataclasses.replace(watched.lived.episode, info=info))
+    rollout, _ = play("Pixels")
+    info = rollout.episode.info.model_copy(update={"task_parameters": {"fault": "step"}})
+    save_episode(tmp_path / "x.npz", dataclasses.replace(rollout.episode, info=info))
     done = replay("x.npz")
     assert done.returncode == 3
     assert f"error: task '{ENVS}:Pixels': RuntimeError: lost a wheel\nin the episode with seed 3, step 4" in done.stderr

@@ -7,53 +7,51 @@ from rerun.chunk import RrdReader
 from rlctl.errors import ArtifactError
 from rlctl.replay.curves import named_observations
 from rlctl.replay.rrd import write_rrd
-from tests.replay.conftest import lived, reach
+from tests.replay.conftest import play, reach
 from tests.replay.reading import column, entities, properties, static
 
 
 @pytest.fixture(scope="module")
 def recording(reached, tmp_path_factory):
     path = tmp_path_factory.mktemp("rrd") / "reach.rrd"
-    told = []
-    write_rrd(path, reached, title="reach / by hand", tell=told.append)
-    assert told == []
+    warnings = []
+    write_rrd(path, reached, title="reach / by hand", warn=warnings.append)
+    assert warnings == []
     return path
 
 
 @pytest.fixture(scope="module")
 def tumble(tmp_path_factory):
-    watched, _ = lived("Tumble")
-    path, told = tmp_path_factory.mktemp("rrd") / "tumble.rrd", []
-    write_rrd(path, watched, title="tumble", tell=told.append)
-    return path, watched, told
+    rollout, _ = play("Tumble")
+    path, warnings = tmp_path_factory.mktemp("rrd") / "tumble.rrd", []
+    write_rrd(path, rollout, title="tumble", warn=warnings.append)
+    return path, rollout, warnings
 
 
 def test_joint_curves_are_those_of_the_episode(recording, reached):
     steps, positions = column(recording, "/joints/position/arm")
     assert steps.tolist() == list(range(121))
     # Float64 goes through a recording bit by bit; the observation is its float32.
-    np.testing.assert_array_equal(positions.astype(np.float32), reached.lived.episode.observations[:, :7])
+    np.testing.assert_array_equal(positions.astype(np.float32), reached.episode.observations[:, :7])
     np.testing.assert_array_equal(positions, reached.scene.robots()[0].joint_positions)
     assert static(recording, "/joints/position/arm", "SeriesLines:names")[0] == "lbr_iiwa_joint_1"
 
 
 def test_weighted_terms_have_a_curve_each_and_add_up(recording, reached):
-    terms = {
-        name: column(recording, f"/reward/terms/{name}")[1].ravel() for name in reached.lived.episode.info.term_names
-    }
+    terms = {name: column(recording, f"/reward/terms/{name}")[1].ravel() for name in reached.episode.info.term_names}
     assert list(terms) == ["distance", "reached", "action", "smoothness"]
     steps, total = column(recording, "/reward/total")
     assert steps.tolist() == list(range(1, 121))
     np.testing.assert_allclose(sum(terms.values()), total.ravel(), atol=1e-12)
-    np.testing.assert_array_equal(total.ravel(), reached.lived.episode.rewards)
+    np.testing.assert_array_equal(total.ravel(), reached.episode.rewards)
     # The weight of the distance is -1: the curve is the raw term with the other sign.
-    np.testing.assert_array_equal(terms["distance"], -reached.lived.episode.terms[:, 0])
+    np.testing.assert_array_equal(terms["distance"], -reached.episode.terms[:, 0])
     colors = {static(recording, f"/reward/terms/{name}", "SeriesLines:colors")[0] for name in terms}
     assert len(colors) == 4
 
 
 def test_goal_and_hand_are_where_they_were(recording, reached):
-    observed = named_observations(reached.lived)
+    observed = named_observations(reached)
     goal = (observed["hand"] + observed["hand_to_goal"])[0]
     _, drawn = column(recording, "/world/markers/goal", "Points3D:positions")
     np.testing.assert_allclose(drawn[:, 0], np.broadcast_to(goal, (121, 3)), atol=1e-6)
@@ -64,9 +62,9 @@ def test_goal_and_hand_are_where_they_were(recording, reached):
 def test_actions_and_observations_by_name(recording, reached):
     steps, actions = column(recording, "/action")
     assert steps[0] == 1
-    np.testing.assert_array_equal(actions, reached.lived.episode.actions)
+    np.testing.assert_array_equal(actions, reached.episode.actions)
     _, hand = column(recording, "/observation/hand")
-    np.testing.assert_array_equal(hand, named_observations(reached.lived)["hand"])
+    np.testing.assert_array_equal(hand, named_observations(reached)["hand"])
 
 
 def test_robot_has_meshes_and_a_transform_per_joint(recording):
@@ -134,8 +132,8 @@ def test_layout_is_in_the_file(recording):
 
 
 def test_same_episode_same_recording_id(recording, tmp_path):
-    write_rrd(tmp_path / "again.rrd", reach(5), title="again", tell=print)
-    write_rrd(tmp_path / "other.rrd", reach(6), title="other", tell=print)
+    write_rrd(tmp_path / "again.rrd", reach(5), title="again", warn=print)
+    write_rrd(tmp_path / "other.rrd", reach(6), title="other", warn=print)
     ids = [
         RrdReader(path).recordings()[0].recording_id
         for path in (recording, tmp_path / "again.rrd", tmp_path / "other.rrd")
@@ -151,13 +149,13 @@ def test_file_appears_whole_or_not_at_all(reached, tmp_path, monkeypatch):
 
     monkeypatch.setattr(rerun.RecordingStream, "flush", full)
     with pytest.raises(ArtifactError, match=r"reach\.rrd: cannot be written: no space left"):
-        write_rrd(tmp_path / "reach.rrd", reached, title="reach", tell=print)
+        write_rrd(tmp_path / "reach.rrd", reached, title="reach", warn=print)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_free_body_moves_by_its_link_frame(tumble):
-    path, watched, _ = tumble
-    cube = next(body for body in watched.scene.bodies if body.name == "cube")
+    path, rollout, _ = tumble
+    cube = next(body for body in rollout.scene.bodies if body.name == "cube")
     _, positions = column(path, "/tf/cube/base", "Transform3D:translation")
     np.testing.assert_allclose(positions[:, 0], cube.positions[:, 0], rtol=1e-6)
     assert cube.positions[0, 0, 2] == pytest.approx(0.4, abs=1e-6)
@@ -165,10 +163,10 @@ def test_free_body_moves_by_its_link_frame(tumble):
 
 
 def test_what_rerun_cannot_read_is_drawn_from_pybullets_shapes(tumble):
-    path, watched, told = tumble
-    assert len(told) == 1
-    assert told[0].startswith("racecar.urdf: drawn from PyBullet's shapes, Rerun cannot read it: ")
-    car = next(body for body in watched.scene.bodies if body.name == "car")
+    path, rollout, warnings = tumble
+    assert len(warnings) == 1
+    assert warnings[0].startswith("racecar.urdf: drawn from PyBullet's shapes, Rerun cannot read it: ")
+    car = next(body for body in rollout.scene.bodies if body.name == "car")
     drawn = [entity for entity in entities(path) if entity.startswith("/world/car/") and "shape" in entity]
     assert len(drawn) == len(car.shapes) > 3
 

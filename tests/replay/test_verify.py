@@ -6,14 +6,14 @@ import pytest
 
 from rlctl.errors import ArtifactError
 from rlctl.replay.difference import find_difference
-from rlctl.replay.recording import verify_episode
+from rlctl.replay.reproduce import verify_episode
 from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
-from tests.replay.conftest import as_json, lived
+from tests.replay.conftest import as_json, play
 
 
 @pytest.fixture
 def episode(reached) -> RecordedEpisode:
-    return reached.lived.episode
+    return reached.episode
 
 
 @pytest.fixture
@@ -39,9 +39,9 @@ def test_recorded_episode_is_the_same_again(replay, episode_file):
 
 @pytest.mark.parametrize("name", ["Tumble", "Pixels"])
 def test_episodes_of_other_environments_are_the_same_again(name, tmp_path):
-    watched, _ = lived(name)
+    rollout, _ = play(name)
     path = tmp_path / "000000.npz"
-    save_episode(path, watched.lived.episode)
+    save_episode(path, rollout.episode)
     _, verification = verify_episode(load_episode(path), path)
     assert verification.difference is None
     assert verification.other_versions == {}
@@ -108,9 +108,9 @@ def test_end_of_an_episode_is_compared(reached, episode):
         rewards=episode.rewards[:50],
         terms=episode.terms[:50],
     )
-    assert str(find_difference(cut, reached.lived)) == ("step 50 of 50: length is 120, recorded 50 (off by 70)")
+    assert str(find_difference(cut, reached)) == ("step 50 of 50: length is 120, recorded 50 (off by 70)")
     flipped = dataclasses.replace(episode, info=episode.info.model_copy(update={"success": False}))
-    assert find_difference(flipped, reached.lived).what == "success"
+    assert find_difference(flipped, reached).what == "success"
 
 
 def test_episode_that_stops_before_its_end_says_so(tampered, episode):
@@ -126,17 +126,15 @@ def test_episode_that_stops_before_its_end_says_so(tampered, episode):
 
 def test_types_and_sizes_are_compared(reached, episode):
     wider = dataclasses.replace(episode, observations=episode.observations.astype(np.float64))
-    assert "type of observation joint_positions is float32, recorded float64" in str(
-        find_difference(wider, reached.lived)
-    )
+    assert "type of observation joint_positions is float32, recorded float64" in str(find_difference(wider, reached))
     fewer = dataclasses.replace(episode, observations=episode.observations[:, :5])
-    assert "size of observation joint_positions is 20, recorded 5" in str(find_difference(fewer, reached.lived))
+    assert "size of observation joint_positions is 20, recorded 5" in str(find_difference(fewer, reached))
 
 
 def test_environment_that_is_not_reproducible(tmp_path):
-    watched, _ = lived("Chance")
+    rollout, _ = play("Chance")
     path = tmp_path / "000000.npz"
-    save_episode(path, watched.lived.episode)
+    save_episode(path, rollout.episode)
     difference = verify_episode(load_episode(path), path)[1].difference
     assert difference.step == 6
     assert difference.what == "observation point[0]"

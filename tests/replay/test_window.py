@@ -14,9 +14,9 @@ def test_episodes_take_their_time():
         arrived.append(time.monotonic())
         return lambda observation, step: env.action_space.sample() if step < 12 else None
 
-    (lived,) = show_episodes(env, spec, [1], begin)
+    (rollout,) = show_episodes(env, spec, [1], begin)
     env.close()
-    assert lived.length == 12
+    assert rollout.length == 12
     # 12 steps of 1/60 s.
     assert time.monotonic() - arrived[0] >= 0.2
 

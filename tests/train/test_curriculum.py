@@ -10,7 +10,7 @@ from rich.console import Console
 from rlctl.errors import AnswerIsNo, RecipeError, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation, run_evaluations
 from rlctl.eval.report import show_all
-from rlctl.replay.recording import verify_episode
+from rlctl.replay.reproduce import verify_episode
 from rlctl.rollout import workers
 from rlctl.rollout.workers import EpisodeResult
 from rlctl.run.episode import load_episode

@@ -1,0 +1,84 @@
+"""Reproduces recorded episodes: compares them with what was recorded, or writes them as `.rrd`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rlctl import output
+from rlctl.errors import UsageError
+from rlctl.replay.difference import find_difference
+from rlctl.replay.recorder import (
+    Rollout,
+    check_actions,
+    current_versions,
+    drawable_env,
+    play_episode,
+    recorded_actions,
+)
+from rlctl.replay.report import Verification
+from rlctl.replay.scene import Warn
+from rlctl.rollout.workers import Workers
+from rlctl.run.episode import RecordedEpisode
+
+
+def print_warning(message: str) -> None:
+    """Print a message to stderr."""
+    output.err().print(message, markup=False)
+
+
+def record_episode(episode: RecordedEpisode, path: Path, *, title: str, warn: Warn = print_warning) -> Rollout:
+    """Replay the actions of an episode in a new environment and write what it looks like to `path`, an `.rrd`.
+
+    `warn` receives how it differs from what was recorded; the file is written all the same. Returns the new rollout.
+    Raises `TaskError` for an episode that failed, and fails again.
+    """
+    from rlctl.replay.rrd import write_rrd
+
+    info, spec = episode.info, episode.info.env_spec()
+    if info.failure:
+        replay_failed(episode)
+    with drawable_env(spec, warn) as env:
+        choose = recorded_actions(episode, env)
+        rollout = play_episode(env, spec, info.seed, choose, policy=info.policy, draw=warn)
+    if info.failure:
+        warn(f"warning: {title}: it failed when it was recorded ({info.failure}), and did not fail now")
+    elif difference := find_difference(episode, rollout):
+        warn(f"warning: {title}: replayed, it differs from the recorded episode; {difference}")
+    write_rrd(path, rollout, title=title, warn=warn)
+    return rollout
+
+
+def replay_failed(episode: RecordedEpisode) -> None:
+    """Replay the actions of an episode that failed, in a worker as in training: it may hang or end its process.
+
+    Raises the `TaskError` that it failed with if it fails again.
+    """
+    with Workers(episode.info.env_spec(), 1) as workers:
+        check_actions(episode, workers.arrays.action.shape[1:])
+        workers.arrays.next_seed[:] = -1
+        workers.reset({0: episode.info.seed})
+        for action in episode.actions:
+            workers.arrays.action[0] = action
+            if workers.step():
+                return
+
+
+def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verification]:
+    """Replay the actions of an episode in a new environment and compare every bit; `path` names it.
+
+    Raises `UsageError` for an episode of which only the actions are known, because it failed.
+    """
+    info, spec = episode.info, episode.info.env_spec()
+    if info.failure:
+        raise UsageError(
+            f"{path}: the episode failed ({info.failure}), so there is nothing to compare; "
+            f"to see it fail again: rlctl replay {path}"
+        )
+    env = spec.make()
+    try:
+        rollout = play_episode(env, spec, info.seed, recorded_actions(episode, env, path), policy=info.policy)
+    finally:
+        env.close()
+    now = current_versions(info.task)
+    other = {name: (version, now.get(name)) for name, version in info.versions.items() if now.get(name) != version}
+    return rollout, Verification(path, find_difference(episode, rollout), other)
