@@ -198,6 +198,8 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
     constructor = module
     for part in attribute.split("."):
         if not hasattr(constructor, part):
+            if attribute in getattr(sys.modules.get("gymnasium"), "registry", ()):
+                return _load_gymnasium(attribute)  # an id without a version, which the module has registered
             classes = [name for name, value in vars(module).items() if inspect.isclass(value)]
             own = [name for name in classes if getattr(module, name).__module__ == module.__name__]
             raise NoSuchClassError(

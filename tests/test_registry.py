@@ -141,12 +141,13 @@ def test_gymnasium_ids(write_module, monkeypatch):
         "Gymnasium has no environment 'Pendulum-v9'. Did you mean 'Pendulum-v1'?"
     )
     assert error(UsageError, "nopackage:Env-v0").startswith("Gymnasium: nopackage:Env-v0: No module named 'nopackage'")
-    write_module(
-        "brings.py",
-        ENV + "\n    gymnasium.register('brings/My-v0', entry_point=MyEnv)\n",
+    registers = "\n".join(
+        f"    gymnasium.register('{name}', entry_point=MyEnv)" for name in ("brings/My-v0", "brings/Plain")
     )
-    env = EnvSpec("brings:brings/My-v0", {"gain": 5.0}).make()
-    assert env.unwrapped.gain == 5.0
+    write_module("brings.py", f"{ENV}\n{registers}\n")
+    for task in ("brings:brings/My-v0", "brings:brings/Plain"):
+        env = EnvSpec(task, {"gain": 5.0}).make()
+        assert env.unwrapped.gain == 5.0
     assert EnvSpec("Pendulum-v1", {"g": 1.0, "max_episode_steps": 7}).make().spec.max_episode_steps == 7
 
 
