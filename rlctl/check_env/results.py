@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from rlctl.check_env.world_results import Source, Worlds  # noqa: F401 (found by name)
+from rlctl.check_env.world_results import Worlds  # noqa: F401 (found by name)
 
 
 def decode(kind: str, content: Mapping[str, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""What was found out about the PyBullet worlds behind an environment, and in its source."""
+"""What was found out about the PyBullet worlds behind an environment, and in its functions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Worlds:
     steps: int = 0
     """How many steps of the environment were watched."""
     resets: int = 0
-    likenesses: list[Likeness] = dataclasses.field(default_factory=list)
+    source: Source = dataclasses.field(default_factory=lambda: Source())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,8 +52,6 @@ class WorldLink:
     name: str
     masses: list[float]
     frictions: list[float]
-    centre_offset: float
-    """How far the centre of mass is from the link's frame [m]."""
     mass_built: float | None = None
     """Its mass before the first reset; None where it was not there yet."""
     has_shape: bool | None = None
@@ -140,31 +138,13 @@ class Jump:
 
 
 @dataclasses.dataclass(frozen=True)
-class Likeness:
-    """A number of the reward that goes exactly with a quantity of a body."""
-
-    term: str
-    quantity: str
-    kind: str
-    """`position`, `height`, `angle`, `linear velocity`, `angular velocity`, `joint position` or `joint velocity`."""
-    r2: float
-    slope: float
-    steps: int
-
-
-@dataclasses.dataclass(frozen=True)
 class Source:
-    """What reading the environment's own classes found; each list has places as `file:line`."""
-
-    classes: list[str]
-    without_client: list[Place]
     """Calls of PyBullet without physicsClientId."""
-    centre_as_frame: list[Place]
-    """`getLinkState(...)[0]`, read as the link's position."""
-    force_at_origin: list[Place]
-    """Forces applied at the world's origin."""
-    links: list[int] | None
-    """The links whose centre is read so; None where that is not known."""
+
+    ran: list[Place] = dataclasses.field(default_factory=list)
+    """In functions that ran."""
+    not_run: list[Place] = dataclasses.field(default_factory=list)
+    """In the environment's other methods."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -205,47 +205,23 @@ class Drops(Cart):
     height = 0.5
 
 
-class ReadsCentre(Cart):
+class ForgetsClient(Cart):
     def read(self):
+        p.getNumBodies()
         super().read()
-        self.tip = p.getLinkState(self.cart, TIP, physicsClientId=self.client)[0]
 
 
-class ReadsFrame(Cart):
-    """Reads the frame of one link, and the centre of mass of one that has it in its frame."""
+class OverridesForgetful(ForgetsClient):
+    """What forgets the client is overridden, and not called; nothing is wrong with it."""
 
-    def read(self):
-        super().read()
-        self.tip = p.getLinkState(self.cart, TIP, physicsClientId=self.client)[4]
+    read = Cart.read
 
 
-class ForceAtOrigin(Cart):
-    def push(self, force):
-        p.applyExternalForce(self.cart, -1, force, [0, 0, 0], p.WORLD_FRAME, physicsClientId=self.client)
+class MayForgetClient(Cart):
+    """Forgets the client in a method that nothing calls."""
 
-
-class TermsOfReward(Cart):
-    """Says what its reward is made of; nothing is wrong with it."""
-
-    def push(self, force):
-        super().push(force)
-        p.applyExternalTorque(self.cart, -1, [0, 0, 0.1 * force[0]], p.WORLD_FRAME, physicsClientId=self.client)
-
-    def terms(self):
-        linear, _ = p.getBaseVelocity(self.cart, physicsClientId=self.client)
-        return {"forward_velocity": 2 * linear[0], "place": super().reward()}
-
-    def reward(self):
-        return sum(self.terms().values())
-
-    def info(self):
-        return {**super().info(), "reward_terms": self.terms()}
-
-
-class YawAsVelocity(TermsOfReward):
-    def terms(self):
-        _, turn = p.getBasePositionAndOrientation(self.cart, physicsClientId=self.client)
-        return {**super().terms(), "forward_velocity": 2 * p.getEulerFromQuaternion(turn)[2] + 1}
+    def count(self):
+        return p.getNumBodies()
 
 
 class ThroughBulletClient(Clean):

@@ -154,11 +154,6 @@ class Float32Terms(Terms):
         return {**super().info(), "reward_terms": {name: np.float32(each) for name, each in self.terms().items()}}
 
 
-class OneTerm(Terms):
-    def terms(self):
-        return {name: value * (1.0 if name == "distance" else 1e-4) for name, value in super().terms().items()}
-
-
 class SparseTerm(Terms):
     """A term that is 0 in all that is tried may be a bonus for what was not found."""
 

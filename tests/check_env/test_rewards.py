@@ -30,7 +30,6 @@ CASES = [
     broken("AliveBonus", ("RL606", "warning"), twin="Paid"),
     broken("AliveUntold", ("RL606", "info"), twin="Paid"),
     broken("TermLeftOut", ("RL607", "warning"), twin="Float32Terms"),
-    broken("OneTerm", ("RL608", "info"), twin="SparseTerm"),
     broken("SuccessUntold", ("RL609", "info"), twin="SuccessArray"),
     broken("SuccessMisnamed", ("RL609", "info")),
     broken("SuccessAtStart", ("RL610", "warning")),

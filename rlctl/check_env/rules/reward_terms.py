@@ -12,12 +12,10 @@ from rlctl.check_env.evidence import MOST_INFOS, Evidence, Trajectory
 from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
 from rlctl.check_env.rules.tried import WITH_SEARCH, at, in_words, termed, terms
 
-WARNING, INFO = Severity.WARNING, Severity.INFO
+WARNING = Severity.WARNING
 
 ROUNDING = 1e-5
 """How far a sum may be off, relative to the sum of all sizes: terms are often float32."""
-ALONE = 0.99
-"""Share of all terms' sizes from which one of them is the whole reward."""
 MEANT_CONSTANT = re.compile(
     r"(^|_)(alive|aliveness|surviv\w*|time|steps?|living|life|exist\w*|constant|bias)(_|$)", re.I
 )
@@ -67,34 +65,6 @@ def add_up(evidence: Evidence) -> Iterator[Seen]:
 
 def _number(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
-
-
-@rule(
-    "RL608",
-    "one term is the whole reward",
-    INFO,
-    "Compare the terms' typical sizes and set the weights so that each one that matters is a visible part.",
-    needs=WITH_SEARCH,
-)
-def shares(evidence: Evidence) -> Iterator[Seen]:
-    """One term makes up more than 99 % of the reward in every episode that was tried; the others have a weight but no
-    effect. Often a unit (mm, degrees) or a square that was forgotten."""
-    lives = termed(evidence)
-    sizes = [{name: float(np.nansum(np.abs(values))) for name, values in terms(life).items()} for life in lives]
-    totals: dict[str, float] = {}
-    for each in sizes:
-        for name, size in each.items():
-            totals[name] = totals.get(name, 0.0) + size
-    largest = max(totals, key=lambda name: totals[name])
-    others = [name for name, total in totals.items() if total > 0 and name != largest]
-    parts = [each.get(largest, 0.0) / sum(each.values()) for each in sizes if sum(each.values()) > 0]
-    if others and min(parts) > ALONE:
-        share = totals[largest] / sum(totals.values())
-        yield Seen(
-            f"{largest!r} is {100 * share:.3g} % of the reward over {in_words(lives)}, at least "
-            f"{100 * min(parts):.3g} % in each; beside it {', '.join(map(repr, others))} count for nothing",
-            {"term": largest, "value": share, "expected": f"below {ALONE}", "others": others},
-        )
 
 
 @rule(

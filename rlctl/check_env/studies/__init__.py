@@ -50,7 +50,6 @@ STUDIES = (
     Study("starts", "probe", 1.0, "starts:starts"),
     Study("search", "probe", 3.0, "search:search"),
     Study("hindsight", "probe", 0.3, "hindsight:hindsight"),
-    Study("source", "probe", 0.2, "source:source"),
     Study("leaks", "probe", 3.0, "leaks:leaks"),
     Study("after the end", "probe", 0.5, "misuse:after_end", provokes=True),
     Study("instances", "instances", 10.0, "lives:instances"),

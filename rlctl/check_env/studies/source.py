@@ -1,145 +1,141 @@
-"""Reads the classes that somebody wrote for an environment: mistakes with PyBullet that show in the text alone.
-
-What counts is what an instance runs: the methods of its class that no class before it overrides, the objects that it
-holds, and the functions of their modules that these use.
-"""
+"""Reads an environment's functions for calls of PyBullet that leave physicsClientId out."""
 
 from __future__ import annotations
 
 import ast
+import contextlib
+import functools
 import inspect
+import re
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import CodeType, FrameType
 from typing import Any
 
-from rlctl.check_env.context import Context
-from rlctl.check_env.studies import bullet_calls
-from rlctl.check_env.studies.link_reads import links_read
-from rlctl.check_env.wire import Message, result
 from rlctl.check_env.world_results import Place, Source
 
-NOT_THEIRS = ("gymnasium", "numpy", "torch", "pybullet", "pybullet_utils", "rlctl", "builtins", "stable_baselines3")
-"""Packages whose classes nobody wrote for an environment; rlctl's own tasks are in packages of their own."""
+LIBRARIES = ("gymnasium", "numpy", "torch", "pybullet", "pybullet_utils", "rlctl", "builtins", "stable_baselines3")
+"""Packages that are not part of an environment; rlctl's own tasks are in packages of their own."""
+NO_CLIENT = re.compile(
+    r"connect|error|getAPIVersion|isNumpyEnabled|submitProfileTiming|rotateVector|calculateVelocityQuaternion"
+    r"|(multiply|invert)Transforms?|compute(View|Projection)Matrix\w*|get\w*Quaternion\w*|getEuler\w*|getMatrix\w*"
+)
+"""Functions that are the same for every client: mathematics, and what makes one."""
+FIRST_IS_CLIENT = {
+    "disconnect", "getConnectionInfo", "getNumBodies", "getNumConstraints", "isConnected", "performCollisionDetection",
+    "getKeyboardEvents", "getMouseEvents", "getPhysicsEngineParameters", "removeAllUserDebugItems", "saveState",
+    "stepSimulation",
+}  # fmt: skip
+"""Functions whose only positional argument is the client."""
+CLIENT_WORDS = re.compile(r"client|\bcid\b|_cid\b|server", re.IGNORECASE)
+"""Names of a client that is passed by position."""
 MOST_PLACES = 20
+LONGEST_S = 2.0
+"""Recording costs a fraction of a microsecond per call; after this time it stops [s]."""
 
-Function = ast.FunctionDef | ast.AsyncFunctionDef
-
-
-def source(context: Context) -> Iterator[Message]:
-    """Read the classes, and list the places of what is doubtful."""
-    pybullet = sys.modules.get("pybullet")
-    classes = list(_classes(context.instance.env)) if pybullet else []
-    found: dict[str, list[Place]] = {"without_client": [], "centre_as_frame": [], "force_at_origin": []}
-    centres: dict[str, list[ast.Call]] = {}
-    for file, what, call in _doubtful(classes, bullet_calls.takes_client(pybullet)):
-        place = Place(file, call.lineno, ast.unparse(call.func))
-        if place not in found[what] and len(found[what]) < MOST_PLACES:
-            found[what].append(place)
-            if what == "centre_as_frame":
-                centres.setdefault(file, []).append(call)
-    for places in found.values():
-        places.sort(key=lambda each: (each.file, each.line))
-    links = links_read(context.instance, centres) if centres else None
-    yield result(Source([each.__qualname__ for each in classes], **found, links=links))
+Functions = dict[CodeType, Mapping[str, Any]]
+"""The code of functions, and the names of the module that each is in."""
 
 
-def _doubtful(classes: list[type], takes_client: set[str]) -> Iterator[tuple[str, str, ast.Call]]:
-    for file, (tree, parts) in _used(classes).items():
-        reader = bullet_calls.Reader(tree, takes_client)
-        for part in parts:
-            for what, call in reader.read(part):
-                yield file, what, call
+@contextlib.contextmanager
+def record_functions() -> Iterator[Functions]:
+    """Record the Python functions that run inside the `with` block, for `LONGEST_S` at most."""
+    ran: Functions = {}
+    before, end = sys.gettrace(), time.monotonic() + LONGEST_S
+
+    def note(frame: FrameType, event: str, argument: Any) -> None:
+        ran[frame.f_code] = frame.f_globals
+        if time.monotonic() > end:
+            sys.settrace(before)
+
+    sys.settrace(note)
+    try:
+        yield ran
+    finally:
+        sys.settrace(before)
 
 
-def _classes(env: Any) -> Iterator[type]:
-    """Yield the classes of the environment, or of its task, and of the objects of the same package that it holds."""
+def read_source(env: Any, ran: Functions) -> Source:
+    """Return the calls without a client in the functions that ran, and in the environment's other methods."""
+    ran = dict(ran)  # recording goes on
+    not_run = {code: names for code, names in _methods(env) if code not in ran}
+    return Source(_places(ran), _places(not_run))
+
+
+def _methods(env: Any) -> Iterator[tuple[CodeType, Mapping[str, Any]]]:
+    """Yield the methods of the environment (or its task) and of the objects of the same package that it holds."""
     inner = getattr(env, "unwrapped", env)
-    task = getattr(inner, "task", None)
-    author = task if type(inner).__module__.partition(".")[0] == "rlctl" and task is not None else inner
-    seen: set[type] = set()
-    for thing in (author, *_held(author)):
-        for each in type(thing).__mro__:
-            if each not in seen and each.__module__.partition(".")[0] not in NOT_THEIRS:
-                seen.add(each)
-                yield each
+    author = getattr(inner, "task", inner) if _package(type(inner).__module__) == "rlctl" else inner
+    package = _package(type(author).__module__)
+    held = [each for each in getattr(author, "__dict__", {}).values() if _package(type(each).__module__) == package]
+    for kind in dict.fromkeys(type(each) for each in (author, *held)):
+        for _, method in inspect.getmembers(kind, inspect.isfunction):
+            yield method.__code__, method.__globals__
 
 
-def _held(author: Any) -> list[Any]:
-    ours = _package(type(author))
-    return [each for each in list(getattr(author, "__dict__", {}).values()) if _package(type(each)) == ours]
+def _package(module: str) -> str:
+    return module.partition(".")[0]
 
 
-def _package(kind: type) -> str:
-    return kind.__module__.partition(".")[0]
+def _places(functions: Functions) -> list[Place]:
+    own = [each for each in functions.items() if _package(each[1].get("__name__", "")) not in LIBRARIES]
+    places = {place for code, names in own for place in calls_without_client(code, names)}
+    return sorted(places, key=lambda each: (each.file, each.line))[:MOST_PLACES]
 
 
-def _used(classes: list[type]) -> dict[str, tuple[ast.Module, list[ast.AST]]]:
-    """Return, per file, its tree and the parts of it that run."""
-    trees: dict[str, ast.Module] = {}
-    parts: dict[str, list[ast.AST]] = {}
-    for each in classes:
-        file = _file(each)
-        if file is None or (file not in trees and not _parse(file, trees)):
-            continue
-        node = _definition(trees[file], each.__qualname__)
-        if node is not None:
-            parts.setdefault(file, []).extend(_running(each, node, classes, trees))
-    return {file: (trees[file], _with_functions(trees[file], nodes)) for file, nodes in parts.items()}
+def calls_without_client(code: CodeType, names: Mapping[str, Any]) -> Iterator[Place]:
+    """Yield the calls of PyBullet in a function that pass no client; `names` are those of its module."""
+    function = _functions(code.co_filename).get(code.co_firstlineno)
+    if function is None:
+        return
+    nodes = list(_own_nodes(function))
+    local = {*code.co_varnames, *code.co_cellvars, *code.co_freevars}
+    visible = {name: value for name, value in names.items() if name not in local}
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            visible |= {each.asname or each.name: sys.modules.get(each.name) for each in node.names}
+    for node in nodes:
+        name = _bullet_function(node.func, visible) if isinstance(node, ast.Call) else ""
+        if name and not NO_CLIENT.fullmatch(name) and not _has_client(name, node):
+            yield Place(code.co_filename, node.lineno, name)
 
 
-def _file(kind: type) -> str | None:
+@functools.cache
+def _functions(file: str) -> dict[int, ast.AST]:
+    """Return the functions of a file by their first line, that of a decorator included."""
     try:
-        return inspect.getsourcefile(kind)
-    except (OSError, TypeError):
-        return None
-
-
-def _parse(file: str, trees: dict[str, ast.Module]) -> bool:
-    try:
-        trees[file] = ast.parse(Path(file).read_text(encoding="utf-8"))
+        text = Path(file).read_text(encoding="utf-8")
+        nodes = ast.walk(ast.parse(text)) if "pybullet" in text else iter(())
     except (OSError, SyntaxError, ValueError):
-        return False
-    return True
+        return {}
+    functions = [each for each in nodes if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef)]
+    return {min([each.lineno, *(d.lineno for d in each.decorator_list)]): each for each in functions}
 
 
-def _definition(tree: ast.Module, qualname: str) -> ast.ClassDef | None:
-    name = qualname.rpartition(".")[2]
-    return next((node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == name), None)
+def _own_nodes(function: ast.AST) -> Iterator[Any]:
+    """Yield what is in a function, without the functions inside it, which have names of their own."""
+    for node in ast.iter_child_nodes(function):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node
+            yield from _own_nodes(node)
 
 
-def _running(kind: type, node: ast.ClassDef, classes: list[type], trees: dict[str, ast.Module]) -> Iterator[ast.AST]:
-    """Yield the parts of a class that an instance runs: not the methods that are overridden and never called."""
-    before = [each for each in classes if issubclass(each, kind) and each is not kind]
-    for part in node.body:
-        if not isinstance(part, Function):
-            yield part
-            continue
-        overriding = [each for each in before if part.name in vars(each)]
-        if not overriding or any(_calls_up(each, part.name, kind, trees) for each in overriding):
-            yield part
+def _bullet_function(func: ast.expr, visible: Mapping[str, Any]) -> str:
+    """Return the name of PyBullet's function that is called; empty for another call."""
+    pybullet = sys.modules.get("pybullet")
+    if isinstance(func, ast.Attribute) and isinstance(func.value, ast.Name) and pybullet is not None:
+        found = visible.get(func.value.id) is pybullet and inspect.isbuiltin(getattr(pybullet, func.attr, None))
+        return func.attr if found else ""
+    function = visible.get(func.id) if isinstance(func, ast.Name) else None
+    name = str(getattr(function, "__name__", ""))
+    return name if inspect.isbuiltin(function) and getattr(pybullet, name, None) is function else ""
 
 
-def _calls_up(kind: type, method: str, parent: type, trees: dict[str, ast.Module]) -> bool:
-    """Say whether a class calls a method of a class above it: by `super()`, or by that class's name."""
-    tree = trees.get(_file(kind) or "")
-    node = _definition(tree, kind.__qualname__) if tree else None
-    if node is None:
-        return True  # not known
-    for call in (each for each in ast.walk(node) if isinstance(each, ast.Call)):
-        if isinstance(call.func, ast.Attribute) and call.func.attr == method:
-            owner = ast.unparse(call.func.value)
-            if owner.startswith("super(") or owner.rpartition(".")[2] == parent.__name__:
-                return True
-    return False
-
-
-def _with_functions(tree: ast.Module, nodes: list[ast.AST]) -> list[ast.AST]:
-    """Add the module's own functions that are used by name, and those that they use."""
-    functions = {each.name: each for each in tree.body if isinstance(each, Function)}
-    found = list(nodes)
-    for node in found:  # grows while it is read
-        for each in ast.walk(node):
-            if isinstance(each, ast.Name) and each.id in functions:
-                found.append(functions.pop(each.id))
-    return found
+def _has_client(name: str, call: Any) -> bool:
+    if any(each.arg in (None, "physicsClientId") for each in call.keywords):
+        return True
+    if any(isinstance(each, ast.Starred) or CLIENT_WORDS.search(ast.unparse(each)) for each in call.args):
+        return True
+    return name in FIRST_IS_CLIENT and bool(call.args)

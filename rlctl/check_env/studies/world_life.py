@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +39,6 @@ class Life:
     """Depth and limit of what is too far inside each other [m]."""
     touching: list[set[int]] = dataclasses.field(default_factory=list)
     """The ids of bodies that touch another one."""
-    terms: list[Mapping[str, float]] = dataclasses.field(default_factory=list)
 
     @property
     def states(self) -> NDArray[np.float64]:
@@ -67,7 +65,7 @@ class Life:
         return f"link {link[1]} of body {link[0]}"
 
 
-def look(life: Life, moment: Moment, terms: Mapping[str, float]) -> bool:
+def look(life: Life, moment: Moment) -> bool:
     """Add what is to be seen now; False where the world has gone, or has other bodies."""
     client = life.world.client
     try:
@@ -84,7 +82,6 @@ def look(life: Life, moment: Moment, terms: Mapping[str, float]) -> bool:
     life.touching.append(
         {body for pair, d in contacts.items() if d < TOUCHING for body, _ in pair if pair[0][0] != pair[1][0]}
     )
-    life.terms.append(terms)
     return True
 
 

@@ -78,7 +78,6 @@ class Dynamics:
 
     masses: tuple[float, ...]
     frictions: tuple[float, ...]
-    centre_offsets: tuple[float, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,14 +156,10 @@ def read_state(world: WorldModel) -> NDArray[np.float64]:
 
 
 def read_dynamics(client: int, body: BodyModel) -> Dynamics:
-    """Return masses, frictions and centres of mass."""
+    """Return masses and frictions."""
     p = bullet()
     infos = [p.getDynamicsInfo(body.id, i - 1, physicsClientId=client) for i in range(len(body.links))]
-    return Dynamics(
-        tuple(float(info[0]) for info in infos),
-        tuple(float(info[1]) for info in infos),
-        tuple(math.hypot(*info[3]) for info in infos),
-    )
+    return Dynamics(tuple(float(info[0]) for info in infos), tuple(float(info[1]) for info in infos))
 
 
 def read_gravity(client: int) -> list[float]:

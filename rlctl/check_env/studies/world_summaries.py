@@ -1,4 +1,4 @@
-"""What is worth telling of the episodes of a world: extremes with their place, and what goes along with the reward."""
+"""What is worth telling of the episodes of a world: extremes with their place."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rlctl.check_env.studies.world_life import Life
 from rlctl.check_env.studies.world_reading import Column, Pair
-from rlctl.check_env.world_results import Excess, Fall, Likeness, Penetration, TopSpeed
+from rlctl.check_env.world_results import Excess, Fall, Penetration, TopSpeed
 
 DEEP_STEPS = 3
 """Shorter than this a penetration is a blow that the solver has not answered yet [steps]."""
@@ -19,10 +19,6 @@ FAST_STEPS = 3
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
 """How far outside its limits a joint may be: part of the range, and at least so much [rad], [m]."""
 MOST_TOLD = 5
-NEARLY_LINEAR = 0.99
-FEWEST_ROWS, FEWEST_VALUES = 50, 20
-LEAST_SPREAD = 1e-3
-"""Quantities that vary less are at rest [m, rad, m/s, rad/s]."""
 
 
 def penetrations(lives: Sequence[Life]) -> list[Penetration]:
@@ -147,35 +143,3 @@ def _fall(life: Life, place: int) -> Fall | None:
         if body.id in touching:
             return Fall(body.name, float(heights[0] - heights[i]), life.moments[0]) if i else None
     return None
-
-
-def likenesses(lives: Sequence[Life]) -> list[Likeness]:
-    """Return, per part of the reward and kind of quantity, the quantity that it is nearest to a line with."""
-    lives = [life for life in lives if life.rows and life.world.key == lives[0].world.key]
-    if not lives:
-        return []
-    states = np.concatenate([life.states for life in lives])
-    rows = [terms for life in lives for terms in life.terms]
-    found = []
-    for name in dict.fromkeys(name for terms in rows for name in terms):
-        values = np.array([terms.get(name, np.nan) for terms in rows])
-        known = np.isfinite(values) & np.isfinite(states).all(axis=1)
-        if known.sum() >= FEWEST_ROWS and len(np.unique(values[known])) >= FEWEST_VALUES:
-            found += _of_term(name, lives[0], values[known], states[known])
-    return found
-
-
-def _of_term(name: str, life: Life, values: NDArray[np.float64], states: NDArray[np.float64]) -> list[Likeness]:
-    spread = states.std(axis=0)
-    centred, deviations = values - values.mean(), states - states.mean(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        covariance = centred @ deviations / len(values)
-        r2 = np.where(spread > LEAST_SPREAD, (covariance / (values.std() * spread)) ** 2, 0.0)
-    best: dict[str, Likeness] = {}
-    for i, column in enumerate(life.world.columns):
-        kind = "height" if (column.kind, column.name) == ("position", "z") else column.kind
-        if r2[i] > max(NEARLY_LINEAR, best[kind].r2 if kind in best else 0.0):
-            body = life.world.bodies[column.body].name
-            slope = float(covariance[i] / spread[i] ** 2)
-            best[kind] = Likeness(name, f"{column.name} of {body}", kind, float(r2[i]), slope, len(values))
-    return list(best.values())

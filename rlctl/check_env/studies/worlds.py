@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import sys
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -20,8 +19,7 @@ from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED
 from rlctl.check_env.failures import EnvironmentRaised, failure
 from rlctl.check_env.instance import Budget, Instance
-from rlctl.check_env.returned import numbers_in
-from rlctl.check_env.studies import world_summaries
+from rlctl.check_env.studies import source, world_summaries
 from rlctl.check_env.studies.tampering import Touch, jumps, touches, weight_matters
 from rlctl.check_env.studies.world_life import Life, look
 from rlctl.check_env.studies.world_reading import (
@@ -57,7 +55,7 @@ class Notes:
 def worlds(context: Context) -> Iterator[Message]:
     """Live a few short episodes, and say what went on in the worlds behind them."""
     before = set(connected())
-    with context.fresh() as instance:
+    with source.record_functions() as ran, context.fresh() as instance:
         if "pybullet" not in sys.modules:
             yield result(Worlds())
             return
@@ -74,7 +72,7 @@ def worlds(context: Context) -> Iterator[Message]:
         if watcher.notes and context.budget.seconds_left > 0:
             with contextlib.suppress(EnvironmentRaised):  # by now its resets were seen
                 watcher.falls_by_itself(len(EPISODES))
-        yield result(watcher.result())
+        yield result(watcher.result(ran))
 
 
 class Watcher:
@@ -109,7 +107,7 @@ class Watcher:
             self.steps += 1
             is_whole = isinstance(answer, tuple) and len(answer) == 5
             moment = Moment(seed, episode, kind, step)
-            lives = [life for life in lives if look(life, moment, _terms(answer[4]) if is_whole else {})]
+            lives = [life for life in lives if look(life, moment)]
             if not is_whole or np.any(answer[2]) or np.any(answer[3]):
                 return
 
@@ -127,7 +125,7 @@ class Watcher:
                 notes.dynamics.append(self._dynamics(world))
             life = Life(world)
             notes.lives.append(life)
-            if look(life, Moment(seed, episode, kind, 0), {}):
+            if look(life, Moment(seed, episode, kind, 0)):
                 lives.append(life)
         return lives
 
@@ -144,7 +142,7 @@ class Watcher:
     def _dynamics(self, world: WorldModel) -> list[Dynamics]:
         return [read_dynamics(world.client, body) for body in world.bodies]
 
-    def result(self) -> Worlds:
+    def result(self, ran: source.Functions) -> Worlds:
         """Return everything; the boxes come now, and leave the worlds unusable."""
         moving = {place: notes for place, notes in self.notes.items() if any(life.moves for life in notes.lives)}
         # What never moves is no physics: a copy of the robot that kinematics are solved with.
@@ -153,7 +151,7 @@ class Watcher:
             [self._world(place, notes) for place, notes in chosen.items()],
             self.steps,
             self.resets,
-            [each for notes in chosen.values() for each in world_summaries.likenesses(notes.lives)],
+            source.read_source(self.instance.env, ran),
         )
 
     def _world(self, place: int, notes: Notes) -> World:
@@ -184,7 +182,6 @@ def _body(body: BodyModel, dynamics: list[Dynamics], built: Dynamics | None, tou
             name,
             [each.masses[i] for each in dynamics],
             [each.frictions[i] for each in dynamics],
-            dynamics[0].centre_offsets[i],
             built.masses[i] if built else None,
             touch[i - 1].has_shape if touch else None,
             touch[i - 1].collides if touch else None,
@@ -192,10 +189,3 @@ def _body(body: BodyModel, dynamics: list[Dynamics], built: Dynamics | None, tou
         for i, name in enumerate(body.links)
     ]
     return WorldBody(body.name, len(body.joints), body.is_free, links)
-
-
-def _terms(info: Any) -> dict[str, float]:
-    """Return the numbers of an info that are parts of the reward."""
-    if not isinstance(info, dict):
-        return {}
-    return {name: value for name, value in numbers_in(info) if "reward" in name.lower()}
