@@ -72,7 +72,7 @@ class CallWatch:
 
     @property
     def seconds(self) -> float:
-        """How long the undisturbed calls took together."""
+        """How long the preserve_process_state calls took together."""
         return sum(times.seconds for times in self.runs)
 
     def slowest(self) -> list[Calls]:

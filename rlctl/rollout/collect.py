@@ -1,4 +1,4 @@
-"""Living a list of episodes with a policy, on many environments."""
+"""Playing a list of episodes with a policy, on many environments."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from rlctl.rollout.workers import EpisodeResult, Observations, Workers
 
 
 class Actor(Protocol):
-    """Chooses actions for several environments at once; may remember something per row (a recurrent state)."""
+    """Chooses actions for several environments at once; may keep a state per row (a recurrent state)."""
 
     def act(self, observations: Observations, rows: NDArray[np.int64], starts: NDArray[np.bool_]) -> NDArray[Any]:
         """Return an action per observation.
 
-        `observations` has a row per element of `rows`, which says what environment each belongs to; `starts`
-        says which of them begin an episode.
+        `observations` has a row per element of `rows`, the environment of each; `starts`
+        marks which of them begin an episode.
         """
         ...
 
@@ -57,9 +57,9 @@ def run_episodes(
     record: bool = False,
     on_episode: Callable[[int], None] | None = None,
 ) -> list[Episode]:
-    """Live an episode per seed and return them in the order of `seeds`.
+    """Play an episode per seed and return them in the order of `seeds`.
 
-    Which environment lives which episode does not matter: an episode follows from its seed and the policy alone.
+    Which environment plays which episode does not matter: an episode follows from its seed and the policy alone.
     `on_episode` is called with the number of episodes done.
     """
     arrays = workers.arrays
@@ -95,8 +95,8 @@ def run_episodes(
                 error.actions = recorders[error.env].actions(arrays.action[error.env])[: error.step]
             raise
         if record:
-            for place, env in enumerate(rows.tolist()):
-                recorders[env].add(_row(observations, place), actions[place], arrays, env)
+            for index, env in enumerate(rows.tolist()):
+                recorders[env].add(_row(observations, index), actions[index], arrays, env)
         for result in ended:
             index = running.pop(result.env)
             trajectory = None
@@ -136,7 +136,7 @@ class _Recorder:
         return Trajectory(observations, np.stack(self._actions), np.array(self._rewards), np.stack(self._terms))
 
 
-def _row(observations: Observations, place: int) -> Any:
+def _row(observations: Observations, index: int) -> Any:
     if isinstance(observations, dict):
-        return {key: value[place] for key, value in observations.items()}
-    return observations[place]
+        return {key: value[index] for key, value in observations.items()}
+    return observations[index]

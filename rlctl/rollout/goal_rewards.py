@@ -1,6 +1,6 @@
-"""Rewards for other goals than the wanted ones, asked of an environment in another process: for hindsight replay.
+"""Rewards for exchanged goals, computed by an environment in another process: for hindsight replay.
 
-The question is a short word and both arrays as safetensors; the answer, numbers as JSON.
+The request is a short prefix and both arrays as safetensors; the answer, numbers as JSON.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from safetensors.numpy import load, save
 
 from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
 
-QUESTION = b"rewards "
+PREFIX = b"rewards "
 """How the message begins."""
 
 
-def question(achieved: NDArray[Any], desired: NDArray[Any]) -> bytes:
-    """Return the message that asks for the rewards of goals; both of shape (n, *goal)."""
+def encode_request(achieved: NDArray[Any], desired: NDArray[Any]) -> bytes:
+    """Return the message that requests the rewards of goals; both of shape (n, *goal)."""
     goals = {"achieved": achieved, "desired": desired}
     # safetensors writes the memory as it lies, so that columns would be taken for rows.
-    return QUESTION + save({name: np.ascontiguousarray(each) for name, each in goals.items()})
+    return PREFIX + save({name: np.ascontiguousarray(each) for name, each in goals.items()})
 
 
-def answer(env: Any, message: bytes) -> list[float]:
-    """Return the n rewards of a question; raises `TaskError` for anything but n finite numbers."""
-    goals = load(message.removeprefix(QUESTION))
+def compute_answer(env: Any, message: bytes) -> list[float]:
+    """Return the n rewards of a request; raises `TaskError` for anything but n finite numbers."""
+    goals = load(message.removeprefix(PREFIX))
     count = len(goals["achieved"])
     infos: list[dict[str, Any]] = [{} for _ in range(count)]
     try:

@@ -1,4 +1,4 @@
-"""The actions of the episodes that environments are in: what it takes to live them again up to now."""
+"""The actions of the episodes that environments are in: what it takes to replay them up to now."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_BYTES = 2**28
-"""Memory for actions, 256 MB. An episode that goes back further than that cannot be lived again."""
+MAX_BYTES = 2**28
+"""Memory for actions, 256 MB. An episode that goes back further than that cannot be replayed."""
 
 
 class ActionHistory:
-    """Remembers the actions of all environments since the oldest of their running episodes began."""
+    """Stores the actions of all environments since the oldest of their running episodes began."""
 
     def __init__(self, n_envs: int) -> None:
         self._rows: deque[NDArray[Any]] = deque()
-        self._first = 0  # what number the first of the rows has
+        self._first = 0  # number of the first stored row
         self._began = np.zeros(n_envs, np.int64)  # number of each episode's first row
 
     @classmethod
     def of_episodes(cls, episodes: Sequence[NDArray[Any]], row: NDArray[Any]) -> ActionHistory:
-        """Return what is remembered after the actions of `episodes`, shape (steps, ...) each.
+        """Return the history after the actions of `episodes`, shape (steps, ...) each.
 
         `row` is what `add` is given: an array with the actions of all environments in a step.
         """
@@ -37,9 +37,9 @@ class ActionHistory:
         return history
 
     def add(self, actions: NDArray[Any]) -> None:
-        """Remember what all environments do in a step; shape (n_envs, ...)."""
+        """Store the actions of all environments in a step; shape (n_envs, ...)."""
         self._rows.append(actions.copy())
-        if len(self._rows) * actions.nbytes > MOST_BYTES:
+        if len(self._rows) * actions.nbytes > MAX_BYTES:
             self._drop(self._first + 1)
 
     def begin(self, envs: Iterable[int]) -> None:
@@ -57,7 +57,7 @@ class ActionHistory:
         start = int(self._began[env]) - self._first
         if start < 0:
             return None
-        return np.array([self._rows[place][env] for place in range(start, len(self._rows))])
+        return np.array([self._rows[index][env] for index in range(start, len(self._rows))])
 
     def all(self) -> list[NDArray[Any] | None]:
         """Return `of` every environment, in one go."""

@@ -21,7 +21,7 @@ class Stream(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeAddress:
-    """Names one episode of one run; enough, with the actions, to live it again."""
+    """Names one episode of one run; enough, with the actions, to reproduce it."""
 
     run_seed: int
     stream: Stream
@@ -37,5 +37,5 @@ class EpisodeAddress:
 
 
 def episode_seeds(run_seed: int, stream: Stream, episodes: int) -> list[int]:
-    """Return the seeds of a numbered list of episodes, the same whatever environment lives each of them."""
+    """Return the seeds of a numbered list of episodes, the same whichever environment plays each of them."""
     return [EpisodeAddress(run_seed, stream, 0, index).seed for index in range(episodes)]

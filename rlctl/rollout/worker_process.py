@@ -20,12 +20,12 @@ from gymnasium import spaces
 
 from rlctl.env_spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
-from rlctl.rollout import goal_rewards, returned
-from rlctl.rollout.failures import FailedInEpisode, as_message
-from rlctl.rollout.printed import say
+from rlctl.rollout import goal_rewards, returned_values
+from rlctl.rollout.failures import FailedInEpisode, encode_error
 from rlctl.rollout.process_group import end_with_parent
-from rlctl.rollout.returned import NotAsDeclared
+from rlctl.rollout.returned_values import InvalidReturn
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
+from rlctl.rollout.worker_output import write_stderr
 from rlctl.run.env_info import describe
 from rlctl.task.env import TaskEnv
 
@@ -45,8 +45,8 @@ class _Episode:
     def start(self, seed: int) -> Any:
         self.seed, self.step, self.active = seed, 0, True
         self._return, self._sums = 0.0, {}
-        observation, info = returned.parts(self.env.reset(seed=seed), returned.RESET, "reset")
-        returned.check_info(info)
+        observation, info = returned_values.check_tuple(self.env.reset(seed=seed), returned_values.RESET, "reset")
+        returned_values.check_info(info)
         return observation
 
     def count(self, reward: float, info: dict[str, Any]) -> None:
@@ -56,7 +56,7 @@ class _Episode:
             for name, value in info.get("reward_terms", {}).items():
                 sums[name] = sums.get(name, 0.0) + value
         except (TypeError, AttributeError):
-            raise NotAsDeclared(f"info['reward_terms'] is {info['reward_terms']!r}, not a dict of numbers") from None
+            raise InvalidReturn(f"info['reward_terms'] is {info['reward_terms']!r}, not a dict of numbers") from None
 
     def summary(self, info: dict[str, Any]) -> dict[str, Any]:
         success = info.get("is_success")
@@ -69,8 +69,10 @@ class _Episode:
             "seed": self.seed,
             "return": self._return,
             "length": self.step,
-            "success": None if success is None else bool(returned.number(success, "info['is_success']")),
-            "terms": {str(name): returned.number(value, f"reward term {name}") for name, value in self._sums.items()},
+            "success": None if success is None else bool(returned_values.to_float(success, "info['is_success']")),
+            "terms": {
+                str(name): returned_values.to_float(value, f"reward term {name}") for name, value in self._sums.items()
+            },
             "final_distance": None if distance is None else float(distance),
         }
 
@@ -85,7 +87,7 @@ class _Worker:
         space = envs[0].observation_space
         self.fields = observation_fields(space)
         leaves = space.spaces if isinstance(space, spaces.Dict) else {SINGLE: space}
-        self.categories = {key: returned.categories(leaf) for key, leaf in leaves.items()}
+        self.categories = {key: returned_values.category_bounds(leaf) for key, leaf in leaves.items()}
         self.space = space
         # A task's environment has looked at its observation itself.
         self.checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
@@ -98,35 +100,35 @@ class _Worker:
     def attach(self) -> None:
         self.arrays = SharedArrays(self.descriptor, self.total, self.space, self.action_space, len(self.term_names))
 
-    def store(self, place: dict[str, Any], episode: _Episode, observation: Any) -> None:
+    def store(self, target: dict[str, Any], episode: _Episode, observation: Any) -> None:
         if self.checked:
-            place[SINGLE][episode.index] = observation
+            target[SINGLE][episode.index] = observation
             return
         parts = observation if isinstance(observation, dict) else {SINGLE: observation}
-        if parts.keys() != place.keys():
-            raise NotAsDeclared(f"observation has the keys {sorted(parts)}, the space has {sorted(place)}")
+        if parts.keys() != target.keys():
+            raise InvalidReturn(f"observation has the keys {sorted(parts)}, the space has {sorted(target)}")
         for key, value in parts.items():
-            row = place[key]
+            row = target[key]
             shape, dtype = self.fields[key]
             value = np.asarray(value)
             if value.shape != shape:
-                raise NotAsDeclared(f"{_named(key)} has shape {value.shape}, the space has {shape}")
+                raise InvalidReturn(f"{_named(key)} has shape {value.shape}, the space has {shape}")
             if value.dtype is not dtype:
                 self.note_cast(episode, key, value)
-            # A sum is finite unless an element is not, or it overflows: the slow check then tells.
+            # A sum is finite unless an element is not, or it overflows: the slow check decides.
             if (
                 value.dtype.kind == "f"
                 and not math.isfinite(np.add.reduce(value, None))
-                and (error := returned.first_not_finite(value, _named(key)))
+                and (error := returned_values.find_not_finite(value, _named(key)))
             ):
                 raise error
             limits = self.categories[key]
             if limits is not None and not ((limits[0] <= value) & (value <= limits[1])).all():
-                raise NotAsDeclared(f"{_named(key)} is {value}, the space has {limits[0]} to {limits[1]}")
+                raise InvalidReturn(f"{_named(key)} is {value}, the space has {limits[0]} to {limits[1]}")
             row[episode.index] = value
 
     def note_cast(self, episode: _Episode, key: str, value: Any) -> None:
-        returned.check_kind(value, _named(key))
+        returned_values.check_numeric(value, _named(key))
         if not np.can_cast(value.dtype, self.fields[key][1]):
             count = self.arrays.cast[episode.index, 0] + 1
             self.arrays.cast[episode.index] = count, ord(value.dtype.char), list(self.fields).index(key)
@@ -137,10 +139,10 @@ class _Worker:
             if seed < 0:
                 episode.active = False
             else:
-                self.guarded(episode, self.begin, seed)
+                self.call_in_episode(episode, self.begin, seed)
         return []
 
-    def relive(self, episodes: list[tuple[int, int, int]], data: bytes) -> list[dict[str, Any]]:
+    def replay_actions(self, episodes: list[tuple[int, int, int]], data: bytes) -> list[dict[str, Any]]:
         """Begin episodes, (environment, seed, steps) each, and take the steps that led to where they were."""
         row = self.arrays.action[0]
         actions = iter(np.frombuffer(data, row.dtype).reshape(-1, *row.shape))
@@ -148,21 +150,21 @@ class _Worker:
         for index, seed, steps in episodes:
             self.arrays.next_seed[index] = -1
             try:
-                self.live_again(index, seed, list(itertools.islice(actions, steps)), ended)
+                self.replay_episode(index, seed, list(itertools.islice(actions, steps)), ended)
             except FailedInEpisode as failure:
-                # It did not when it was lived first. So it is elsewhere now, and may begin the next one.
+                # It did not fail the first time, so its state differs now: it may begin its next episode.
                 self.episodes[index - self.first].active = False
                 ended.append({"env": index})
-                say(f"{failure} when it was lived again")
+                write_stderr(f"{failure} when it was replayed")
         return ended
 
-    def live_again(self, index: int, seed: int, actions: list[Any], ended: list[dict[str, Any]]) -> None:
+    def replay_episode(self, index: int, seed: int, actions: list[Any], ended: list[dict[str, Any]]) -> None:
         episode = self.episodes[index - self.first]
-        self.guarded(episode, self.begin, seed)
+        self.call_in_episode(episode, self.begin, seed)
         for action in actions:
             self.arrays.action[index] = action
             if episode.active:
-                self.guarded(episode, self.step_one, ended)
+                self.call_in_episode(episode, self.step_one, ended)
 
     def begin(self, episode: _Episode, seed: int) -> None:
         self.arrays.inside[episode.index] = seed, 0
@@ -172,15 +174,15 @@ class _Worker:
         for episode in self.episodes:
             try:
                 episode.env.close()
-            except BaseException as error:  # what was lived is lived
-                say(f"warning: closing environment {episode.index}: {describe_exception(error)}")
+            except BaseException as error:  # its episodes are over
+                write_stderr(f"warning: closing environment {episode.index}: {describe_exception(error)}")
         self.episodes = []
 
     def step(self) -> list[dict[str, Any]]:
         ended: list[dict[str, Any]] = []
         for episode in self.episodes:
             if episode.active:
-                self.guarded(episode, self.step_one, ended)
+                self.call_in_episode(episode, self.step_one, ended)
         return ended
 
     def step_one(self, episode: _Episode, ended: list[dict[str, Any]]) -> None:
@@ -190,16 +192,19 @@ class _Worker:
         arrays.inside[index, 1] = episode.step
         given = episode.env.step(int(action) if self.discrete else action.copy())
         if given.__class__ is not tuple or len(given) != 5:
-            given = returned.parts(given, returned.STEP, "step")
+            given = returned_values.check_tuple(given, returned_values.STEP, "step")
         observation, reward, terminated, truncated, info = given
         if reward.__class__ is not float:
-            reward = returned.number(reward, "reward")
+            reward = returned_values.to_float(reward, "reward")
         if not math.isfinite(reward):
-            raise NotAsDeclared(f"reward is {reward}")
+            raise InvalidReturn(f"reward is {reward}")
         if info.__class__ is not dict:
-            returned.check_info(info)
+            returned_values.check_info(info)
         if terminated.__class__ is not bool or truncated.__class__ is not bool:
-            terminated, truncated = returned.flag(terminated, "terminated"), returned.flag(truncated, "truncated")
+            terminated, truncated = (
+                returned_values.to_bool(terminated, "terminated"),
+                returned_values.to_bool(truncated, "truncated"),
+            )
         episode.count(reward, info)
         arrays.reward[index] = reward
         arrays.terminated[index] = terminated
@@ -217,7 +222,7 @@ class _Worker:
         else:
             episode.active = False
 
-    def guarded(self, episode: _Episode, call: Callable[[_Episode, Any], None], argument: Any) -> None:
+    def call_in_episode(self, episode: _Episode, call: Callable[[_Episode, Any], None], argument: Any) -> None:
         try:
             call(episode, argument)
         except BaseException as error:  # a plugin may raise anything, SystemExit too
@@ -227,7 +232,7 @@ class _Worker:
 
 def main() -> None:
     """Serve commands until the connection closes. Arguments: connection, descriptor, and the job as JSON."""
-    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # what is printed is told at once
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # lines are forwarded at once
     job = json.loads(sys.argv[3])
     end_with_parent(job["parent"], int(sys.argv[4]))
     try:
@@ -235,8 +240,10 @@ def main() -> None:
     except (BrokenPipeError, ConnectionResetError):  # the main process has heard enough
         return
     except OSError as error:
-        told = error.strerror
-        say(f"no connection to rlctl any more ({told}): has an environment closed a file that is not its own?")
+        reason = error.strerror
+        write_stderr(
+            f"no connection to rlctl any more ({reason}): did an environment close a file descriptor of rlctl?"
+        )
         sys.exit(1)
 
 
@@ -253,7 +260,7 @@ def _serve(job: dict[str, Any]) -> None:
     try:
         worker = _built(job, job["spec"])
     except BaseException as error:
-        answer(error=as_message(error))
+        answer(error=encode_error(error))
         return
     answer(info=worker.info.model_dump())
     while True:
@@ -267,8 +274,8 @@ def _serve(job: dict[str, Any]) -> None:
             elif message == b"attach":
                 worker.attach()
                 ended = []
-            elif message.startswith(goal_rewards.QUESTION):
-                answer(rewards=goal_rewards.answer(worker.episodes[0].env, message))
+            elif message.startswith(goal_rewards.PREFIX):
+                answer(rewards=goal_rewards.compute_answer(worker.episodes[0].env, message))
                 continue
             elif message.startswith(b"{"):
                 worker.close()
@@ -277,12 +284,14 @@ def _serve(job: dict[str, Any]) -> None:
                 worker = _built(job, json.loads(message))
                 answer(info=worker.info.model_dump())
                 continue
-            elif message.startswith(b"relive "):
-                ended = worker.relive(json.loads(message.removeprefix(b"relive ")), connection.recv_bytes())
+            elif message.startswith(b"replay_actions "):
+                ended = worker.replay_actions(
+                    json.loads(message.removeprefix(b"replay_actions ")), connection.recv_bytes()
+                )
             else:
                 ended = worker.reset(json.loads(message))
         except BaseException as error:
-            answer(error=as_message(error))
+            answer(error=encode_error(error))
             continue
         if ended:
             answer(ended=ended)

@@ -27,16 +27,16 @@ from rlctl import errors
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.rollout import goal_rewards
-from rlctl.rollout.printed import forward
-from rlctl.rollout.process_group import end, signals_held
+from rlctl.rollout.process_group import block_signals, end
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
+from rlctl.rollout.worker_output import forward
 from rlctl.run.env_info import EnvInfo
 
 Observations = NDArray[Any] | dict[str, NDArray[Any]]
 
 # Started this way a worker finds what its parent finds, and the caller's script is not run again.
 # Who stops a service signals all of its processes, and the main process decides: ignored before anything slow is
-# imported, and held back until then. What the environments start has its own say.
+# imported, and held back until then. Processes that environments start decide for themselves.
 _BOOTSTRAP = (
     "import signal; numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP); "
     "[signal.signal(number, lambda *_: None) for number in numbers]; "
@@ -113,7 +113,7 @@ class Workers:
 
     def _start(self, first: int, count: int) -> None:
         ours, theirs = socket.socketpair()
-        # The end of a pipe that nobody writes to: it tells the worker when this process is gone, and closes it.
+        # The end of a pipe that nobody writes to: its hang-up shows the worker that this process is gone.
         lifeline, our_end = os.pipe()
         self._lifelines.append(our_end)
         job = {
@@ -132,7 +132,7 @@ class Workers:
             "MKL_NUM_THREADS": "1",
         }
         passed = (theirs.fileno(), self._memory, lifeline)
-        with theirs, open(lifeline, "rb"), signals_held():
+        with theirs, open(lifeline, "rb"), block_signals():
             process = subprocess.Popen(
                 [sys.executable, "-c", _BOOTSTRAP, *map(str, passed[:2]), json.dumps(job), str(lifeline)],
                 pass_fds=passed,
@@ -196,7 +196,7 @@ class Workers:
             self._send(worker, json.dumps(pairs).encode())
         self._answers(by_worker, self.timeout_s, "resetting")
 
-    def relive(self, episodes: Mapping[int, tuple[int, NDArray[Any]]]) -> set[int]:
+    def replay_actions(self, episodes: Mapping[int, tuple[int, NDArray[Any]]]) -> set[int]:
         """Begin episodes, environment index -> (seed, actions so far), and take those steps.
 
         Return the environments whose episode ended on the way: they are not where they were.
@@ -208,9 +208,9 @@ class Workers:
         for worker, envs in by_worker.items():
             heads = [(env, episodes[env][0], len(episodes[env][1])) for env in envs]
             dtype = self._arrays.action.dtype
-            self._send(worker, b"relive " + json.dumps(heads).encode())
+            self._send(worker, b"replay_actions " + json.dumps(heads).encode())
             self._send(worker, b"".join(episodes[env][1].astype(dtype).tobytes() for env in envs))
-        answers = self._answers(by_worker, self.timeout_s, "reliving episodes")
+        answers = self._answers(by_worker, self.timeout_s, "replaying episodes")
         return {each["env"] for answer in answers.values() for each in answer.get("ended", ())}
 
     def step(self) -> list[EpisodeResult]:
@@ -238,23 +238,23 @@ class Workers:
         return ended
 
     def compute_rewards(self, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.float64]:
-        """Return what environment 0 says steps are worth that reached one goal and wanted another.
+        """Return the rewards that environment 0 computes for steps that reached one goal and were to reach another.
 
         Goals of shape (n, *goal), rewards (n,). Raises `TaskError`, which names compute_reward, if it raises, hangs, or
         does not return n finite numbers.
         """
         self._wait_until_built()
-        self._send(0, goal_rewards.question(achieved, desired))
+        self._send(0, goal_rewards.encode_request(achieved, desired))
         answers = self._answers([0], self.timeout_s, "in compute_reward")
         return np.array(answers[0]["rewards"], np.float64)
 
     def observations(self, rows: Any = slice(None)) -> Observations:
         """Return a copy of the current observations, shape (rows, ...) or a dict of such."""
-        return _picked(self.arrays.observation, rows)
+        return _copy_rows(self.arrays.observation, rows)
 
     def final_observations(self, rows: Any) -> Observations:
         """Return a copy of the last observations of episodes that just ended."""
-        return _picked(self.arrays.final, rows)
+        return _copy_rows(self.arrays.final, rows)
 
     def _send_all(self, message: bytes) -> None:
         for worker in range(len(self._processes)):
@@ -302,12 +302,12 @@ class Workers:
     def _raised(self, error: dict[str, Any]) -> RlctlError:
         message = error["message"]
         kind = getattr(errors, error["kind"], TaskError) if error["kind"] else TaskError
-        place = (error["env"], error["seed"], error["step"]) if "env" in error else None
+        where = (error["env"], error["seed"], error["step"]) if "env" in error else None
         details = error["traceback"]
         if kind is TaskError and self._spec.task not in message.partition("\n")[0]:
             message = f"task {self._spec.task!r}: {message}"
-        if place is not None:
-            failed = EpisodeFailed(message, *place, hint=self._hint, details=details)
+        if where is not None:
+            failed = EpisodeFailed(message, *where, hint=self._hint, details=details)
             if kind is TaskError:
                 return failed
             message = str(failed)
@@ -367,7 +367,7 @@ class Workers:
         self.close()
 
 
-def _picked(arrays: dict[str, NDArray[Any]], rows: Any) -> Observations:
+def _copy_rows(arrays: dict[str, NDArray[Any]], rows: Any) -> Observations:
     picked: dict[str, Any] = {key: array[rows].copy() for key, array in arrays.items()}
     result: Observations = picked.get(SINGLE, picked)
     return result

@@ -55,7 +55,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     try:
         return cls(
             name,
-            normalized(env, recipe.normalize, kwargs.get("gamma", 0.99)),
+            wrap_normalize(env, recipe.normalize, kwargs.get("gamma", 0.99)),
             policy_kwargs=policy_kwargs,
             seed=recipe.seed,
             device=device,
@@ -66,14 +66,14 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
 
 
 def _check_device(device: str) -> None:
-    # SB3 takes the CPU without a word where there is no GPU.
+    # SB3 silently takes the CPU where there is no GPU.
     if device == "auto":
         return
     try:
-        wanted = torch.device(device)
+        requested = torch.device(device)
     except RuntimeError:
         raise UsageError(f"--device {device!r}: no such device; give cpu, cuda, cuda:1, or auto") from None
-    if wanted.type == "cuda" and (wanted.index or 0) >= torch.cuda.device_count():
+    if requested.type == "cuda" and (requested.index or 0) >= torch.cuda.device_count():
         raise UsageError(
             f"--device {device}: torch sees {torch.cuda.device_count()} CUDA devices here; use cpu or auto"
         )
@@ -135,7 +135,7 @@ def _check_rollout(recipe: Recipe, n_envs: int) -> None:
         raise RecipeError("algo_kwargs.n_steps: one environment needs at least 2 steps a rollout")
 
 
-def normalized(env: VecEnv, settings: Normalize | None, gamma: float) -> VecEnv:
+def wrap_normalize(env: VecEnv, settings: Normalize | None, gamma: float) -> VecEnv:
     """Wrap environments in SB3's VecNormalize, as far as their observations are real numbers."""
     if settings is None:
         return env

@@ -39,7 +39,7 @@ _POLICY, _STATE, _TENSORS = "policy.safetensors", "state.json", "state.safetenso
 
 
 class State(pydantic.BaseModel):
-    """What `state.json` says."""
+    """The content of `state.json`."""
 
     model_config = pydantic.ConfigDict(extra="forbid")
 
@@ -71,7 +71,7 @@ class Checkpoint:
 
 
 class Checkpoints:
-    """Writes the checkpoints of a training, and puts one back."""
+    """Writes the checkpoints of a training, and restores one."""
 
     def __init__(self, run: RunDirectory, model: BaseAlgorithm, env: WorkerVecEnv, keep: int) -> None:
         self._run = run
@@ -116,7 +116,7 @@ class Checkpoints:
         with files.whole_folder(target) as folder:
             for name, content in contents.items():
                 files.write_new(folder / name, content)
-            files.write_new(folder / _STATE, _sealed(state.model_dump(mode="json")))
+            files.write_new(folder / _STATE, _encode_state(state.model_dump(mode="json")))
         return target
 
     def computed_with(self) -> dict[str, str]:
@@ -124,7 +124,7 @@ class Checkpoints:
         return {
             **collect_versions(),
             "machine": platform.machine(),
-            "processor": f"{_maker()} {torch.backends.cpu.get_cpu_capability()}",
+            "processor": f"{_cpu_vendor()} {torch.backends.cpu.get_cpu_capability()}",
             "threads": str(torch.get_num_threads()),
             "device": str(self._model.device),
         }
@@ -136,30 +136,30 @@ class Checkpoints:
         if self._replay is not None:
             replay_segments.remove_unnamed(self._run.replay_segments, _named_segments(self._run))
 
-    def put_back(self, checkpoint: Checkpoint) -> str | None:
-        """Put model, replay buffer and environments where a checkpoint has them.
+    def restore(self, checkpoint: Checkpoint) -> str | None:
+        """Restore model, replay buffer and environments from a checkpoint.
 
-        Return, if an environment did not come back to where it was, what to tell: all begin their next episodes then.
+        Return a message if an environment did not reach its former state; then all begin their next episodes.
         """
         model, tensors = self._model, checkpoint.tensors
         try:
-            snapshot.put_back(model, tensors, checkpoint.state.model)
+            snapshot.restore(model, tensors, checkpoint.state.model)
             if self._replay is not None:
                 self._replay.load(checkpoint.state.segments, self._added)
-                replay_segments.put_back_hindsight(self._replay.buffer, tensors)
-            strayed = _put_back_environments(self._env, tensors)
+                replay_segments.restore_hindsight(self._replay.buffer, tensors)
+            mismatch = _restore_environments(self._env, tensors)
         except (ArtifactError, KeyError) as error:
             raise ArtifactError(f"{checkpoint.folder}: {error}") from None
         if (normalizer := model.get_vec_normalize_env()) is not None:
             normalizer.old_obs = self._env.workers.observations()
-        if strayed is not None:
+        if mismatch is not None:
             begin_next_episodes(model)
             if self._replay is not None:
-                self._replay.changed_last(self._added)
-        return strayed
+                self._replay.mark_last_changed(self._added)
+        return mismatch
 
 
-def newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
+def read_newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
     """Return the newest undamaged checkpoint, and what is wrong with those after it; None where there is none yet.
 
     Raises `ArtifactError` if all are damaged.
@@ -208,7 +208,7 @@ def _read_state(folder: Path) -> State:
     return state
 
 
-def _sealed(state: dict[str, Any]) -> bytes:
+def _encode_state(state: dict[str, Any]) -> bytes:
     return json.dumps({"sha256": _seal(state), "state": state}).encode()
 
 
@@ -226,8 +226,8 @@ def _named_segments(run: RunDirectory) -> list[Segment]:
     return named
 
 
-def _maker() -> str:
-    """Return who made the processor, where the system says it: libraries choose their code by that too."""
+def _cpu_vendor() -> str:
+    """Return the vendor of the processor, where known: libraries choose their code by that too."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -236,7 +236,7 @@ def _maker() -> str:
     return next(found, "unknown")
 
 
-def differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
+def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
     """Return `torch 2.13.0 -> 2.14.0` for each entry that is another one now."""
     names = dict.fromkeys([*before, *now])
     return [
@@ -248,36 +248,36 @@ def differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
 
 def _environment_tensors(env: WorkerVecEnv) -> Tensors:
     """Return the episodes that environments are in, what was done in them, and what was observed last."""
-    taken = env.history.all()
-    known = [actions for actions in taken if actions is not None and len(actions)]
+    histories = env.history.all()
+    nonempty = [actions for actions in histories if actions is not None and len(actions)]
     row = env.workers.arrays.action[:0]
     tensors = {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),
-        "environments/steps": np.array([-1 if actions is None else len(actions) for actions in taken], np.int64),
-        "environments/actions": np.concatenate([row, *known]),
+        "environments/steps": np.array([-1 if actions is None else len(actions) for actions in histories], np.int64),
+        "environments/actions": np.concatenate([row, *nonempty]),
     }
     for key, observation in env.workers.arrays.observation.items():
         tensors[f"environments/observation/{key}"] = observation
     return tensors
 
 
-def _put_back_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
-    """Live the running episodes again; return what to tell if an environment ended up elsewhere."""
+def _restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
+    """Replay the running episodes; return a message if an environment does not reach its former state."""
     steps = tensors["environments/steps"].tolist()
     if len(steps) != env.num_envs:
         raise ArtifactError(f"it is of {len(steps)} environments, not {env.num_envs}")
     started = tensors["environments/episodes_started"].tolist()
     if min(steps) < 0:
         env.episodes_started = started
-        return f"environment {steps.index(-1)} is in an episode too long to be lived again"
+        return f"environment {steps.index(-1)} is in an episode too long to be replayed"
     actions: list[NDArray[Any]] = np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])
-    strayed = set(env.relive(started, actions))
+    mismatch = set(env.replay_actions(started, actions))
     for key, observation in env.workers.arrays.observation.items():
         before = tensors[f"environments/observation/{key}"]
-        strayed.update(index for index in range(env.num_envs) if not np.array_equal(before[index], observation[index]))
-    if not strayed:
+        mismatch.update(index for index in range(env.num_envs) if not np.array_equal(before[index], observation[index]))
+    if not mismatch:
         return None
     return (
-        f"environment {min(strayed)} did not come back to where it was with its seed and actions, "
+        f"environment {min(mismatch)} did not come back to where it was with its seed and actions, "
         "so all begin their next episodes"
     )

@@ -1,4 +1,4 @@
-"""Where a training is in its curriculum, and when it goes on."""
+"""The present stage of a curriculum, and when the next one begins."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from rlctl.train.progress import Progress
 
 
 class Curriculum:
-    """The stages of a training; without any, nothing is ever due.
+    """The stages of a training; without any, no stage is ever due.
 
-    What it knows of the past is in `progress`, which checkpoints keep.
+    Its state is in `progress`, which checkpoints keep.
     """
 
     def __init__(self, stages: Sequence[Stage], specs: Sequence[EnvSpec], goal: EnvInfo, progress: Progress) -> None:
         self.stages = stages
         self.goal_spec = specs[-1]
-        """What evaluations live in, and policies are for: the last stage."""
+        """The last stage: evaluations are played in it, policies are for it."""
         self.goal = goal
         """What the environments of `goal_spec` are."""
         self._specs = specs
@@ -55,7 +55,7 @@ class Curriculum:
         return format_title(self.number, self.stages)
 
     def columns(self) -> dict[str, int]:
-        """Return what tables say of the stage: nothing without stages."""
+        """Return the columns of the stage for tables: nothing without stages."""
         return {"stage": self.number} if self.stages else {}
 
     def contents(self) -> list[StageContent]:
@@ -94,15 +94,15 @@ class Curriculum:
         """Return what the environments of the next stage are made from."""
         return self._specs[self.number]
 
-    def go_on(self, steps: int) -> tuple[str, str]:
+    def enter_next_stage(self, steps: int) -> tuple[str, str]:
         """Enter the next stage; return its title and why it begins."""
         rule, measured = self.stages[self.number - 1].promote, self.measured()
         assert rule is not None  # else nothing would be due
         assert measured is not None
-        told = f"success {percent(measured)}" if rule.success is not None else f"return {measured:.2f}"
+        reason = f"success {percent(measured)}" if rule.success is not None else f"return {measured:.2f}"
         progress = self._progress
         progress.stage, progress.stage_began, progress.stage_episodes = progress.stage + 1, steps, []
-        return self.title, f"after {steps:,} steps: {told} over {rule.window} episode{'s' if rule.window > 1 else ''}"
+        return self.title, f"after {steps:,} steps: {reason} over {rule.window} episode{'s' if rule.window > 1 else ''}"
 
     def warning(self) -> str | None:
         """Return, once, what is wrong with a rule that nothing can fulfil."""
@@ -161,5 +161,5 @@ def _cut_episodes(buffer: ReplayBuffer) -> None:
         buffer.truncate_last_trajectory()
         return
     last = buffer.pos - 1
-    running = buffer.dones[last] == 0.0  # the others have said themselves how they ended
+    running = buffer.dones[last] == 0.0  # the others have ended by themselves
     buffer.timeouts[last, running] = 1.0

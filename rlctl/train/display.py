@@ -37,7 +37,7 @@ def duration(seconds: float) -> str:
 
 
 class Display(abc.ABC):
-    """Is told what happens in a training."""
+    """Shows what happens in a training."""
 
     def __init__(self, title: str, total: int) -> None:
         self.title = title
@@ -67,7 +67,7 @@ class Display(abc.ABC):
 
     @abc.abstractmethod
     def message(self, text: str) -> None:
-        """Something to tell: a warning, or what an environment printed."""
+        """Text to show: a warning, or what an environment printed."""
 
 
 def stage_line(title: str, why: str) -> str:

@@ -44,7 +44,7 @@ class EpisodeKeeper:
         return [(self._write(episode), episode) for episode in list(self._latest)[-count:]] if count else []
 
     def keep_failed(self, spec: EnvSpec, error: EpisodeFailed, evaluated_at: int | None = None) -> Path:
-        """Write `error.actions`, of an episode that an environment did not survive; return the file."""
+        """Write `error.actions`, of an episode in which an environment failed; return the file."""
         policy = "training" if evaluated_at is None else f"{_POLICY}{evaluated_at}"
         failure = str(error).partition("\n")[0]
         info = EpisodeInfo.of(
@@ -77,7 +77,7 @@ class EpisodeKeeper:
 
 
 def remove_after(run: RunDirectory, steps: int) -> None:
-    """Remove the episodes of evaluations after a training step: a resumed run lives them again."""
+    """Remove the episodes of evaluations after a training step: a resumed run repeats them."""
     for file in run.episodes.glob("*.npz"):
         try:
             policy = load_episode(file).info.policy

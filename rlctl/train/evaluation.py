@@ -15,11 +15,11 @@ from rlctl.rollout.workers import Observations, Workers
 from rlctl.run.policy import BatchActor, PolicyInfo
 from rlctl.run.recipe import Recipe
 from rlctl.run.torch_policy import Normalizer, TorchPolicy
-from rlctl.train.snapshot import Tensors, own_randomness
+from rlctl.train.snapshot import Tensors, isolate_randomness
 
 
 class Evaluator:
-    """Lives the evaluation episodes of a run; the training does not notice."""
+    """Plays the evaluation episodes of a run without a trace in the training."""
 
     def __init__(self, recipe: Recipe, make_workers: Callable[[], Workers]) -> None:
         self._recipe = recipe
@@ -27,9 +27,7 @@ class Evaluator:
         # They build their environments beside the first updates, which leave a core idle.
         self._workers: Workers | None = make_workers()
 
-    def live(
-        self, model: BaseAlgorithm, info: PolicyInfo, tensors: Tensors, check: Callable[[], None]
-    ) -> list[Episode]:
+    def run(self, model: BaseAlgorithm, info: PolicyInfo, tensors: Tensors, check: Callable[[], None]) -> list[Episode]:
         """Return the episodes of a model's policy as it is now.
 
         `check` is called before each step and may raise to leave. Raises `TaskError` if an environment fails;
@@ -45,7 +43,7 @@ class Evaluator:
             self._recipe.seed, spawn_key=(int(Stream.EVAL_IN_TRAINING), model.num_timesteps)
         ).generate_state(1)
         try:
-            with own_randomness(model, int(chance[0])):
+            with isolate_randomness(model, int(chance[0])):
                 return run_episodes(workers, actor, seeds, record=True)
         except Exception:
             self.close()
@@ -61,7 +59,7 @@ class Evaluator:
 
 
 class _Watched:
-    """An actor that asks before each step whether to go on."""
+    """An actor that calls a check before each step."""
 
     def __init__(self, actor: Actor, check: Callable[[], None]) -> None:
         self._actor = actor

@@ -1,4 +1,4 @@
-"""What is told, and kept, of an environment that failed."""
+"""What a training reports and stores of an environment that failed."""
 
 from __future__ import annotations
 
@@ -12,24 +12,26 @@ from rlctl.train.saving import Saver
 from rlctl.train.vec_env import WorkerVecEnv
 
 
-def explained(error: TaskError, run: RunDirectory, env: WorkerVecEnv, saver: Saver, keeper: EpisodeKeeper) -> TaskError:
+def explain_fault(
+    error: TaskError, run: RunDirectory, env: WorkerVecEnv, saver: Saver, keeper: EpisodeKeeper
+) -> TaskError:
     """Keep the actions of the training episode that failed, and return the error with what to do next."""
     if isinstance(error, EpisodeFailed):
-        lived = env.history.of(error.env)
+        actions = env.history.of(error.env)
         # A reset that fails is that of the next episode: none of the actions is its own.
-        error.actions = None if lived is None else lived[: error.step]
-    told = [str(kept(error, env.workers.spec, saver, keeper))]
+        error.actions = None if actions is None else actions[: error.step]
+    lines = [str(keep_episode(error, env.workers.spec, saver, keeper))]
     if saver.saved_step:  # at step 0 there is nothing to keep
-        told.append(f"the checkpoint of step {saver.saved_step:,} stands; go on with: rlctl train --resume {run.path}")
-    return TaskError("\n".join(told), details=error.details)
+        lines.append(f"the checkpoint of step {saver.saved_step:,} stands; go on with: rlctl train --resume {run.path}")
+    return TaskError("\n".join(lines), details=error.details)
 
 
-def kept(
+def keep_episode(
     error: RlctlError, spec: EnvSpec, saver: Saver, keeper: EpisodeKeeper, evaluated_at: int | None = None
 ) -> RlctlError:
-    """Write the actions of an episode that failed, if they are known; return the error, which says where then."""
+    """Write the actions of an episode that failed, if they are known; return the error, with the file in its hint."""
     if not isinstance(error, EpisodeFailed) or error.actions is None:
         return error
     files: list[Path] = []
     saver.attempt("failed episode", lambda: files.append(keeper.keep_failed(spec, error, evaluated_at)))
-    return error.with_hint(f"to live it again: rlctl replay {files[0]}") if files else error
+    return error.with_hint(f"to reproduce it: rlctl replay {files[0]}") if files else error

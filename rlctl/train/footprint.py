@@ -19,9 +19,9 @@ from rlctl.run.hyperparameters import ON_POLICY
 from rlctl.run.recipe import Recipe
 
 _FLOAT32 = 4  # [bytes]
-_PER_WEIGHT = 4 * _FLOAT32  # the weight, its gradient, and two moments of the optimiser
+_BYTES_PER_WEIGHT = 4 * _FLOAT32  # the weight, its gradient, and two moments of the optimiser
 _LSTM_PARTS = 4  # hidden and cell state, of actor and critic
-_MOST_OF_IT = 0.9  # of the memory that is free; the environments need some as well
+_USABLE_SHARE = 0.9  # of the memory that is free; the environments need some as well
 
 
 def check(recipe: Recipe, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], n_envs: int) -> None:
@@ -40,7 +40,7 @@ def check(recipe: Recipe, observation_space: spaces.Space[Any], action_space: sp
         "policy_kwargs": _network(recipe.policy_kwargs),
     }
     for name, size in needs.items():
-        if size > _MOST_OF_IT * there:
+        if size > _USABLE_SHARE * there:
             raise RecipeError(
                 f"{name}: {_value(recipe, name)} needs {memory.format_bytes(size)} of memory, and "
                 f"{memory.format_bytes(there)} are free; give less"
@@ -80,7 +80,7 @@ def _network(kwargs: Mapping[str, Any]) -> int:
     weights = sum(int(before) * int(after) for part in parts for before, after in itertools.pairwise(part))
     hidden = int(kwargs.get("lstm_hidden_size", 0))
     weights += 2 * 4 * hidden * hidden * int(kwargs.get("n_lstm_layers", 1))
-    return weights * _PER_WEIGHT
+    return weights * _BYTES_PER_WEIGHT
 
 
 def _elements(space: spaces.Space[Any]) -> int:

@@ -1,4 +1,4 @@
-"""Hindsight experience replay: what an episode reached is learnt from as if it had been wanted.
+"""Hindsight experience replay: what an episode reached is learnt from as if it had been the goal.
 
 M. Andrychowicz et al., Hindsight Experience Replay, 2017, https://arxiv.org/abs/1707.01495; SB3's buffer does it.
 In a curriculum, exchanged goals are rewarded as the present stage does, whichever stage their episode is of.
@@ -79,7 +79,7 @@ def _no_room(size: int, n_envs: int, what_will_do: str) -> str:
 
 
 class HindsightBuffer(HerReplayBuffer):
-    """SB3's buffer, which says what to change where it has no whole episode to learn from.
+    """SB3's buffer, whose error says what to change where it has no whole episode to learn from.
 
     `episode_steps` are the most that an episode has, None if that is not known.
     """
@@ -101,14 +101,14 @@ class HindsightBuffer(HerReplayBuffer):
 
     def _no_episode(self) -> RecipeError:
         if self.full:
-            wanted = f"give it twice the steps of an episode, times {self.n_envs}"
-            return RecipeError(_no_room(self.buffer_size * self.n_envs, self.n_envs, wanted))
-        wanted = f"give it the steps of an episode, times {self.n_envs} environments"
+            advice = f"give it twice the steps of an episode, times {self.n_envs}"
+            return RecipeError(_no_room(self.buffer_size * self.n_envs, self.n_envs, advice))
+        advice = f"give it the steps of an episode, times {self.n_envs} environments"
         if self._episode_steps is not None:
-            wanted = f"{self._episode_steps * self.n_envs} will do"
+            advice = f"{self._episode_steps * self.n_envs} will do"
         return RecipeError(
             f"algo_kwargs.learning_starts: learning began after {self.pos * self.n_envs} steps, before an episode was "
-            f"over, and hindsight learns from whole ones; {wanted}"
+            f"over, and hindsight learns from whole ones; {advice}"
         )
 
     def truncate_last_trajectory(self) -> None:

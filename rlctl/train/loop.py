@@ -21,7 +21,7 @@ from rlctl.rollout.collect import Episode
 from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
-from rlctl.train import faults, rows, snapshot
+from rlctl.train import faults, snapshot, table_rows
 from rlctl.train.checkpoint import Checkpoint
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
@@ -51,8 +51,8 @@ class TrainingStopped(Exception):
     """Ends SB3's `learn` at a boundary; nothing is wrong."""
 
 
-class _Asked(Exception):
-    """A signal came while the evaluation episodes were lived."""
+class _StopRequested(Exception):
+    """A signal came while evaluation episodes were played."""
 
 
 class TrainingLoop(BaseCallback):
@@ -81,22 +81,24 @@ class TrainingLoop(BaseCallback):
         self.episodes = EpisodeKeeper(run, learner.curriculum.goal_spec, learner.curriculum.goal)
         self._evaluator = evaluator
         self._resumed = resumed
-        self._told_to_stop = False
+        self._stop_announced = False
         self._started = time.monotonic() - self.progress.seconds
         self._last_row = (time.monotonic(), self.model.num_timesteps)
 
     def _on_step(self) -> bool:
         self.display.steps(self.model.num_timesteps)
-        if self.stop_signal is not None and not self._told_to_stop:
-            self._told_to_stop = True
-            self.display.message("stopping after this update, with a checkpoint; once more to stop now")
+        if self.stop_signal is not None and not self._stop_announced:
+            self._stop_announced = True
+            self.display.message(
+                "stopping after this update, with a checkpoint; press Ctrl-C again to stop immediately"
+            )
         return True
 
     def _on_rollout_start(self) -> None:
         resumed, self._resumed = self._resumed, None
         if resumed is not None and not resumed.state.at_end:
             # gSDE has just drawn, as it had when the checkpoint was taken.
-            snapshot.put_back_randomness(self.model, resumed.tensors, resumed.state.model)
+            snapshot.restore_randomness(self.model, resumed.tensors, resumed.state.model)
         if self.model.num_timesteps > 0:
             self.boundary()
         elif self.saver.saved_step is None:
@@ -105,20 +107,20 @@ class TrainingLoop(BaseCallback):
             self.save_checkpoint()
 
     def boundary(self) -> None:
-        """Do everything that is due after an update, and that a checkpoint resumed from does not say was done."""
+        """Do everything that is due after an update, except what the resumed checkpoint has done already."""
         steps = self.model.num_timesteps
         self._take_ended()
         stage_done = self.curriculum.is_due(steps)
         self._write_metrics_if_due(steps, stage_done)
         if stage_done:
             self._begin_next_stage(steps)
-        self._stop_if_asked()
+        self._stop_if_requested()
         if steps >= self.progress.next_eval:
             self.evaluate()
             if self._is_good_enough():
                 self._save_the_end(at_end=False)
                 raise TrainingStopped
-            self._stop_if_asked()
+            self._stop_if_requested()
         if self.saver.checkpoint_is_due():
             self.save_checkpoint()
 
@@ -128,26 +130,26 @@ class TrainingLoop(BaseCallback):
         self.curriculum.count(ended)
         if warning := self.curriculum.warning():
             self.display.message(warning)
-        for warning in self.env.watch.report(self.env.workers.arrays, self.progress):
+        for warning in self.env.monitor.report(self.env.workers.arrays, self.progress):
             self.display.message(warning)
 
     def _begin_next_stage(self, steps: int) -> None:
         self.env.workers.rebuild(self.curriculum.next_spec())
         begin_next_episodes(self.model)
-        self.display.stage(*self.curriculum.go_on(steps))
+        self.display.stage(*self.curriculum.enter_next_stage(steps))
 
     def _is_good_enough(self) -> bool:
         return self.recipe.stop_success is not None and self.progress.good_in_a_row >= 2
 
-    def _stop_if_asked(self) -> None:
+    def _stop_if_requested(self) -> None:
         if self.stop_signal is not None:
             self._stop(self.stop_signal, at_end=False)
 
     def _stop(self, number: int, *, at_end: bool) -> None:
         saved = self.save_checkpoint(at_end=at_end)
-        told = "checkpoint saved" if saved else "the last saved checkpoint stands"
+        state = "checkpoint saved" if saved else "the last saved checkpoint stands"
         raise Interrupted(
-            f"interrupted at step {self.model.num_timesteps:,}; {told}. Go on with: "
+            f"interrupted at step {self.model.num_timesteps:,}; {state}. Go on with: "
             f"rlctl train --resume {self.run_directory.path}",
             number,
         )
@@ -167,9 +169,9 @@ class TrainingLoop(BaseCallback):
 
     def _save_the_end(self, *, at_end: bool) -> None:
         self.progress.done = True
-        if not self.saver.persistently(lambda: self.save_checkpoint(at_end=at_end)):
+        if not self.saver.retry(lambda: self.save_checkpoint(at_end=at_end)):
             raise ArtifactError(
-                f"{self.run_directory.path}: the training is done, but could not be saved: {self.saver.trouble}"
+                f"{self.run_directory.path}: the training is done, but could not be saved: {self.saver.problem}"
             )
 
     def check_finite(self) -> None:
@@ -208,7 +210,7 @@ class TrainingLoop(BaseCallback):
             "seconds": round(now - self._started, 3),
             "fps": round((steps - steps_before) / max(now - before, 1e-9), 1),
             **self.curriculum.columns(),
-            **rows.of_training(recent, terms, self.logger.name_to_value),
+            **table_rows.training_row(recent, terms, self.logger.name_to_value),
         }
         self.saver.row(self.saver.metrics, row)
         for name, number in self.curriculum.columns().items():
@@ -219,15 +221,15 @@ class TrainingLoop(BaseCallback):
         self.display.metrics(steps, row["fps"], row["return"], row["success"])
 
     def evaluate(self, *, at_end: bool = False) -> None:
-        """Live the evaluation episodes, keep the best policy, and write the row and the episodes.
+        """Play the evaluation episodes, save the best policy, and write the row and the episodes.
 
         An environment that fails costs this evaluation, not the training.
         """
         steps, began = self.model.num_timesteps, time.monotonic()
         packed = self._pack()
         try:
-            self._take_note(self._evaluator.live(self.model, *packed, self._leave_if_asked), packed)
-        except _Asked:
+            self._record_evaluation(self._evaluator.run(self.model, *packed, self._raise_if_stop_requested), packed)
+        except _StopRequested:
             assert self.stop_signal is not None
             self._stop(self.stop_signal, at_end=at_end)
         except (TaskError, UsageError, ArtifactError) as error:  # the last two where files were removed meanwhile
@@ -238,26 +240,26 @@ class TrainingLoop(BaseCallback):
         # The rate of training is without the time of evaluations.
         self._last_row = (self._last_row[0] + time.monotonic() - began, self._last_row[1])
 
-    def _leave_if_asked(self) -> None:
-        # An evaluation may take minutes, and who asks may wait seconds only: the resumed run lives it again.
+    def _raise_if_stop_requested(self) -> None:
+        # An evaluation may take minutes, too long to wait after a signal; the resumed run repeats it.
         if self.stop_signal is not None:
-            raise _Asked
+            raise _StopRequested
 
     def _evaluation_failed(self, error: RlctlError) -> None:
         progress, steps = self.progress, self.model.num_timesteps
         progress.failed_evaluations += 1
         progress.first_failure = progress.first_failure or f"at step {steps:,}: {error}"
-        error = faults.kept(error, self.curriculum.goal_spec, self.saver, self.episodes, steps)
+        error = faults.keep_episode(error, self.curriculum.goal_spec, self.saver, self.episodes, steps)
         self.display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
 
-    def _take_note(self, episodes: list[Episode], packed: Packed) -> None:
+    def _record_evaluation(self, episodes: list[Episode], packed: Packed) -> None:
         progress, steps = self.progress, self.model.num_timesteps
         results = [episode.result for episode in episodes]
         success, mean = success_rate(results), mean_return(results)
         better = self._is_better(success, mean)
         if better:
             info = packed[0].model_copy(update={"evaluation": Score(success=success, mean_return=mean)})
-            self.saver.keep_best((info, packed[1]))
+            self.saver.save_best((info, packed[1]))
             progress.best_success, progress.best_return, progress.best_step = success, mean, steps
         threshold = self.recipe.stop_success
         good = threshold is not None and success is not None and success >= threshold
@@ -266,7 +268,7 @@ class TrainingLoop(BaseCallback):
             "steps": steps,
             "seconds": round(time.monotonic() - self._started, 3),
             **self.curriculum.columns(),
-            **rows.of_evaluation(results),
+            **table_rows.evaluation_row(results),
         }
         self.saver.row(self.saver.evals, row)
         self.logger.record("eval/mean_reward", mean)
@@ -289,7 +291,7 @@ class TrainingLoop(BaseCallback):
 
     def explain_fault(self, error: TaskError) -> TaskError:
         """Keep the actions of the episode that failed, and return the error with what to do next."""
-        return faults.explained(error, self.run_directory, self.env, self.saver, self.episodes)
+        return faults.explain_fault(error, self.run_directory, self.env, self.saver, self.episodes)
 
     def save_checkpoint(self, *, at_end: bool = False) -> bool:
         """Write a checkpoint of the present boundary; False, with a warning, if the disk does not take it."""

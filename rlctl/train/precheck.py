@@ -12,7 +12,7 @@ from rlctl.errors import AnswerIsNo
 from rlctl.train.display import Display
 
 BUDGET_S = 2.0
-"""Time for living episodes [s]; importing and building the environment come on top."""
+"""Time for playing episodes [s]; importing and building the environment come on top."""
 STUDIES = ("comparisons", "episodes")
 """What one child process can do in that time."""
 
@@ -49,18 +49,20 @@ class Precheck:
             raise self._error
         report = self._report
         if report is None or report.evidence.built is None:
-            return  # the workers build it too, and say what is wrong
+            return  # the workers build it too, and report what is wrong
         task, found = self._spec.task, report.verdict.findings
         for name in report.verdict.crashed:
             display.message(f"check before training: {name} crashed, a bug in rlctl; what it would find is not known")
         errors = [finding for finding in found if finding.severity is Severity.ERROR]
         if errors:
-            told = "; ".join(f"{each.rule} {each.name} ({each.message})" for each in errors)
+            text = "; ".join(f"{each.rule} {each.name} ({each.message})" for each in errors)
             count = f"{len(errors)} error{'s' if len(errors) > 1 else ''}"
             raise AnswerIsNo(
-                f"the check before training found {count}: {told}\n"
-                f"rlctl check-env {task} says more; --no-check trains anyway."
+                f"the check before training found {count}: {text}\n"
+                f"rlctl check-env {task} shows details; --no-check trains anyway."
             )
         warnings = [finding.rule for finding in found if finding.severity is Severity.WARNING]
         if warnings:
-            display.message(f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} says more")
+            display.message(
+                f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} shows details"
+            )

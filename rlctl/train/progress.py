@@ -1,4 +1,4 @@
-"""What a training must remember over a resume, beside what learns."""
+"""What a resume restores beside the model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rlctl.rollout.workers import EpisodeResult
 
 @dataclasses.dataclass
 class Progress:
-    """What the loop must remember over a resume; plain data, kept in checkpoints. Steps are environment steps."""
+    """The state of the training loop; plain data, stored in checkpoints. Steps are environment steps."""
 
     next_eval: int
     """The first boundary at or after this step is evaluated."""

@@ -59,7 +59,7 @@ class ReplaySegments:
         self._row_bytes = sum(array[:1].nbytes for array in arrays)
         self._most_rows = max(1, SEGMENT_BYTES // self._row_bytes)
 
-    def changed_last(self, added: int) -> None:
+    def mark_last_changed(self, added: int) -> None:
         """Say that the last of `added` transitions is another one now than when it was added."""
         self._written = min(self._written, added - 1)
 
@@ -70,20 +70,20 @@ class ReplaySegments:
         if not all((self.folder / each.name).is_file() for each in segments):  # somebody has removed them
             segments, self._written = [], 0
         first = max(self._written, oldest)
-        while first < added and segments and self._worth_merging(segments[-1], first, added):
+        while first < added and segments and self._should_merge(segments[-1], first, added):
             first = max(min(first, segments.pop().first), oldest)
         for low in range(first, added, self._most_rows):
             segments.append(self._write(low, min(low + self._most_rows, added)))
         self._segments, self._written = segments, added
         return list(segments)
 
-    def _worth_merging(self, before: Segment, first: int, last: int) -> bool:
+    def _should_merge(self, before: Segment, first: int, last: int) -> bool:
         # Like a binary counter: a transition is written as often as its segment doubles, and no more.
         return before.last - before.first <= last - first and last - before.first <= self._most_rows
 
     def _write(self, first: int, last: int) -> Segment:
-        places = np.arange(first, last) % self.buffer.buffer_size
-        content = save_tensors({name: array[places] for name, array in _arrays(self.buffer).items()})
+        indices = np.arange(first, last) % self.buffer.buffer_size
+        content = save_tensors({name: array[indices] for name, array in _arrays(self.buffer).items()})
         segment = Segment(first=first, last=last, sha256=files.digest(content))
         files.write_bytes(self.folder / segment.name, content)
         return segment
@@ -104,13 +104,13 @@ class ReplaySegments:
 
     def _read(self, segment: Segment) -> None:
         file = self.folder / segment.name
-        places = np.arange(segment.first, segment.last) % self.buffer.buffer_size
+        indices = np.arange(segment.first, segment.last) % self.buffer.buffer_size
         try:
             stored = load_tensors(file.read_bytes())
             for name, array in _arrays(self.buffer).items():
-                if stored[name].shape != (len(places), *array.shape[1:]) or stored[name].dtype != array.dtype:
+                if stored[name].shape != (len(indices), *array.shape[1:]) or stored[name].dtype != array.dtype:
                     raise ValueError(f"{name} has shape {stored[name].shape} and type {stored[name].dtype}")
-                array[places] = stored[name]
+                array[indices] = stored[name]
         except (OSError, SafetensorError, KeyError, ValueError) as error:
             raise ArtifactError(f"{file}: does not fit this recipe: {error}") from None
 
@@ -154,7 +154,7 @@ def hindsight_tensors(buffer: ReplayBuffer) -> Tensors:
     }
 
 
-def put_back_hindsight(buffer: ReplayBuffer, tensors: Tensors) -> None:
+def restore_hindsight(buffer: ReplayBuffer, tensors: Tensors) -> None:
     """Give a HER buffer, whose transitions are there, the episodes that `hindsight_tensors` returned."""
     if not isinstance(buffer, HerReplayBuffer):
         return
@@ -162,9 +162,9 @@ def put_back_hindsight(buffer: ReplayBuffer, tensors: Tensors) -> None:
     for env, start in enumerate(buffer._current_ep_start.tolist()):
         buffer.ep_start[_ring(start, buffer.pos, buffer.buffer_size), env] = start
     for env, start, length in tensors["hindsight/episodes"].tolist():
-        places = _ring(start, start + length, buffer.buffer_size)
-        buffer.ep_start[places, env] = start
-        buffer.ep_length[places, env] = length
+        indices = _ring(start, start + length, buffer.buffer_size)
+        buffer.ep_start[indices, env] = start
+        buffer.ep_length[indices, env] = length
 
 
 def _ring(first: int, last: int, size: int) -> NDArray[np.int64]:

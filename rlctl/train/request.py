@@ -1,4 +1,4 @@
-"""`rlctl train`: from what was asked for to a finished run."""
+"""`rlctl train`: from a request to a finished run."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from rlctl.run.env_info import EnvInfo
 from rlctl.run.recipe import resolve
 from rlctl.train import status
 from rlctl.train.display import Display, make_display
-from rlctl.train.importing import undisturbed
 from rlctl.train.precheck import Precheck
-from rlctl.train.resuming import Start, check_stop_success, prepare, resumed
+from rlctl.train.process_state import preserve_process_state
+from rlctl.train.resume import Start, check_stop_success, load_start, prepare
 from rlctl.train.signals import StopSignals
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _EVAL_ENVS = 32
 
 @dataclasses.dataclass(frozen=True)
 class TrainRequest:
-    """What the command line asks for."""
+    """The arguments of `rlctl train`."""
 
     task: str | None
     resume: str | None = None
@@ -75,7 +75,7 @@ def run_training(request: TrainRequest) -> TrainResult:
     if (request.task is None) == (request.resume is None):
         raise UsageError("give a task to train, or --resume RUN to go on with a run; one of the two")
     with StopSignals() as signals:
-        start = _new(request) if request.task is not None else _resumed(request)
+        start = _new(request) if request.task is not None else _load_start(request)
         try:
             return _run(request, start, signals)
         finally:
@@ -85,21 +85,21 @@ def run_training(request: TrainRequest) -> TrainResult:
 
 def _new(request: TrainRequest) -> Start:
     task = request.task or ""
-    with undisturbed():
+    with preserve_process_state():
         constructor: Any = registry.load(task)
     stages = constructor.stages if registry.is_task(constructor) else ()
     return Start(task, resolve(task, request.config, request.settings, stages))
 
 
-def _resumed(request: TrainRequest) -> Start:
+def _load_start(request: TrainRequest) -> Start:
     if request.config is not None:
         raise UsageError("--resume goes on with the run's own recipe: leave out --config")
-    return resumed(request.resume, request.settings, request.root, force=request.force)
+    return load_start(request.resume, request.settings, request.root, force=request.force)
 
 
 def _run(request: TrainRequest, start: Start, signals: StopSignals) -> TrainResult:
     if start.checkpoint is not None and start.checkpoint.progress.done:
-        return _nothing_to_do(start, start.checkpoint)
+        return _report_finished(start, start.checkpoint)
     specs = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")
     title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
     with make_display(title, start.recipe.total_timesteps) as display:
@@ -122,11 +122,11 @@ def _goal(specs: list[EnvSpec], workers: Workers, request: TrainRequest, display
         return check_stages(specs, probe)
 
 
-def _nothing_to_do(start: Start, checkpoint: Checkpoint) -> TrainResult:
+def _report_finished(start: Start, checkpoint: Checkpoint) -> TrainResult:
     assert start.run is not None  # the checkpoint is in it
     if start.run.status().get("status") == "running":  # killed after all was done
         status.write_end(start.run, checkpoint.state.step, checkpoint.progress)
-    _tell_failed_evaluations(start.run, checkpoint.progress)
+    _report_failed_evaluations(start.run, checkpoint.progress)
     note = "this run is finished already: nothing to do; -n makes it longer"
     return _result(start.run, start, checkpoint.state.step, checkpoint.progress, [], note)
 
@@ -170,7 +170,7 @@ def _train(
             raise
         finally:
             evaluator.close()
-    _tell_failed_evaluations(run, learner.progress)
+    _report_failed_evaluations(run, learner.progress)
     return _result(run, start, learner.model.num_timesteps, learner.progress, recordings)
 
 
@@ -195,7 +195,7 @@ def _learner(request: TrainRequest, start: Start, specs: list[EnvSpec], workers:
 def _saver(
     request: TrainRequest, start: Start, run: RunDirectory, lock: RunLock, learner: Learner, display: Display
 ) -> Saver:
-    """Put everything where the checkpoint has it, if there is one, and return what writes from now on."""
+    """Restore the checkpoint, if there is one, and return what writes from now on."""
     from rlctl.train.checkpoint import Checkpoints
     from rlctl.train.saving import Saver
     from rlctl.train.tensorboard import make_logger
@@ -204,7 +204,7 @@ def _saver(
     learner.model.set_logger(make_logger(run.tensorboard, display.message, resumed_at or 0))
     checkpoints = Checkpoints(run, learner.model, learner.env, start.recipe.checkpoint.keep)
     if start.run is not None:
-        _go_on(start, run, checkpoints, learner, display)
+        _restore_run(start, run, checkpoints, learner, display)
 
     def write_start() -> None:
         lock.renew()
@@ -217,21 +217,21 @@ def _saver(
 
 
 def _learn_to_the_end(loop: TrainingLoop, request: TrainRequest, signals: StopSignals, display: Display) -> list[Path]:
-    """Train, write that it is done, and return the recordings that were asked for."""
-    from rlctl.train.space_watch import summary
-    from rlctl.train.tensorboard import writer_errors
+    """Train, write that it is done, and return the requested recordings."""
+    from rlctl.train.space_monitor import summary
+    from rlctl.train.tensorboard import silence_writer_thread
 
     if loop.recipe.stages:
         display.stage(loop.curriculum.title)
     signals.begin(loop)
-    with writer_errors():
+    with silence_writer_thread():
         _learn(loop)
     signals.end()
     steps, progress = loop.model.num_timesteps, loop.progress
     if warning := summary(progress):
         display.message(warning)
     saver, run = loop.saver, loop.run_directory
-    saver.persistently(lambda: saver.attempt("run.json", lambda: status.write_end(run, steps, progress)))
+    saver.retry(lambda: saver.attempt("run.json", lambda: status.write_end(run, steps, progress)))
     return _record(loop, request.record)
 
 
@@ -240,10 +240,10 @@ def _may_succeed(workers: Workers) -> bool:
     return workers.info.has_success or not workers.info.reward_weights
 
 
-def _go_on(start: Start, run: RunDirectory, checkpoints: Checkpoints, learner: Learner, display: Display) -> None:
-    """Put model, environments and run folder where the checkpoint has them, and say how exactly."""
+def _restore_run(start: Start, run: RunDirectory, checkpoints: Checkpoints, learner: Learner, display: Display) -> None:
+    """Restore model, environments and run folder from the checkpoint, and show how exact that is."""
     from rlctl.run.policy import read_policy
-    from rlctl.train.checkpoint import differences
+    from rlctl.train.checkpoint import find_differences
 
     for note in start.notes:
         display.message(note)
@@ -251,11 +251,11 @@ def _go_on(start: Start, run: RunDirectory, checkpoints: Checkpoints, learner: L
         folder, state = start.checkpoint.folder, start.checkpoint.state
         info, _ = read_policy(folder / "policy.safetensors")
         info.check_fits(learner.curriculum.goal, folder / "policy.safetensors")
-        strayed = checkpoints.put_back(start.checkpoint)
-        inexact = [*start.inexact, *differences(state.computed_with, checkpoints.computed_with())]
-        inexact += [strayed] if strayed else []
-        told = f"not bit-exact: {'; '.join(inexact)}" if inexact else "as if it had never stopped"
-        display.message(f"going on at step {state.step:,}, {told}")
+        mismatch = checkpoints.restore(start.checkpoint)
+        inexact = [*start.inexact, *find_differences(state.computed_with, checkpoints.computed_with())]
+        inexact += [mismatch] if mismatch else []
+        exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "as if it had never stopped"
+        display.message(f"going on at step {state.step:,}, {exactness}")
     for note in prepare(run, start.checkpoint, learner.progress):
         display.message(note)
 
@@ -277,7 +277,7 @@ def _learn(loop: TrainingLoop) -> None:
         raise
 
 
-def _tell_failed_evaluations(run: RunDirectory, progress: Progress) -> None:
+def _report_failed_evaluations(run: RunDirectory, progress: Progress) -> None:
     if progress.failed_evaluations:
         raise TaskError(
             f"{run.path}: the training is done, but {progress.failed_evaluations} of its evaluations failed, "

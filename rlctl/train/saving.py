@@ -19,7 +19,7 @@ from rlctl.train.snapshot import Tensors
 
 Packed = tuple[PolicyInfo, Tensors]
 
-TIME_FOR_CHECKPOINTS = 0.02
+CHECKPOINT_TIME_SHARE = 0.02
 """Part of the training's time that checkpoints may take."""
 PAUSES_S = (1.0, 5.0)
 """How long to wait before what ends a training is tried once more."""
@@ -40,14 +40,14 @@ class Saver:
         self.evals = Table(run.evals_file)
         self.saved_step: int | None = None
         """Step of the last checkpoint that is whole on the disk."""
-        self.trouble = ""
+        self.problem = ""
         """What could not be written the last time, and why."""
         self._run = run
         self._checkpoints = checkpoints
         self._warn = warn
         self._write_again = write_again
         self._next_checkpoint = time.monotonic()
-        self._unpaid = 1
+        self._uncounted_checkpoints = 1
         """Checkpoints that come whether they are due or not: the last one."""
         self._last_bytes = 0
         self._reminded = 0.0
@@ -62,7 +62,7 @@ class Saver:
                 self._restore_folder()
             write()
         except OSError as error:
-            self._tell(f"{what}: {error.strerror or error}")
+            self._report(f"{what}: {error.strerror or error}")
             return False
         return True
 
@@ -76,14 +76,14 @@ class Saver:
         else:
             self._warn(f"warning: {self._run.status_file} was removed while training: written again")
 
-    def _tell(self, trouble: str) -> None:
-        if trouble != self.trouble or time.monotonic() - self._reminded > _REMIND_EVERY_S:
-            self._warn(f"warning: not saved: {trouble}; training goes on")
+    def _report(self, problem: str) -> None:
+        if problem != self.problem or time.monotonic() - self._reminded > _REMIND_EVERY_S:
+            self._warn(f"warning: not saved: {problem}; training goes on")
             self._reminded = time.monotonic()
-        self.trouble = trouble
+        self.problem = problem
 
-    def persistently(self, write: Callable[[], bool]) -> bool:
-        """Call `write`, which says whether it has written, a few times: when a training ends there is no next time."""
+    def retry(self, write: Callable[[], bool]) -> bool:
+        """Call `write` until it returns True, a few times: after the last checkpoint there is no next one."""
         if write():
             return True
         for pause in PAUSES_S:
@@ -97,7 +97,7 @@ class Saver:
         table.add(row)
         self.attempt(table.path.name, table.flush)
 
-    def keep_best(self, packed: Packed) -> None:
+    def save_best(self, packed: Packed) -> None:
         """Write the best policy; one that the disk does not take now is written before the next checkpoint."""
         self._best, self._best_waits = packed, True
         self.attempt("best policy", self._write_best)
@@ -117,17 +117,17 @@ class Saver:
         packed = pack()
         saved = self.attempt("checkpoint", lambda: self._write_checkpoint(packed, progress, at_end))
         if saved:
-            self._tell_saved_again()
+            self._report_saved_again()
             self.attempt("old checkpoints", self._checkpoints.remove_old)
         now = time.monotonic()
-        self._next_checkpoint = now + (1 + self._unpaid) * (now - began) / TIME_FOR_CHECKPOINTS
-        self._unpaid = 0
+        self._next_checkpoint = now + (1 + self._uncounted_checkpoints) * (now - began) / CHECKPOINT_TIME_SHARE
+        self._uncounted_checkpoints = 0
         return saved
 
-    def _tell_saved_again(self) -> None:
-        if self.trouble:
+    def _report_saved_again(self) -> None:
+        if self.problem:
             self._warn(f"saved again, at step {self.saved_step:,}")
-        self.trouble = ""
+        self.problem = ""
 
     def _write_checkpoint(self, packed: Packed, progress: Progress, at_end: bool) -> None:
         # Whoever goes on from a checkpoint will not come by here again: everything before it must be on the disk.

@@ -13,7 +13,7 @@ from rlctl.errors import Interrupted
 if TYPE_CHECKING:
     from rlctl.train.loop import TrainingLoop
 
-_ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignals:
@@ -33,7 +33,9 @@ class StopSignals:
         if threading.current_thread() is threading.main_thread():
             # Set even where a shell has made SIGINT ignored, as for a command in the background; what `nohup` has made
             # ignored stays so.
-            asking = [each for each in _ASKING if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN]
+            asking = [
+                each for each in _STOP_SIGNALS if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN
+            ]
             self._before = {number: signal.signal(number, self._handle) for number in asking}
         return self
 
@@ -48,7 +50,7 @@ class StopSignals:
             signal.signal(number, self._handle)
 
     def end(self) -> None:
-        """The training is done and saved: it stays that, whoever asks for what."""
+        """The training is done and saved: later signals change nothing."""
         self._done = True
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

@@ -41,31 +41,31 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
         "randomness": {"python": _python_state(), "action_space": model.action_space.np_random.bit_generator.state},
         "episodes": list(model.ep_info_buffer or ()),
         "successes": [bool(each) for each in model.ep_success_buffer or ()],
-        "log": _logged(model),
+        "log": _log_values(model),
         # Images lie in memory with their channels last, and convolutions of another layout round differently.
         "axes": {name: _axes(values) for name, values in _observed(model).items()},
     }
     return tensors, plain
 
 
-def put_back(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
+def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
     """Give a model the state that `take` returned; raises `ArtifactError` if it is another kind of model."""
     try:
         parameters = _unflatten(plain["parameters"], tensors)
         model.set_parameters(parameters, exact_match=True, device=model.device)
-        _put_back_variables(model, tensors)
-        _put_back_normalizer(model, tensors)
-        _put_back_rollout(model, tensors, plain["axes"])
+        _restore_variables(model, tensors)
+        _restore_normalizer(model, tensors)
+        _restore_rollout(model, tensors, plain["axes"])
         for name in _COUNTERS:  # no other: a file does not choose what is set
             if name in plain["counters"]:
                 setattr(model, name, plain["counters"][name])
-        _put_back_log(model, plain)
-        put_back_randomness(model, tensors, plain)
+        _restore_log(model, plain)
+        restore_randomness(model, tensors, plain)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise ArtifactError(f"does not fit this recipe: {' '.join(str(error).split())[:200]}") from None
 
 
-def _put_back_log(model: BaseAlgorithm, plain: dict[str, Any]) -> None:
+def _restore_log(model: BaseAlgorithm, plain: dict[str, Any]) -> None:
     """Give SB3 its last episodes, and the logger the values of the last update: TensorBoard goes on with them."""
     model.ep_info_buffer = deque(plain["episodes"], maxlen=model._stats_window_size)
     model.ep_success_buffer = deque(plain["successes"], maxlen=model._stats_window_size)
@@ -73,7 +73,7 @@ def _put_back_log(model: BaseAlgorithm, plain: dict[str, Any]) -> None:
         model.logger.record(key, value, exclude=tuple(exclude))
 
 
-def _logged(model: BaseAlgorithm) -> list[Any]:
+def _log_values(model: BaseAlgorithm) -> list[Any]:
     excluded = model.logger.name_to_excluded
     values: dict[str, Any] = model.logger.name_to_value
     return [
@@ -83,8 +83,8 @@ def _logged(model: BaseAlgorithm) -> list[Any]:
     ]
 
 
-def put_back_randomness(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
-    """Put all random generators, and what gSDE explores with, where they were."""
+def restore_randomness(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
+    """Restore all random generators and the exploration matrices of gSDE."""
     torch.set_rng_state(torch.from_numpy(tensors["randomness/torch"].copy()))
     keys, position, has_gauss, cached = (tensors[f"randomness/numpy/{part}"] for part in _NUMPY)
     np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(cached)))  # noqa: NPY002 (SB3 draws there)
@@ -98,8 +98,8 @@ def put_back_randomness(model: BaseAlgorithm, tensors: Tensors, plain: dict[str,
 
 
 @contextlib.contextmanager
-def own_randomness(model: BaseAlgorithm, seed: int) -> Iterator[None]:
-    """Let something draw from torch's generator, beginning at `seed`, without a trace in the training."""
+def isolate_randomness(model: BaseAlgorithm, seed: int) -> Iterator[None]:
+    """Seed torch's generator with `seed` inside the block, and restore it after."""
     explorer = _explorer(model)
     before = {name: getattr(explorer, name) for name in _EXPLORATION if hasattr(explorer, name)}
     state = torch.get_rng_state()
@@ -189,7 +189,7 @@ def _variables(model: BaseAlgorithm) -> Tensors:
     return {f"variables/{name}": _array(getattr(model, name)) for name in names}
 
 
-def _put_back_variables(model: BaseAlgorithm, tensors: Tensors) -> None:
+def _restore_variables(model: BaseAlgorithm, tensors: Tensors) -> None:
     _, names = model._get_torch_save_params()
     for name in names:
         # In place: an optimiser holds this very tensor.
@@ -208,7 +208,7 @@ def _normalizer_tensors(model: BaseAlgorithm) -> Tensors:
     return tensors
 
 
-def _put_back_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
+def _restore_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
     normalizer = model.get_vec_normalize_env()
     if normalizer is None:
         return
@@ -236,7 +236,7 @@ def _axes(array: NDArray[Any]) -> list[int]:
     return sorted(range(array.ndim), key=lambda axis: -array.strides[axis])
 
 
-def _laid_out(values: NDArray[Any], axes: list[int]) -> NDArray[Any]:
+def _copy_with_axes(values: NDArray[Any], axes: list[int]) -> NDArray[Any]:
     """Copy an array into memory in the order of `axes`."""
     return values.transpose(axes).copy().transpose(np.argsort(axes))
 
@@ -247,23 +247,25 @@ def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
     tensors |= {name: np.asarray(part) for name, part in _observed(model).items()}
     states: Any = getattr(model, "_last_lstm_states", None)
     for kind, pair in zip(("pi", "vf"), states or (), strict=False):
-        for place, each in enumerate(pair):
-            tensors[f"rollout/lstm/{kind}/{place}"] = _array(each)
+        for index, each in enumerate(pair):
+            tensors[f"rollout/lstm/{kind}/{index}"] = _array(each)
     return tensors
 
 
-def _put_back_rollout(model: BaseAlgorithm, tensors: Tensors, axes: dict[str, list[int]]) -> None:
+def _restore_rollout(model: BaseAlgorithm, tensors: Tensors, axes: dict[str, list[int]]) -> None:
     model._last_episode_starts = tensors["rollout/starts"].copy()
     for name in _OBSERVED:
         prefix = f"rollout/{name}/"
         # In the order of `axes`: a file of tensors has them by name, a dict observation as its space has them.
         parts = {
-            key[len(prefix) :]: _laid_out(tensors[key], order) for key, order in axes.items() if key.startswith(prefix)
+            key[len(prefix) :]: _copy_with_axes(tensors[key], order)
+            for key, order in axes.items()
+            if key.startswith(prefix)
         }
         setattr(model, name, parts.get("", parts or None))
     if getattr(model, "_last_lstm_states", None) is not None:
         pairs = [
-            tuple(torch.from_numpy(tensors[f"rollout/lstm/{kind}/{place}"].copy()).to(model.device) for place in (0, 1))
+            tuple(torch.from_numpy(tensors[f"rollout/lstm/{kind}/{index}"].copy()).to(model.device) for index in (0, 1))
             for kind in ("pi", "vf")
         ]
         model._last_lstm_states = RNNStates(*pairs)  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""What `run.json` says of a training: how it began and how it ended."""
+"""The content of `run.json`: how it began and how it ended."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rlctl import registry
 from rlctl.errors import DivergedError, Interrupted
 from rlctl.run import files
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import collect_versions
+from rlctl.run.policy import versions
 from rlctl.run.recipe import Recipe
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
         "algo": recipe.algo,
         "seed": recipe.seed,
         "device": device,
-        "versions": collect_versions(),
+        "versions": versions(),
         "git_commit": _git_commit(),
         "command": ["rlctl", *sys.argv[1:]],
         "host": platform.node(),
@@ -49,20 +49,20 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
 
 
 def _identity(task: str) -> dict[str, Any]:
-    """Return what tells one version of a task from another: its distribution's, and its source."""
+    """Return what identifies a version of a task: its distribution's, and its source."""
     source = registry.find_source_file(task)
     digest = files.digest(source.read_bytes()) if source is not None and source.is_file() else None
     return {"origin": registry.find_origin(task), "source_sha256": digest}
 
 
-def task_changes(told: Mapping[str, Any], task: str) -> list[str]:
-    """Say how a task differs from what `run.json` told when its training began; nothing if it does not."""
+def describe_task_changes(before_status: Mapping[str, Any], task: str) -> list[str]:
+    """Describe how a task differs from what `run.json` has of the start; empty if it does not."""
     now = _identity(task)
-    before, after = (each if isinstance(each, dict) else {} for each in (told.get("origin"), now["origin"]))
+    before, after = (each if isinstance(each, dict) else {} for each in (before_status.get("origin"), now["origin"]))
     if before != after:
         names = (" ".join(map(str, each.values())) or "no installed package" for each in (before, after))
         return ["task {} came from {} when the run began, and comes from {} now".format(task, *names)]
-    if told.get("source_sha256") != now["source_sha256"]:
+    if before_status.get("source_sha256") != now["source_sha256"]:
         file = registry.find_source_file(task)
         gone = file is not None and not file.is_file()
         return [f"{file or task} {'is not there any more' if gone else 'is not what it was when the run began'}"]

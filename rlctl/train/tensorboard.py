@@ -14,7 +14,7 @@ from torch.utils.tensorboard.writer import SummaryWriter
 
 class _Format(TensorBoardOutputFormat):
     def __init__(self, folder: Path, first_step: int) -> None:
-        # What was written of these steps before, by an earlier process say, is not shown twice.
+        # What was written of these steps before, by an earlier process for example, is not shown twice.
         self.writer = SummaryWriter(log_dir=str(folder), purge_step=first_step or None)
         self._is_closed = False
 
@@ -31,7 +31,7 @@ class _TensorBoard(KVWriter):
     def __init__(self, folder: Path, warn: Callable[[str], None], first_step: int) -> None:
         self._folder = folder
         self._warn = warn
-        self._trouble = ""
+        self._problem = ""
         self._format: _Format | None = None
         self._attempt(lambda: self._open(first_step))
 
@@ -49,24 +49,24 @@ class _TensorBoard(KVWriter):
         try:
             write()
         except OSError as error:
-            trouble = error.strerror or str(error)
-            if trouble != self._trouble:
-                self._warn(f"warning: not saved: TensorBoard log: {trouble}; metrics.csv has the same numbers")
-            self._trouble = trouble
+            problem = error.strerror or str(error)
+            if problem != self._problem:
+                self._warn(f"warning: not saved: TensorBoard log: {problem}; metrics.csv has the same numbers")
+            self._problem = problem
             self.close()
         else:
-            self._trouble = ""
+            self._problem = ""
 
     def close(self) -> None:
         before, self._format = self._format, None
         if before is not None:
-            with contextlib.suppress(OSError):  # told when it happened first
+            with contextlib.suppress(OSError):  # reported when it happened first
                 before.close()
 
 
 @contextlib.contextmanager
-def writer_errors() -> Iterator[None]:
-    """Keep quiet of what TensorBoard's own thread cannot write: `write` raises it again, and that is told."""
+def silence_writer_thread() -> Iterator[None]:
+    """Silence errors of TensorBoard's own thread: `write` raises them again, and that is reported."""
     before = threading.excepthook
 
     def hook(arguments: threading.ExceptHookArgs) -> None:
@@ -81,5 +81,5 @@ def writer_errors() -> Iterator[None]:
 
 
 def make_logger(folder: Path, warn: Callable[[str], None], first_step: int = 0) -> Logger:
-    """Return a logger that writes to a TensorBoard folder from a step on; `warn` is told if it cannot."""
+    """Return a logger that writes to a TensorBoard folder from a step on; `warn` is called if it cannot."""
     return Logger(str(folder), [_TensorBoard(folder, warn, first_step)])

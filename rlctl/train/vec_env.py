@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from rlctl.rollout.history import ActionHistory
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import EpisodeResult, Workers
-from rlctl.train.space_watch import SpaceWatch
+from rlctl.train.space_monitor import SpaceMonitor
 
 _NOTHING: dict[str, Any] = {}
 
@@ -27,9 +27,9 @@ class WorkerVecEnv(VecEnv):
         """Per environment, how many episodes have begun: the next one's number."""
         self.history = ActionHistory(workers.n_envs)
         """What was done in the running episodes."""
-        self.watch = SpaceWatch(workers.info.spaces()[0])
+        self.monitor = SpaceMonitor(workers.info.spaces()[0])
         self.ended: list[EpisodeResult] = []
-        """Episodes that ended since somebody last took them."""
+        """Episodes that ended since the last `take_ended`."""
         self.render_mode = None
         super().__init__(workers.n_envs, *workers.info.spaces())
 
@@ -48,16 +48,16 @@ class WorkerVecEnv(VecEnv):
         for env in envs:
             self.workers.arrays.next_seed[env] = self._seed(env, self.episodes_started[env])
 
-    def relive(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
-        """Put each environment into the episode it was in, and take the actions that were taken in it.
+    def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
+        """Put each environment into its running episode by replaying the actions.
 
         `actions` has shape (steps, ...) per environment. Return the environments whose episode ended on the way,
         which they would not if they were deterministic.
         """
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
-        ended = self.workers.relive(dict(enumerate(zip(seeds, actions, strict=True))))
-        self.watch.forget(self.workers.arrays)  # counted when it was lived first
+        ended = self.workers.replay_actions(dict(enumerate(zip(seeds, actions, strict=True))))
+        self.monitor.forget(self.workers.arrays)  # counted the first time
         self.history = ActionHistory.of_episodes(actions, self.workers.arrays.action)
         for env in range(self.num_envs):
             self.workers.arrays.next_seed[env] = self._seed(env, self.episodes_started[env])
@@ -74,16 +74,16 @@ class WorkerVecEnv(VecEnv):
         if ended:
             envs = [result.env for result in ended]
             final = self.workers.final_observations(envs)
-            for place, result in enumerate(ended):
+            for index, result in enumerate(ended):
                 env = result.env
                 self.episodes_started[env] += 1
-                infos[env] = self._end_info(result, _row(final, place))
+                infos[env] = self._end_info(result, _row(final, index))
             self._begun(envs)
             self.ended += ended
         # float32, as SB3's own environments hand rewards over.
         rewards = arrays.reward.astype(np.float32)
         observations = self.workers.observations()
-        self.watch.look(observations)
+        self.monitor.look(observations)
         return observations, rewards, arrays.terminated | arrays.truncated, infos
 
     def _end_info(self, result: EpisodeResult, final_observation: Any) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class WorkerVecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
 
-def _row(observations: Any, place: int) -> Any:
+def _row(observations: Any, index: int) -> Any:
     if isinstance(observations, dict):
-        return {key: value[place] for key, value in observations.items()}
-    return observations[place]
+        return {key: value[index] for key, value in observations.items()}
+    return observations[index]

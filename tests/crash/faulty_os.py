@@ -36,12 +36,12 @@ class FaultyOs:
         def operation(*arguments, **options):
             self.count += 1
             self._log(f"operation {self.count} {name} {arguments[0]}")
-            self._take_note(name, *arguments)
+            self._record_evaluation(name, *arguments)
             return self._operate(name, original, arguments, options)
 
         return operation
 
-    def _take_note(self, name, first, *_):
+    def _record_evaluation(self, name, first, *_):
         if name not in ("write", "fsync"):
             return
         told = os.fstat(first)

@@ -20,7 +20,7 @@ def run(arguments, folder, plan):
     from rlctl.run import files
     from rlctl.train import saving
 
-    saving.TIME_FOR_CHECKPOINTS = plan.get("time_for_checkpoints", 1e9)  # at every boundary
+    saving.CHECKPOINT_TIME_SHARE = plan.get("time_for_checkpoints", 1e9)  # at every boundary
     saving.PAUSES_S = (0.0, 0.0)
     _announce(saving.Saver, log)
     files.os = FaultyOs(log, **plan.get("disk", {}))

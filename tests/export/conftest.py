@@ -12,7 +12,7 @@ from rlctl.run.env_info import describe
 from rlctl.run.policy import save_policy
 from rlctl.run.recipe import Normalize
 from rlctl.run.torch_policy import ALGORITHMS, policy_name
-from rlctl.train.algorithms import normalized
+from rlctl.train.algorithms import wrap_normalize
 from rlctl.train.pack import pack
 
 SMALL = f"{Path(__file__).parent / 'envs.py'}:Small"
@@ -44,7 +44,7 @@ def train():
     """Return a model of `steps` steps and its environments, normalised as far as the recipe's default would."""
 
     def trained(algo, spec, steps=64, **kwargs):
-        env = normalized(DummyVecEnv([spec.make]), Normalize(), 0.99)
+        env = wrap_normalize(DummyVecEnv([spec.make]), Normalize(), 0.99)
         name = policy_name(algo, env.observation_space)
         settings = {**ON_POLICY.get(algo, OFF_POLICY), "policy_kwargs": {"net_arch": [16, 16]}, **kwargs}
         model = ALGORITHMS[algo](name, env, device="cpu", seed=0, **settings)

@@ -58,7 +58,7 @@ def small_ppo() -> dict:
 @pytest.fixture
 def every_boundary(monkeypatch):
     """Write a checkpoint at every boundary, whatever it costs."""
-    monkeypatch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e9)
+    monkeypatch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e9)
 
 
 @pytest.fixture

@@ -159,14 +159,14 @@ SAC = {
 @pytest.mark.parametrize("settings", [pytest.param(TINY, marks=pytest.mark.slow), SAC], ids=["ppo", "sac"])
 def test_an_environment_that_no_seed_reaches_begins_new_episodes(killed, resume, capfd, settings):
     run = killed("Unseeded", settings)
-    before, _ = checkpoint.newest(run)
+    before, _ = checkpoint.read_newest(run)
     resume(run)
     told = capfd.readouterr().err
     assert (
         "going on at step 64, not bit-exact: environment 0 did not come back to where it was with its seed and "
         "actions, so all begin their next episodes"
     ) in told
-    after, damage = checkpoint.newest(run)
+    after, damage = checkpoint.read_newest(run)
     assert damage == []
     assert after.state.step == 128
     if settings is SAC:
@@ -199,7 +199,7 @@ def test_an_environment_that_fails_when_lived_again_begins_new_episodes(killed, 
     resume(run)
     told = capfd.readouterr().err
     assert "RuntimeError: the gripper fell off in environment " in told
-    assert ", step 2, when it was lived again" in told
+    assert ", step 2, when it was replayed" in told
     assert "did not come back to where it was with its seed and actions, so all begin their next episodes" in told
     assert run.status()["status"] == "finished"
 

@@ -40,7 +40,7 @@ def column(path, name, kind=int):
 
 
 def saved(run):
-    return checkpoint.newest(run)[0]
+    return checkpoint.read_newest(run)[0]
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_a_window_must_be_full_and_only_its_episodes_count():
     assert not stages.is_due(1000)
     stages.count(ended(True, True, True))  # 3 of 4
     assert stages.is_due(1000)
-    assert stages.go_on(1000) == (
+    assert stages.enter_next_stage(1000) == (
         "stage 2 of 2: the recipe's own task",
         "after 1,000 steps: success 75.0% over 4 episodes",
     )
@@ -80,7 +80,7 @@ def test_min_steps_are_steps_of_the_stage():
     stages.count(ended(None, total=5.0))
     assert not stages.is_due(99)
     assert stages.is_due(100)
-    stages.go_on(120)
+    stages.enter_next_stage(120)
     stages.count(ended(None, total=5.0))
     assert not stages.is_due(219)
     assert stages.is_due(220)

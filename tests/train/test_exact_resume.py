@@ -108,7 +108,7 @@ def newest_other_than(run):
 
 @pytest.mark.parametrize("case", ["ppo", "dqn"])
 def test_an_evaluation_after_the_last_checkpoint(train, resume, kill_after, monkeypatch, case):
-    monkeypatch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e-9)
+    monkeypatch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e-9)
     env, given = CASES[case]
     whole = train(env, given).run
     undo = kill_after(40)

@@ -1,4 +1,4 @@
-"""The episode that an environment did not survive is kept, and lived again."""
+"""The episode in which an environment failed is stored, and reproduced."""
 
 import pytest
 
@@ -37,7 +37,7 @@ def test_it_fails_again_as_it_did(fail, rlctl, case):
     error, run = fail(env, {**TINY, **settings}, **{"fault": "raise", **parameters})
     first, place, *_ = str(error).splitlines()
     file = run.episode_file(0)
-    assert place.endswith(f"; to live it again: rlctl replay {file}")
+    assert place.endswith(f"; to reproduce it: rlctl replay {file}")
     episode = load_episode(file)
     assert episode.info.failure == first
     assert episode.info.seed == FAULTY_SEED

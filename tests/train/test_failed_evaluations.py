@@ -59,7 +59,7 @@ def test_training_goes_on(train, settings, tmp_path, capfd, fault, told):
     kept = [file for file in sorted(run.episodes.glob("*.npz")) if load_episode(file).info.failure]
     assert [load_episode(file).info.policy for file in kept] == ["training step 64", "training step 96"]
     assert all(len(load_episode(file).actions) == 7 for file in kept)
-    assert f"to live it again: rlctl replay {kept[0]}" in printed
+    assert f"to reproduce it: rlctl replay {kept[0]}" in printed
 
 
 @pytest.mark.slow

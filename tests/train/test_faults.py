@@ -29,7 +29,7 @@ def whole(tmp_path_factory):
 
     root = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(saving, "TIME_FOR_CHECKPOINTS", 1e9)
+        patch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e9)
         return run_training(TrainRequest(f"{ENVS}:Faulty", settings={**TINY, "task": {"fault": ""}}, root=root)).run
 
 
@@ -61,7 +61,7 @@ def test_a_fault_is_named_and_the_run_goes_on_after_it(fail, resume, monkeypatch
     told = ENDS.get(fault, "no answer for 3 s while stepping; if that may take so long, raise --env-timeout")
     assert str(error).splitlines() == [
         f"task '{ENVS}:Faulty': {told}",
-        f"{PLACE}to live it again: rlctl replay {run.episode_file(0)}",
+        f"{PLACE}to reproduce it: rlctl replay {run.episode_file(0)}",
         f"the checkpoint of step 64 stands; go on with: rlctl train --resume {run.path}",
     ]
     assert error.exit_code == 3
@@ -91,7 +91,7 @@ def test_a_reset_that_hangs(fail):
 def test_connections_closed_by_the_environment(fail, capfd):
     error, _ = fail(fault="closes files")
     assert "worker 1 died while " in str(error)
-    assert "has an environment closed a file that is not its own?" in capfd.readouterr().err
+    assert "did an environment close a file descriptor of rlctl?" in capfd.readouterr().err
 
 
 def test_an_environment_that_cannot_be_built_leaves_no_run(train, tmp_path):
@@ -120,7 +120,7 @@ def test_one_of_the_bad_manners_alone(train, whole, manners):
 
 
 def assert_same_weights(one, other):
-    (ours, _), (theirs, _) = checkpoint.newest(one), checkpoint.newest(other)
+    (ours, _), (theirs, _) = checkpoint.read_newest(one), checkpoint.read_newest(other)
     different = [name for name, values in ours.tensors.items() if values.tobytes() != theirs.tensors[name].tobytes()]
     assert different == []
 
@@ -132,7 +132,7 @@ def test_observations_outside_their_space_are_counted_and_said(train, capfd):
         "warning: observation is outside its space: element 0 is 12.5, not -10 to 10; "
         "such observations are counted, and taken as they are"
     ) in told
-    assert "warning: observation comes as float64, its space says float32: cast, and counted" in told
+    assert "warning: observation comes as float64, its space has float32: cast, and counted" in told
     # Each of two environments took 32 steps, in four episodes that began with an observation each; three had a fifth.
     assert run.status()["observations_outside"] == 2 * 3
     assert run.status()["observations_cast"] == 2 * (32 + 4)

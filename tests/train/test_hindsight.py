@@ -151,7 +151,7 @@ def goals(max_steps=None) -> EnvInfo:
 def test_a_task_that_computes_rewards(tmp_path):
     settings = {**SMALL_HER, "n_envs": 2, "total_timesteps": 110, "algo_kwargs": {"batch_size": 16}, "task": {}}
     run = run_training(TrainRequest(f"{tasks.__file__}:Place", settings=settings, root=tmp_path)).run
-    found, _ = checkpoint.newest(run)
+    found, _ = checkpoint.read_newest(run)
     assert found.state.model["counters"]["_n_updates"] == 5 * 2  # after 102, 104, ..., 110 steps
     assert load_policy(run.best_policy).info.env.has_compute_reward
 

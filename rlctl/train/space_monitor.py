@@ -1,4 +1,4 @@
-"""Counts observations that are not what their space says, which trains all the same, and says so once."""
+"""Counts observations that contradict their space and warns once; training goes on."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
 from rlctl.train.progress import Progress
 
 
-class SpaceWatch:
+class SpaceMonitor:
     """Looks at the observations of all environments after each step: some microseconds, for all of them together."""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         leaves = space.spaces if isinstance(space, spaces.Dict) else {SINGLE: space}
         self._dtypes = [dtype for _, dtype in observation_fields(space).values()]
         self._keys = list(leaves)
-        self._bounds = {key: leaf for key, leaf in leaves.items() if isinstance(leaf, spaces.Box) and _may_leave(leaf)}
-        self._limits = {key: _one_for_all(box) for key, box in self._bounds.items()}
+        self._bounds = {key: leaf for key, leaf in leaves.items() if isinstance(leaf, spaces.Box) and _can_exceed(leaf)}
+        self._limits = {key: _uniform_bounds(box) for key, box in self._bounds.items()}
         self._outside = 0
-        self._told = ""
+        self._message = ""
 
     def look(self, observations: Any) -> None:
         """Count those that are outside; arrays have a row per environment."""
@@ -40,28 +40,30 @@ class SpaceWatch:
 
     def _rows(self, key: str, box: spaces.Box, values: NDArray[Any]) -> list[int]:
         wrong = ((values < box.low) | (values > box.high)).reshape(len(values), -1)
-        if not self._told:
+        if not self._message:
             env, element = np.argwhere(wrong)[0]
             value, low, high = (each.ravel()[element] for each in (values[env], box.low, box.high))
-            self._told = (
+            self._message = (
                 f"{_named(key)} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
             )
         return [int(row) for row in np.flatnonzero(wrong.any(axis=1))]
 
     def report(self, arrays: SharedArrays, progress: Progress) -> list[str]:
-        """Add what was counted since the last report to `progress`; return what is new to tell."""
-        told = []
+        """Add what was counted since the last report to `progress`; return new warnings."""
+        warnings = []
         if self._outside and not progress.observations_outside:
-            told.append(f"warning: {self._told}; such observations are counted, and taken as they are")
+            warnings.append(f"warning: {self._message}; such observations are counted, and taken as they are")
         cast = int(arrays.cast[:, 0].sum())
         if cast and not progress.observations_cast:
             _, character, number = arrays.cast[int(arrays.cast[:, 0].argmax())].tolist()
             dtype, name = np.dtype(chr(character)), _named(self._keys[number])
-            told.append(f"warning: {name} comes as {dtype}, its space says {self._dtypes[number]}: cast, and counted")
+            warnings.append(
+                f"warning: {name} comes as {dtype}, its space has {self._dtypes[number]}: cast, and counted"
+            )
         progress.observations_outside += self._outside
         progress.observations_cast += cast
         self.forget(arrays)
-        return told
+        return warnings
 
     def forget(self, arrays: SharedArrays) -> None:
         """Do not count what has come since the last report."""
@@ -69,12 +71,12 @@ class SpaceWatch:
         arrays.cast[:] = 0
 
 
-def _one_for_all(box: spaces.Box) -> tuple[Any, Any] | None:
+def _uniform_bounds(box: spaces.Box) -> tuple[Any, Any] | None:
     low, high = box.low.min(), box.high.max()
     return (low, high) if (box.low == low).all() and (box.high == high).all() else None
 
 
-def _may_leave(box: spaces.Box) -> bool:
+def _can_exceed(box: spaces.Box) -> bool:
     """Say whether the dtype has values that the space has not."""
     dtype: Any = box.dtype
     if np.issubdtype(dtype, np.integer):
@@ -88,7 +90,7 @@ def _named(key: str) -> str:
 
 
 def summary(progress: Progress) -> str | None:
-    """Return what to tell at the end of a training; None if there is nothing."""
+    """Return the warning for the end of a training, or None."""
     counts = {"outside their space": progress.observations_outside, "of another dtype": progress.observations_cast}
-    told = [f"{count:,} {what}" for what, count in counts.items() if count]
-    return f"warning: observations {' and '.join(told)}" if told else None
+    counted = [f"{count:,} {what}" for what, count in counts.items() if count]
+    return f"warning: observations {' and '.join(counted)}" if counted else None

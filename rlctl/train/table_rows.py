@@ -17,22 +17,22 @@ _LOSSES = (
 )  # fmt: skip
 
 
-def of_training(recent: Sequence[EpisodeResult], terms: Iterable[str], log: Mapping[str, Any]) -> dict[str, Any]:
+def training_row(recent: Sequence[EpisodeResult], terms: Iterable[str], log: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the episodes that ended lately have come to, and what SB3 logged of the last update.
 
-    `terms` are the names of the reward terms; what is not known is None.
+    `terms` are the names of the reward terms; missing values are None.
     """
-    known = mean_terms(recent) if recent else {}
+    means = mean_terms(recent) if recent else {}
     return {
         "return": mean_return(recent) if recent else None,
         "length": _mean_length(recent) if recent else None,
         "success": success_rate(recent) if recent else None,
-        **{f"term/{name}": known.get(name) for name in terms},
+        **{f"term/{name}": means.get(name) for name in terms},
         **{name: log.get(f"train/{name}") for name in _LOSSES},
     }
 
 
-def of_evaluation(results: Sequence[EpisodeResult]) -> dict[str, Any]:
+def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     """Return what the episodes of an evaluation have come to."""
     return {
         "episodes": len(results),

@@ -30,7 +30,7 @@ class Start:
     lock: RunLock | None = None
     checkpoint: Checkpoint | None = None
     notes: tuple[str, ...] = ()
-    """What to tell of the checkpoint."""
+    """Messages about the checkpoint."""
     inexact: tuple[str, ...] = ()
     """Why the run cannot go on as if it had never stopped, as far as is known before it goes on."""
 
@@ -40,7 +40,7 @@ class Start:
         return (self.checkpoint.progress.stage or 1) if self.checkpoint else 1
 
 
-def resumed(word: str | None, settings: Mapping[str, Any], root: Path, *, force: bool) -> Start:
+def load_start(word: str | None, settings: Mapping[str, Any], root: Path, *, force: bool) -> Start:
     """Find a run, lock it, and read its newest good checkpoint; nothing is changed yet.
 
     `settings` are those of the recipe's that may be others now. Raises `UsageError` for any other, and unless
@@ -56,24 +56,24 @@ def resumed(word: str | None, settings: Mapping[str, Any], root: Path, *, force:
     lock = run.lock()  # before looking: a process that is training removes old checkpoints
     try:
         recipe = validate({**before.model_dump(by_alias=True), **settings}, "recipe")
-        told = run.status()
-        task = _task(told, run)
-        changes = status.task_changes(told, task)
+        before_status = run.status()
+        task = _task(before_status, run)
+        changes = status.describe_task_changes(before_status, task)
         if changes and not force:
             raise UsageError(
                 f"{run.path}: {'; '.join(changes)}. What was learnt may not fit any more; --force goes on all the same"
             )
         run.recover()
-        found, damage = checkpoint.newest(run)
+        found, damage = checkpoint.read_newest(run)
         start = Start(task, recipe, run, lock, found, _notes(found, damage), tuple(changes))
-        return _reopened(start, before) if settings else start
+        return _reopen(start, before) if settings else start
     except BaseException:
         lock.release()
         raise
 
 
-def _task(told: Mapping[str, Any], run: RunDirectory) -> str:
-    task = told["task"]
+def _task(content: Mapping[str, Any], run: RunDirectory) -> str:
+    task = content["task"]
     if not isinstance(task, str):
         raise ArtifactError(f"{run.status_file}: damaged: its task is {task!r}")
     return task
@@ -85,7 +85,7 @@ def _notes(found: Checkpoint | None, damage: list[str]) -> tuple[str, ...]:
     return tuple(f"warning: {each}; going on from step {found.state.step:,}" for each in damage)
 
 
-def _reopened(start: Start, before: Recipe) -> Start:
+def _reopen(start: Start, before: Recipe) -> Start:
     """Let a training that was done go on, if it is asked for more than it was."""
     found, recipe = start.checkpoint, start.recipe
     if found is None or not found.progress.done:
@@ -99,7 +99,7 @@ def _reopened(start: Start, before: Recipe) -> Start:
 
 
 def prepare(run: RunDirectory, found: Checkpoint | None, progress: Progress) -> list[str]:
-    """Put the run folder back to where the checkpoint has it; return what to tell.
+    """Put the run folder back to where the checkpoint has it; return warnings.
 
     Tables are cut back, checkpoints that are damaged are set aside, and the best policy stays the best there is.
     """
@@ -111,44 +111,46 @@ def prepare(run: RunDirectory, found: Checkpoint | None, progress: Progress) -> 
         if int(folder.name) > step:
             files.set_aside(folder)
     remove_after(run, step)
-    told = []
+    warnings = []
     for file, size, sha256 in (
         (run.metrics_file, progress.metrics_bytes, progress.metrics_sha256),
         (run.evals_file, progress.evals_bytes, progress.evals_sha256),
     ):
         table = Table(file)
         if not table.cut_back(size):
-            told.append(f"warning: {file}: rows before step {step:,} are gone: it is shorter than the checkpoint says")
+            warnings.append(
+                f"warning: {file}: rows before step {step:,} are gone: it is shorter than the checkpoint says"
+            )
         elif size and table.digest() != sha256:
-            told.append(
+            warnings.append(
                 f"warning: {file}: damaged, or edited: rows before step {step:,} are not those that were written"
             )
-    return told + _take_best(run, progress)
+    return warnings + _read_best_score(run, progress)
 
 
-def _take_best(run: RunDirectory, progress: Progress) -> list[str]:
-    """Believe the best policy's own file: it may be newer than the checkpoint, and must not give way to a worse one.
+def _read_best_score(run: RunDirectory, progress: Progress) -> list[str]:
+    """Take the score from the best policy's own file, which may be newer than the checkpoint.
 
-    Return what to tell if it is not as good as the checkpoint says.
+    Return a warning if it is not as good as the checkpoint says.
     """
     from rlctl.run.policy import read_policy
 
-    known, trouble = progress.best_step, ""
+    best_step, problem = progress.best_step, ""
     score = (progress.best_success or 0.0, progress.best_return or 0.0)
     progress.best_success = progress.best_return = progress.best_step = None
     try:
         info, _ = read_policy(run.best_policy)
     except ArtifactError as error:
-        trouble = str(error)
+        problem = str(error)
     else:
         if info.evaluation is not None:
             progress.best_success, progress.best_return = info.evaluation.success, info.evaluation.mean_return
             progress.best_step = info.training_steps
         if progress.best_step is None or (progress.best_success or 0.0, progress.best_return or 0.0) < score:
-            trouble = f"{run.best_policy}: not the best policy, but that of step {info.training_steps:,}"
-    if known is None or not trouble:
+            problem = f"{run.best_policy}: not the best policy, but that of step {info.training_steps:,}"
+    if best_step is None or not problem:
         return []
-    return [f"warning: {trouble}; the best one was that of step {known:,}, and is lost unless a checkpoint has it"]
+    return [f"warning: {problem}; the best one was that of step {best_step:,}, and is lost unless a checkpoint has it"]
 
 
 def check_stop_success(recipe: Recipe, task: str, may_succeed: bool) -> None:

@@ -14,11 +14,11 @@ STEP = ("observation", "reward", "terminated", "truncated", "info")
 RESET = ("observation", "info")
 
 
-class NotAsDeclared(ValueError):
-    """An environment returned something else than its spaces, or Gymnasium's interface, say."""
+class InvalidReturn(ValueError):
+    """An environment returned a value that contradicts its spaces or Gymnasium's interface."""
 
 
-def parts(returned: Any, names: tuple[str, ...], call: str) -> Any:
+def check_tuple(returned: Any, names: tuple[str, ...], call: str) -> Any:
     """Return what a call gave back if it is a tuple with a value for each name."""
     if isinstance(returned, tuple | list) and len(returned) == len(names):
         return returned
@@ -26,47 +26,47 @@ def parts(returned: Any, names: tuple[str, ...], call: str) -> Any:
         what = f"{len(returned)} value{'' if len(returned) == 1 else 's'}"
     else:
         what = reprlib.repr(returned)
-    raise NotAsDeclared(f"{call} returned {what}, and not ({', '.join(names)}), as Gymnasium wants it")
+    raise InvalidReturn(f"{call} returned {what}, and not ({', '.join(names)}), as Gymnasium requires")
 
 
-def number(value: Any, name: str) -> float:
+def to_float(value: Any, name: str) -> float:
     """Return a reward, or what else must be a number, as a float."""
     try:
         if isinstance(value, str | bytes):
             raise TypeError
         return float(value.item() if isinstance(value, np.ndarray) else value)
     except (TypeError, ValueError):
-        raise NotAsDeclared(f"{name} is {reprlib.repr(value)}, not a number") from None
+        raise InvalidReturn(f"{name} is {reprlib.repr(value)}, not a number") from None
 
 
-def flag(value: Any, name: str) -> bool:
-    """Return `terminated` or `truncated` as a bool; numpy's bools and numbers 0 and 1 are taken for one."""
+def to_bool(value: Any, name: str) -> bool:
+    """Return `terminated` or `truncated` as a bool; numpy's bools and numbers 0 and 1 are accepted."""
     if np.size(value) == 1 and (single := np.ravel(value)[0]) in (0, 1):
         return bool(single)
-    raise NotAsDeclared(f"{name} is {reprlib.repr(value)}, not a bool")
+    raise InvalidReturn(f"{name} is {reprlib.repr(value)}, not a bool")
 
 
 def check_info(info: Any) -> None:
-    """Raise `NotAsDeclared` if an info is no dictionary."""
+    """Raise `InvalidReturn` if an info is not a dictionary."""
     if not isinstance(info, Mapping):
-        raise NotAsDeclared(f"info is {reprlib.repr(info)}, not a dict")
+        raise InvalidReturn(f"info is {reprlib.repr(info)}, not a dict")
 
 
-def check_kind(value: NDArray[Any], what: str) -> None:
-    """Raise `NotAsDeclared` if an observation is not made of numbers."""
+def check_numeric(value: NDArray[Any], what: str) -> None:
+    """Raise `InvalidReturn` if the elements of an observation are not numbers."""
     if value.dtype.kind not in "biuf":
-        raise NotAsDeclared(f"{what} is {reprlib.repr(value.tolist())}, not numbers")
+        raise InvalidReturn(f"{what} is {reprlib.repr(value.tolist())}, not numbers")
 
 
-def first_not_finite(value: NDArray[Any], what: str) -> NotAsDeclared | None:
+def find_not_finite(value: NDArray[Any], what: str) -> InvalidReturn | None:
     """Return the error of an observation that has an element that is not finite."""
     bad = np.flatnonzero(~np.isfinite(value))
     if not bad.size:
         return None
-    return NotAsDeclared(f"{what} is not finite: element {bad[0]} is {value.ravel()[bad[0]]}")
+    return InvalidReturn(f"{what} is not finite: element {bad[0]} is {value.ravel()[bad[0]]}")
 
 
-def categories(space: spaces.Space[Any]) -> NDArray[Any] | None:
+def category_bounds(space: spaces.Space[Any]) -> NDArray[Any] | None:
     """Return the first and last value, shape (2, ...), of a space of categories: a network cannot take others."""
     if isinstance(space, spaces.Discrete):
         return np.array([space.start, space.start + space.n - 1])

@@ -6,9 +6,9 @@ import threading
 import pytest
 
 from rlctl.env_spec import EnvSpec
-from rlctl.rollout.failures import FailedInEpisode, as_message
-from rlctl.rollout.printed import LONGEST_LINE, MOST_LINES_PER_S, forward, printable
+from rlctl.rollout.failures import FailedInEpisode, encode_error
 from rlctl.rollout.shared_arrays import anonymous_file
+from rlctl.rollout.worker_output import MAX_LINE_BYTES, MAX_LINES_PER_S, forward, replace_control_characters
 from rlctl.rollout.worker_process import _Worker
 from tests.train import faulty_envs
 
@@ -22,7 +22,7 @@ def failure(env, **parameters):
     worker.arrays.next_seed[:] = -1
     with pytest.raises(FailedInEpisode) as caught:
         live(worker)
-    return as_message(caught.value)
+    return encode_error(caught.value)
 
 
 def live(worker):
@@ -45,11 +45,11 @@ def live(worker):
         ("objects", "observation is [{}], not numbers"),
         (
             "nothing",
-            "step returned None, and not (observation, reward, terminated, truncated, info), as Gymnasium wants it",
+            "step returned None, and not (observation, reward, terminated, truncated, info), as Gymnasium requires",
         ),
         (
             "old gym",
-            "step returned 4 values, and not (observation, reward, terminated, truncated, info), as Gymnasium wants it",
+            "step returned 4 values, and not (observation, reward, terminated, truncated, info), as Gymnasium requires",
         ),
         ("no info", "info is None, not a dict"),
         ("text flag", "terminated is 'False', not a bool"),
@@ -130,18 +130,18 @@ def test_what_is_printed_comes_line_by_line():
 
 def test_what_would_upset_a_terminal():
     assert told_of(b"\x1b[2J\x07\x00 caf\xc3\xa9 \xff\tend\r\n") == ["\ufffd[2J\ufffd\ufffd caf\u00e9 \ufffd\tend"]
-    assert printable("\u202eabc") == "\ufffdabc"
+    assert replace_control_characters("\u202eabc") == "\ufffdabc"
 
 
 def test_a_flood_is_counted():
-    told = told_of(b"".join(b"%d\n" % number for number in range(200_000)) + b"z" * 10 * LONGEST_LINE)
+    told = told_of(b"".join(b"%d\n" % number for number in range(200_000)) + b"z" * 10 * MAX_LINE_BYTES)
     assert told[:2] == ["0", "1"]
-    assert max(map(len, told)) <= LONGEST_LINE
+    assert max(map(len, told)) <= MAX_LINE_BYTES
     left_out = [int(line.split()[0].strip("(").replace(",", "")) for line in told if "left out" in line]
     # The last line comes in ten parts, all alike: one of them counts.
     assert sum(left_out) + len(told) - len(left_out) == 200_001
     assert len(told) < 200_000 / 100
-    assert len(told) > MOST_LINES_PER_S
+    assert len(told) > MAX_LINES_PER_S
 
 
 def test_nobody_to_tell():

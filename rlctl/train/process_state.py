@@ -10,8 +10,8 @@ import numpy as np
 
 
 @contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Put back what importing somebody's module may change and a training relies on.
+def preserve_process_state() -> Iterator[None]:
+    """Restore what importing somebody's module may change and a training relies on.
 
     That is the working directory, what numpy does about overflows, and the permissions of new files. Signal handlers
     are set anew when the training begins.
