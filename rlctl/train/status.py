@@ -14,7 +14,7 @@ from rlctl import registry
 from rlctl.errors import DivergedError, Interrupted
 from rlctl.run import files
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import versions
+from rlctl.run.policy import collect_versions
 from rlctl.run.recipe import Recipe
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
         "algo": recipe.algo,
         "seed": recipe.seed,
         "device": device,
-        "versions": versions(),
+        "versions": collect_versions(),
         "git_commit": _git_commit(),
         "command": ["rlctl", *sys.argv[1:]],
         "host": platform.node(),
