@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
-from rlctl.rollout.process_group import end, end_with_parent, signals_held
+from rlctl.rollout.process_group import block_signals, end, end_with_parent
 
 # Started this way a child finds the modules that its parent finds, and the caller's script is not run again.
 # Ctrl-C and `kill` may reach a child too, but its parent decides: ignored before anything slow is imported, and held
@@ -65,7 +65,7 @@ class ChildProcess:
             "lifeline": lifeline,
         }
         try:
-            with theirs, open(lifeline, "rb"), signals_held():
+            with theirs, open(lifeline, "rb"), block_signals():
                 self.process = subprocess.Popen(
                     [sys.executable, "-c", _BOOTSTRAP, json.dumps(job)],
                     pass_fds=(theirs.fileno(), lifeline, *descriptors),
