@@ -55,31 +55,35 @@ def _hue(hue: float) -> Color:
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def _send(timelines: Timelines, entity: str, first: int, values: NDArray[Any], names: Sequence[str]) -> None:
+def _send(
+    timelines: Timelines,
+    entity: str,
+    first: int,
+    values: NDArray[Any],
+    names: Sequence[str],
+    *,
+    colors: Sequence[Color] | None = None,
+    width: float = 1.5,
+) -> None:
     """Send curves: `values` of shape (rows, curves), its first row at the step `first`."""
     rows, count = values.shape
     if count == 0:
         return
-    style = rr.SeriesLines(names=list(names), colors=palette(count), widths=[1.5] * count)
+    style = rr.SeriesLines(names=list(names), colors=colors or palette(count), widths=[width] * count)
     timelines.stream.log(entity, style, static=True)
     scalars = np.ascontiguousarray(values, np.float64)
     timelines.send(entity, range(first, first + rows), rr.Scalars.columns(scalars=scalars))
 
 
-def _single(timelines: Timelines, entity: str, values: NDArray[Any], name: str, color: Color, width: float) -> None:
-    timelines.stream.log(entity, rr.SeriesLines(names=name, colors=color, widths=width), static=True)
-    scalars = np.asarray(values, np.float64)
-    timelines.send(entity, range(1, len(scalars) + 1), rr.Scalars.columns(scalars=scalars))
-
-
 def _rewards(rollout: Rollout, timelines: Timelines) -> list[Plot]:
     names = rollout.episode.info.term_names
-    _single(timelines, "reward/total", rollout.episode.rewards, "total", _TOTAL_COLOR, 2.5)
+    rewards = rollout.episode.rewards[:, None]
+    _send(timelines, "reward/total", 1, rewards, ["total"], colors=[_TOTAL_COLOR], width=2.5)
     for index, (name, color) in enumerate(zip(names, palette(len(names)), strict=True)):
         entity = rr.new_entity_path(["reward", "terms", name])
-        _single(timelines, entity, rollout.weighted_terms[:, index], name, color, 1.5)
+        _send(timelines, entity, 1, rollout.weighted_terms[:, index : index + 1], [name], colors=[color])
     if rollout.successes is not None:
-        _single(timelines, "success", rollout.successes, "success", _PALETTE[2], 1.5)
+        _send(timelines, "success", 1, rollout.successes[:, None], ["success"], colors=[_PALETTE[2]])
     return [Plot("reward, by weighted term" if names else "reward", "reward", "reward")]
 
 

@@ -36,36 +36,34 @@ class Difference:
 
 @dataclasses.dataclass(frozen=True)
 class _Column:
-    """Recorded and present values: a row per step from `first` on, a name per element of a row."""
+    """Recorded and new values: a row per step from `first` on, a name per element of a row."""
 
     names: list[str]
     first: int
     recorded: NDArray[Any]
     now: NDArray[Any]
 
-    def differing(self) -> NDArray[np.int64]:
+    def differing(self) -> list[int]:
         """Return the steps whose bits differ."""
         rows = min(len(self.recorded), len(self.now))
         before, after = self.recorded[:rows], self.now[:rows]
         if before.dtype != after.dtype or before.shape != after.shape:
-            return np.arange(rows) + self.first
+            return list(range(self.first, self.first + rows))
         unequal: NDArray[np.bool_] = (_bits(before) != _bits(after)).any(axis=1)
-        return np.flatnonzero(unequal) + self.first
+        return (np.flatnonzero(unequal) + self.first).tolist()
 
-    def difference(self, step: int, steps: int, length: int) -> Difference:
-        """Describe the first element that differs at a step."""
+    def describe(self, step: int) -> tuple[str, str, str, float | None]:
+        """Return the first element that differs at a step: its name, recorded and new value, and by how much."""
         before, after = self.recorded[step - self.first], self.now[step - self.first]
         name = self.names[0].partition("[")[0]
         if before.dtype != after.dtype:
-            return Difference(step, f"type of {name}", str(before.dtype), str(after.dtype), None, steps, length)
+            return f"type of {name}", str(before.dtype), str(after.dtype), None
         if before.shape != after.shape:
-            return Difference(step, f"size of {name}", str(before.size), str(after.size), None, steps, length)
+            return f"size of {name}", str(before.size), str(after.size), None
         element = int(np.flatnonzero((_bits(before[:, None]) != _bits(after[:, None])).any(axis=1))[0])
-        values = before[element].item(), after[element].item()
-        size = abs(float(values[1]) - float(values[0]))
-        texts = [repr(value) for value in values]
-        finite = size if np.isfinite(size) else None
-        return Difference(step, self.names[element], texts[0], texts[1], finite, steps, length)
+        recorded, now = before[element].item(), after[element].item()
+        size = abs(float(now) - float(recorded))
+        return self.names[element], repr(recorded), repr(now), size if np.isfinite(size) else None
 
 
 def _bits(values: NDArray[Any]) -> NDArray[np.uint8]:
@@ -74,18 +72,15 @@ def _bits(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 def find_difference(recorded: RecordedEpisode, rollout: Rollout) -> Difference | None:
     """Compare observations, rewards, reward terms and the end; None if every bit is the same."""
-    length = len(recorded.rewards)
-    steps: set[int] = set()
-    first: tuple[int, _Column] | None = None
-    for column in _columns(recorded, rollout):
-        found = column.differing().tolist()
-        steps.update(found)
-        # At the same step the earlier column counts: what is observed explains what is rewarded.
-        if found and (first is None or found[0] < first[0]):
-            first = found[0], column
-    if first is not None:
-        return first[1].difference(first[0], len(steps), length)
-    return _different_end(recorded, rollout, length)
+    length, columns = len(recorded.rewards), _columns(recorded, rollout)
+    differing = [column.differing() for column in columns]
+    steps = set().union(*differing)
+    if not steps:
+        return _different_end(recorded, rollout, length)
+    first = min(steps)
+    # At the same step the earlier column counts: what is observed explains what is rewarded.
+    column = next(column for column, found in zip(columns, differing, strict=True) if first in found)
+    return Difference(first, *column.describe(first), len(steps), length)
 
 
 def _columns(recorded: RecordedEpisode, rollout: Rollout) -> list[_Column]:

@@ -96,29 +96,27 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
     content: dict[str, Any] = {
         "task": result.task,
         "policy": result.policy,
-        "episodes": [
-            {
-                "file": str(episode.recording) if episode.recording else None,
-                "episode": str(episode.episode) if episode.episode else None,
-                "seed": episode.seed,
-                "length": episode.length,
-                "return": episode.total_reward,
-                "success": episode.success,
-            }
-            for episode in result.episodes
-        ],
+        "episodes": [_episode_json(episode) for episode in result.episodes],
         "open": open_command(result),
         "versions": collect_versions(),
     }
     if (verification := result.verification) is not None:
-        difference = verification.difference
+        difference, versions = verification.difference, verification.other_versions.items()
         content["verification"] = {
             "episode": str(verification.episode),
             "identical": difference is None,
             "difference": dataclasses.asdict(difference) if difference else None,
-            "other_versions": {
-                name: {"recorded": recorded, "now": now}
-                for name, (recorded, now) in verification.other_versions.items()
-            },
+            "other_versions": {name: {"recorded": recorded, "now": now} for name, (recorded, now) in versions},
         }
     return content
+
+
+def _episode_json(episode: ReplayedEpisode) -> dict[str, Any]:
+    return {
+        "file": str(episode.recording) if episode.recording else None,
+        "episode": str(episode.episode) if episode.episode else None,
+        "seed": episode.seed,
+        "length": episode.length,
+        "return": episode.total_reward,
+        "success": episode.success,
+    }
