@@ -136,7 +136,8 @@ class _Actor:
                 recording = self._next_recording()
                 episode = recording.with_suffix(".npz")
                 save_episode(episode, rollout.episode)
-                write_rrd(recording, rollout, title=f"{spec.task} / episode {recording.stem}", warn=print_warning)
+                title, several = f"{spec.task} / episode {recording.stem}", len(self._seeds) > 1
+                write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
                 done.append(_summarize(rollout, recording, episode))
         return ReplayResult(spec.task, self._name, done)
 

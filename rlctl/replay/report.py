@@ -67,6 +67,7 @@ def show(result: ReplayResult, json: str | None) -> None:
         out.print(_line(episode), markup=False)
     if command := open_command(result):
         out.print(f"open with: {command}", markup=False)
+        out.print(f"without a display, in a browser: {command.replace('rerun', 'rerun --serve-web', 1)}", markup=False)
 
 
 def _line(episode: ReplayedEpisode) -> str:

@@ -26,10 +26,13 @@ def print_warning(message: str) -> None:
     output.err().print(message, markup=False)
 
 
-def record_episode(episode: RecordedEpisode, path: Path, *, title: str, warn: Warn = print_warning) -> Rollout:
+def record_episode(
+    episode: RecordedEpisode, path: Path, *, title: str, warn: Warn = print_warning, several: bool = False
+) -> Rollout:
     """Replay the actions of an episode in a new environment and write what it looks like to `path`, an `.rrd`.
 
-    `warn` receives how it differs from what was recorded; the file is written all the same. Returns the new rollout.
+    `warn` receives how it differs from what was recorded; the file is written all the same. `several`: it is
+    opened together with others. Returns the new rollout.
     Raises `TaskError` for an episode that failed, and fails again.
     """
     from rlctl.replay.rrd import write_rrd
@@ -44,7 +47,7 @@ def record_episode(episode: RecordedEpisode, path: Path, *, title: str, warn: Wa
         warn(f"warning: {title}: it failed when it was recorded ({info.failure}), and did not fail now")
     elif difference := find_difference(episode, rollout):
         warn(f"warning: {title}: replayed, it differs from the recorded episode; {difference}")
-    write_rrd(path, rollout, title=title, warn=warn)
+    write_rrd(path, rollout, title=title, warn=warn, several=several)
     return rollout
 
 

@@ -25,14 +25,16 @@ from rlctl.run.episode import RecordedEpisode
 
 _LEVEL_COLORS = {"INFO": 0xB0D0FFFF, "WARN": 0xFFC060FF, "DEBUG": 0xB0B0B0FF}
 _EYE_DIRECTION = np.array([1.0, 0.75, 0.5])  # from the front left, looking down
+_GOAL_MARGIN = 2.5  # distance of the eye in distances of the goal; from 1.9 on it is in a view of 55 degrees
 _PLOT_ROWS = (("reward",), ("action",), ("joints", "observation"))  # by kind; those of a row are tabs
 
 
-def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn) -> None:
+def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: bool = False) -> None:
     """Write a recording, whole or not at all. Opens no port.
 
     Rows are at the steps of the episode: 0 is the reset; the action, the reward and the state after it have the
     same number. The same episode always has the same recording id. `warn` receives what cannot be drawn.
+    With `several` recordings to open together, the viewer shows their list.
     """
     info = rollout.episode.info
     stream = rr.RecordingStream(
@@ -44,7 +46,7 @@ def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn) -> None:
         try:
             with stream:
                 # What is sent before `save` waits in memory: the layout is known only at the end.
-                layout = _send(stream, rollout, title, warn)
+                layout = _send(stream, rollout, title, warn, several)
                 stream.save(part, default_blueprint=layout)
                 stream.flush()
         except RuntimeError as error:  # what Rerun raises when the disk is full
@@ -60,7 +62,7 @@ def _recording_id(episode: RecordedEpisode) -> str:
     return f"{registry.make_slug(episode.info.task)}-{episode.info.seed}-{content.hexdigest()[:12]}"
 
 
-def _send(stream: rr.RecordingStream, rollout: Rollout, title: str, warn: Warn) -> rrb.Blueprint:
+def _send(stream: rr.RecordingStream, rollout: Rollout, title: str, warn: Warn, several: bool) -> rrb.Blueprint:
     timelines, scene = Timelines(stream, rollout.dt), rollout.scene
     stream.send_recording_name(title)
     stream.send_property("episode", _properties(rollout))
@@ -71,7 +73,7 @@ def _send(stream: rr.RecordingStream, rollout: Rollout, title: str, warn: Warn) 
         steps, blobs = [step for step, _ in scene.pictures], [blob for _, blob in scene.pictures]
         columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
         timelines.send("camera", steps, columns)
-    return _layout(rollout, plots, timelines.default, followed)
+    return _layout(rollout, plots, timelines.default, followed, several)
 
 
 def _properties(rollout: Rollout) -> rr.AnyValues:
@@ -110,7 +112,9 @@ def _send_log(rollout: Rollout, timelines: Timelines) -> None:
     timelines.send("goal", changes, rr.StateChange.columns(state=states))
 
 
-def _layout(rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: str | None) -> rrb.Blueprint:
+def _layout(
+    rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: str | None, several: bool
+) -> rrb.Blueprint:
     """Return the layout: the world on the left, its numbers on the right; the camera follows the entity `followed`."""
     scene = rollout.scene
     left: list[rrb.Container | rrb.View] = []
@@ -138,7 +142,7 @@ def _layout(rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: st
     return rrb.Blueprint(
         content,
         rrb.TimePanel(state="collapsed", timeline=timeline),
-        rrb.BlueprintPanel(state="hidden"),
+        rrb.BlueprintPanel(state="expanded" if several else "hidden"),  # the list of recordings is in it
         rrb.SelectionPanel(state="hidden"),
         auto_views=False,
         auto_layout=False,
@@ -157,10 +161,13 @@ def _plot(plot: Plot) -> rrb.TimeSeriesView:
 
 def _world(scene: Scene, followed: str | None) -> rrb.Spatial3DView:
     low, high = bounds(scene) if followed is None else start_bounds(scene)
-    center = (low + high) / 2
-    margin = 1.15 if followed is None else 1.5  # what is followed is in the middle, its feet are far below
-    distance = max(1.0, margin * float(np.linalg.norm(high - low)))
-    eye = center + distance * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
+    center, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    distances = [1.0, 1.15 * size]
+    if followed is not None:
+        # What is followed is in the middle of the picture: its feet are far below, and a goal is to one side.
+        goals = [float(np.linalg.norm(positions[0] - center)) for positions in scene.markers.values()]
+        distances = [1.0, 1.5 * size, *(_GOAL_MARGIN * goal for goal in goals)]
+    eye = center + max(distances) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
     start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     so_far = [rrb.VisibleTimeRange(name, start=start, end=end) for name in ("step", "sim_time")]
     return rrb.Spatial3DView(

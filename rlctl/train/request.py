@@ -293,7 +293,8 @@ def _record(loop: TrainingLoop, count: int) -> list[Path]:
     recordings = []
     for path, episode in loop.episodes.latest(count):
         recording = path.with_suffix(".rrd")
-        record_episode(episode, recording, title=f"{loop.run_directory.path.name} / episode {path.stem}")
+        title = f"{loop.run_directory.path.name} / episode {path.stem}"
+        record_episode(episode, recording, title=title, several=count > 1)
         recordings.append(recording)
     return recordings
 

@@ -46,6 +46,8 @@ def show(result: TrainResult, json: str | None) -> None:
         out.print(f"ended in stage {result.stage} of {result.stages}{short}")
     for path in result.recordings:
         out.print(f"recording: rerun {path}")
+    if result.recordings:
+        out.print("  without a display, in a browser: rerun --serve-web FILE")
     out.print(f"run: {run}")
     out.print("next:")
     for command in (

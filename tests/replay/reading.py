@@ -38,6 +38,17 @@ def static(path: Path, entity: str, component: str):
     return batch.column(component).to_pylist()[0]
 
 
+def layout(path: Path, component: str, entity: str = "/") -> list:
+    """Return the values of a component in a recording's layout, below an entity."""
+    found = []
+    for store in RrdReader(path).blueprints():
+        for chunk in RrdReader(path).stream(store=store):
+            batch = chunk.to_record_batch()
+            if component in batch.schema.names and chunk.entity_path.startswith(entity):
+                found += batch.column(component).to_pylist()[0] or []
+    return found
+
+
 def properties(path: Path) -> dict:
     found = {}
     for chunk in RrdReader(path).stream().filter(content="/__properties/episode"):

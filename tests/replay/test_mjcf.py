@@ -1,10 +1,10 @@
 """MJCF robots are drawn where PyBullet simulates them, and the camera goes along."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 
 from rlctl.env_spec import EnvSpec
 from rlctl.replay.bodies import shape_centers
@@ -14,7 +14,7 @@ from rlctl.replay.rrd import write_rrd
 from rlctl.replay.scene import BodyMotion, SceneReader
 from rlctl.task.bullet import pybullet
 from tests.replay.conftest import play
-from tests.replay.reading import column, entities, static
+from tests.replay.reading import column, entities, layout, static
 
 ROBOTS = ("ant", "half-cheetah", "hopper", "walker2d", "humanoid")
 PROBE_RADIUS = 0.01  # [m]
@@ -184,6 +184,21 @@ def test_camera_follows_a_free_urdf_robot(tmp_path):
     assert "/world/car/base_link/visual_0" in entities(tmp_path / "r2d2.rrd")
 
 
+def test_the_goal_of_a_small_robot_is_in_view(tmp_path):
+    rollout, _ = play("Tumble", car="r2d2.urdf")
+    # As if the goal were 6 m to the left of the robot, which is some 1.5 m high.
+    goal = rollout.scene.robots()[0].positions[:, 0] + (0.0, 6.0, 0.0)
+    scene = dataclasses.replace(rollout.scene, markers={"goal": goal})
+    write_rrd(tmp_path / "r2d2.rrd", dataclasses.replace(rollout, scene=scene), title="r2d2", warn=print)
+    eye = np.array(layout(tmp_path / "r2d2.rrd", "EyeControls3D:position")[0])
+    center = np.array(layout(tmp_path / "r2d2.rrd", "EyeControls3D:look_target")[0])
+    to_center, to_goal = center - eye, goal[0] - eye
+    cosine = to_center @ to_goal / np.linalg.norm(to_center) / np.linalg.norm(to_goal)
+    assert np.degrees(np.arccos(cosine)) < 55 / 2  # [deg], half of the viewer's field of view
+    # And no further away than it has to be.
+    assert np.linalg.norm(to_center) < 3 * 6
+
+
 @pytest.mark.parametrize("name", ["ant", "hopper"])
 def test_file_that_only_pybullet_reads_costs_a_warning(tmp_path, monkeypatch, name):
     def refuse(file):
@@ -201,13 +216,7 @@ def test_file_that_only_pybullet_reads_costs_a_warning(tmp_path, monkeypatch, na
 
 def tracked(path: Path) -> list[str]:
     """Return what the cameras of a recording's layout follow."""
-    found = []
-    for store in RrdReader(path).blueprints():
-        for chunk in RrdReader(path).stream(store=store):
-            batch = chunk.to_record_batch()
-            if "EyeControls3D:tracking_entity" in batch.schema.names:
-                found += batch.column("EyeControls3D:tracking_entity").to_pylist()[0] or []
-    return found
+    return layout(path, "EyeControls3D:tracking_entity")
 
 
 MODEL = """<mujoco model="m">

@@ -11,7 +11,7 @@ from rlctl.replay.report import as_json
 from rlctl.replay.reproduce import record_episode
 from rlctl.run.episode import load_episode, save_episode
 from tests.replay.conftest import ENVS, play
-from tests.replay.reading import column, properties
+from tests.replay.reading import column, layout, properties
 
 
 def test_rollouts_go_into_the_run_and_are_numbered_on(run):
@@ -22,6 +22,8 @@ def test_rollouts_go_into_the_run_and_are_numbered_on(run):
     first, second = result.episodes
     assert first.seed != second.seed
     assert first.recording.parent == run.run.episodes
+    # The list of recordings is open (3: expanded).
+    assert layout(second.recording, "PanelBlueprint:state", "/blueprint_panel") == [3]
     recorded = load_episode(first.episode)
     assert recorded.info.seed == first.seed == properties(first.recording)["seed"]
     assert recorded.info.policy == properties(first.recording)["policy"] == "best.safetensors, ppo, step 64"
@@ -55,6 +57,8 @@ def test_task_and_parameters_can_be_others(run, tmp_path):
     (episode,) = run_replay(request).episodes
     assert episode.success is True
     assert load_episode(episode.episode).info.task_parameters == {"tolerance": 0.9}
+    # A single recording needs no list (1: hidden).
+    assert layout(episode.recording, "PanelBlueprint:state", "/blueprint_panel") == [1]
 
 
 def test_command_line_from_a_run_to_the_command_that_opens_it(replay, run, tmp_path):
@@ -63,7 +67,10 @@ def test_command_line_from_a_run_to_the_command_that_opens_it(replay, run, tmp_p
     lines = done.stdout.splitlines()
     assert lines[0] == "reach: best.safetensors, ppo, step 64"
     assert lines[1].startswith("a b.rrd: seed ")
-    assert lines[-1] == "open with: rerun 'a b.rrd'"
+    assert lines[2:] == [
+        "open with: rerun 'a b.rrd'",
+        "without a display, in a browser: rerun --serve-web 'a b.rrd'",
+    ]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a b.npz", "a b.rrd"]
 
 
