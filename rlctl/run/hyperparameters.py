@@ -1,288 +1,237 @@
-"""Where the parameters of algorithms and networks make sense. Their names are checked against SB3's own signatures."""
+"""The parameters of every algorithm, `algo_kwargs`: SB3's names, with the type and range of each.
+
+Names and defaults are compared with SB3's signatures by a test; `docs/recipe.md` is made from these models.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from rlctl.errors import did_you_mean, short_repr
+import pydantic
+from pydantic import Field
 
-Rule = Callable[[Any], None]
-"""Raises `ValueError`, which says what would be right, for a value that makes no sense."""
+from rlctl.run.quantities import Number, NumberAfter, Switch, Whole
 
 ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
 
-_MOST = 10**9
-_WIDEST = 65_536
-_DEEPEST = 100
+_Fraction = Annotated[Number, Field(ge=0, le=1)]
+_PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
+_NotNegative = Annotated[Number, Field(ge=0)]
+_Positive = Annotated[Number, Field(gt=0)]
+_ClipRange = Annotated[Number, Field(gt=0, le=10)]
+_Count = Annotated[Whole, Field(ge=1, le=10**9)]
+_CountFrom0 = Annotated[Whole, Field(ge=0, le=10**9)]
+
+_Schedule = _PositiveFraction | Annotated[str, NumberAfter("lin_", _PositiveFraction)]
+_ClipSchedule = _ClipRange | Annotated[str, NumberAfter("lin_", _ClipRange)]
+_PositiveSchedule = _Positive | Annotated[str, NumberAfter("lin_", _Positive)]
+_EntropyCoefficient = _NotNegative | Literal["auto"] | Annotated[str, NumberAfter("auto_", _Positive)]
+_TrainFreq = _Count | tuple[_Count, Literal["step", "episode"]]
 
 
-@dataclasses.dataclass(frozen=True)
-class Range:
-    """Numbers from `low` to `high`, finite, and what else a parameter may be."""
-
-    low: float
-    high: float = math.inf
-    integer: bool = False
-    open_low: bool = False
-    schedule: bool = False
-    """Also `lin_` and a number of the range, which falls to zero over the training."""
-    auto: bool = False
-    """Also `auto`, or `auto_` and a positive number to begin with."""
-    optional: bool = False
-    """Also null."""
-
-    def __call__(self, value: Any) -> None:
-        if value is None and self.optional:
-            return
-        if isinstance(value, str):
-            self._check_text(value)
-            return
-        if isinstance(value, bool) or not isinstance(value, int | float) or (self.integer and not _is_whole(value)):
-            raise ValueError(f"expected {self._kind()}, got {short_repr(value)}")
-        if not self._contains(value):
-            raise ValueError(f"{short_repr(value)} is not in {self}")
-
-    def _contains(self, value: float) -> bool:
-        above = self.low < value if self.open_low else self.low <= value
-        return above and value <= self.high and math.isfinite(value)
-
-    def _check_text(self, text: str) -> None:
-        if self.auto and text == "auto":
-            return
-        for prefix, allowed in (("lin_", self.schedule), ("auto_", self.auto)):
-            if allowed and text.startswith(prefix):
-                start = _number(text.removeprefix(prefix))
-                if start is None or not self._contains(start) or (prefix == "auto_" and start <= 0):
-                    raise ValueError(
-                        f"{short_repr(text)!r} is not {prefix} and a number in {self}, such as {prefix}0.1"
-                    )
-                return
-        raise ValueError(f"expected {self._kind()}, got {short_repr(text)!r}")
-
-    def _kind(self) -> str:
-        kinds = ["a whole number" if self.integer else "a number"]
-        kinds += ["lin_ and a number"] if self.schedule else []
-        kinds += ["auto"] if self.auto else []
-        return " or ".join(kinds)
-
-    def __str__(self) -> str:
-        return f"{'(' if self.open_low else '['}{self.low:g}, {self.high:g}]"
+def decide_by(rule: str) -> dict[str, Any]:
+    """Return the `json_schema_extra` of a parameter that rlctl chooses where a recipe does not: by which rule."""
+    return {"default_text": f"{rule} *rlctl*"}
 
 
-def _is_whole(value: float) -> bool:
-    return math.isfinite(value) and float(value).is_integer()
+class Parameters(pydantic.BaseModel):
+    """Parameters by SB3's names; those that a recipe leaves out are not passed on."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
+class _OnPolicy(Parameters):
+    learning_rate: _Schedule = 3e-4
+    """Step size of the optimiser; `lin_3e-4` falls from 3e-4 to zero over the training."""
+    n_steps: _Count = Field(2048, json_schema_extra=decide_by("4096 / n_envs, from 16 to 2048"))
+    """Steps per environment and rollout."""
+    gamma: _PositiveFraction = 0.99
+    """Discount per step."""
+    gae_lambda: _Fraction = 0.95
+    """Bias against variance of the advantage estimate (GAE); 1 is the Monte Carlo return."""
+    ent_coef: _NotNegative = 0.0
+    """Weight of the entropy in the loss."""
+    vf_coef: _NotNegative = 0.5
+    """Weight of the value function in the loss."""
+    max_grad_norm: _Positive = 0.5
+    """Gradients are clipped to this norm."""
+    normalize_advantage: Switch = True
+    """Whether to normalise the advantages of a minibatch."""
+    use_sde: Switch = False
+    """State-dependent exploration (gSDE)."""
+    sde_sample_freq: _Count | Literal[-1] = -1
+    """Steps between new gSDE noise; -1: once per rollout."""
+    stats_window_size: _Count = 100
+    """Episodes in the running means of TensorBoard."""
 
 
-def _switch(value: Any) -> None:
-    if not isinstance(value, bool):
-        raise ValueError(f"expected true or false, got {short_repr(value)}")
+class Ppo(_OnPolicy):
+    """Proximal policy optimisation."""
+
+    batch_size: Whole = Field(
+        64, ge=2, le=10**9, json_schema_extra=decide_by("128, or the whole rollout where that is smaller")
+    )
+    """Minibatch size."""
+    n_epochs: _Count = 10
+    """Passes over each rollout."""
+    clip_range: _ClipSchedule = 0.2
+    """How far the ratio of new to old probability may leave 1."""
+    clip_range_vf: _PositiveSchedule | None = None
+    """The same for the value function; null: not clipped."""
+    target_kl: _Positive | None = None
+    """Ends an update when the policy has moved this far; null: never."""
 
 
-def _off(value: Any) -> None:
-    if value is not False:
-        raise ValueError("not supported: checkpoints need the whole buffer; leave it out")
+class RecurrentPpo(Ppo):
+    """PPO with an LSTM."""
+
+    n_steps: _Count = Field(128, json_schema_extra=decide_by("4096 / n_envs, from 16 to 2048"))
+    batch_size: Whole = Field(
+        128, ge=2, le=10**9, json_schema_extra=decide_by("128, or the whole rollout where that is smaller")
+    )
 
 
-def _name(value: Any) -> None:
-    if not isinstance(value, str):
-        raise ValueError(f"expected a name, such as tanh, got {short_repr(value)}")
+class A2c(_OnPolicy):
+    """Advantage actor-critic."""
+
+    learning_rate: _Schedule = 7e-4
+    n_steps: _Count = 5
+    gae_lambda: _Fraction = 1.0
+    normalize_advantage: Switch = False
+    rms_prop_eps: _PositiveFraction = 1e-5
+    """Epsilon of RMSProp."""
+    use_rms_prop: Switch = True
+    """Whether to use RMSProp instead of Adam."""
 
 
-def _one_of_no_use(value: float) -> Rule:
-    """Whole numbers from 1, and one that stands for something else."""
+class _OffPolicy(Parameters):
+    learning_rate: _Schedule = 3e-4
+    """Step size of the optimiser; `lin_3e-4` falls from 3e-4 to zero over the training."""
+    buffer_size: Annotated[Whole, Field(ge=1, le=10**15)] = Field(
+        1_000_000, json_schema_extra=decide_by("total_timesteps, from 1,000 to 1,000,000")
+    )
+    """Transitions in the replay buffer."""
+    learning_starts: _CountFrom0 = 100
+    """Steps of random actions before the first update."""
+    batch_size: Whole = Field(256, ge=2, le=10**9)
+    """Transitions per gradient step."""
+    gamma: _PositiveFraction = 0.99
+    """Discount per step."""
+    train_freq: _TrainFreq = Field(1, examples=["[1, episode]"], json_schema_extra=decide_by("1"))
+    """Steps of each environment between updates."""
+    gradient_steps: _Count | Literal[-1] = Field(1, json_schema_extra=decide_by("-1"))
+    """Gradient steps per update; -1: as many as environment steps were taken."""
+    optimize_memory_usage: Switch = False
+    """Not supported: checkpoints need the whole buffer."""
+    n_steps: _Count = 1
+    """Steps of the n-step return."""
 
-    def check(given: Any) -> None:
-        if given != value or isinstance(given, bool):
-            _COUNT(given)
-
-    return check
-
-
-_COUNT = Range(1, _MOST, integer=True)
-_FRACTION = Range(0, 1)
-_PART = Range(0, 1, open_low=True)
-_NOT_NEGATIVE = Range(0)
-_POSITIVE = Range(0, open_low=True)
-_CLIP = Range(0, 10, open_low=True, schedule=True)
-_WIDTH = Range(1, _WIDEST, integer=True)
-_FEW = Range(1, _DEEPEST, integer=True)
-_ALL_OR_COUNT = _one_of_no_use(-1)
-
-
-def _train_freq(value: Any) -> None:
-    if not isinstance(value, list):
-        _COUNT(value)
-        return
-    if len(value) != 2 or value[1] not in ("step", "episode"):
-        raise ValueError(f"expected a number of steps, or a pair such as [1, episode], got {short_repr(value)}")
-    _COUNT(value[0])
-
-
-def _mapping(rules: Mapping[str, Rule]) -> Rule:
-    def check(value: Any) -> None:
-        if value is None:
-            return
-        if not isinstance(value, Mapping):
-            raise ValueError(f"expected a mapping of {', '.join(rules)}, got {short_repr(value)}")
-        _check_all(value, rules, known_only=True)
-
-    return check
-
-
-def _layers(value: Any) -> None:
-    if not isinstance(value, list):
-        raise ValueError(f"expected a list of layer widths, such as [64, 64], got {short_repr(value)}")
-    if len(value) > _DEEPEST:
-        raise ValueError(f"{len(value):,} layers; at most {_DEEPEST} make sense")
-    for width in value:
-        _WIDTH(width)
-
-
-def _net_arch(*parts: str) -> Rule:
-    """A list of widths, or one for each part of a network that has parts."""
-
-    def check(value: Any) -> None:
-        if not isinstance(value, Mapping) or not parts:
-            _layers(value)
-            return
-        if set(value) != set(parts):
-            example = ", ".join(f"{part}: [64, 64]" for part in parts)
-            raise ValueError(f"expected [64, 64] or {{{example}}}, got {short_repr(value)}")
-        for part, layers in value.items():
-            _checked(part, layers, _layers)
-
-    return check
-
-
-_ALGORITHM: dict[str, Rule] = {
-    "learning_rate": Range(0, 1, schedule=True, open_low=True),
-    "n_steps": _COUNT,
-    "batch_size": Range(2, _MOST, integer=True),
-    "n_epochs": _COUNT,
-    "gamma": _PART,
-    "gae_lambda": _FRACTION,
-    "clip_range": _CLIP,
-    "clip_range_vf": dataclasses.replace(_CLIP, high=math.inf, optional=True),
-    "normalize_advantage": _switch,
-    "ent_coef": _NOT_NEGATIVE,
-    "vf_coef": _NOT_NEGATIVE,
-    "max_grad_norm": _POSITIVE,
-    "use_sde": _switch,
-    "sde_sample_freq": _ALL_OR_COUNT,
-    "use_sde_at_warmup": _switch,
-    "target_kl": dataclasses.replace(_POSITIVE, optional=True),
-    "stats_window_size": _COUNT,
-    "rms_prop_eps": _PART,
-    "use_rms_prop": _switch,
-    "buffer_size": Range(1, 10**15, integer=True),  # what memory there is decides
-    "learning_starts": Range(0, _MOST, integer=True),
-    "tau": _PART,
-    "train_freq": _train_freq,
-    "gradient_steps": _ALL_OR_COUNT,
-    "action_noise": dataclasses.replace(_NOT_NEGATIVE, optional=True),
-    "optimize_memory_usage": _off,
-    "target_update_interval": _COUNT,
-    "target_entropy": Range(-math.inf, auto=True),
-    "policy_delay": _COUNT,
-    "target_policy_noise": _NOT_NEGATIVE,
-    "target_noise_clip": _NOT_NEGATIVE,
-    "exploration_fraction": _FRACTION,
-    "exploration_initial_eps": _FRACTION,
-    "exploration_final_eps": _FRACTION,
-    "top_quantiles_to_drop_per_net": Range(0, integer=True),
-}
-_OFF_POLICY_ONLY: dict[str, Rule] = {"ent_coef": dataclasses.replace(_NOT_NEGATIVE, auto=True)}
-
-_POLICY: dict[str, Rule] = {
-    "activation_fn": _name,
-    "ortho_init": _switch,
-    "log_std_init": Range(-20, 10),
-    "full_std": _switch,
-    "use_expln": _switch,
-    "squash_output": _switch,
-    "share_features_extractor": _switch,
-    "features_extractor_kwargs": _mapping(
-        {"features_dim": _WIDTH, "cnn_output_dim": _WIDTH, "normalized_image": _switch}
-    ),
-    "clip_mean": _NOT_NEGATIVE,
-    "n_critics": _FEW,
-    "n_quantiles": Range(1, 10_000, integer=True),
-    "batch_norm": _switch,
-    "batch_norm_momentum": _PART,
-    "batch_norm_eps": _PART,
-    "renorm_warmup_steps": Range(0, _MOST, integer=True),
-    "lstm_hidden_size": _WIDTH,
-    "n_lstm_layers": _FEW,
-    "shared_lstm": _switch,
-    "enable_critic_lstm": _switch,
-    "lstm_kwargs": _mapping({"dropout": Range(0, 0.99), "bias": _switch}),
-}
-_PARTS = {"dqn": (), **dict.fromkeys(ON_POLICY, ("pi", "vf"))}
-_QUANTILES = 25  # as TQC has it
-
-
-def check_algorithm(algo: str, values: Mapping[str, Any]) -> None:
-    """Raise `ValueError`, which begins with the parameter's name, for a value that an algorithm can do nothing with."""
-    _check_all(values, _ALGORITHM if algo in ON_POLICY else {**_ALGORITHM, **_OFF_POLICY_ONLY})
-
-
-def check_policy(algo: str, values: Mapping[str, Any]) -> None:
-    """Raise `ValueError`, which begins with the parameter's name, for a value that a network cannot have."""
-    _check_all(values, {**_POLICY, "net_arch": _net_arch(*_PARTS.get(algo, ("pi", "qf")))})
-
-
-def check_together(algo: str, values: Mapping[str, Any], policy: Mapping[str, Any], n_envs: int) -> None:
-    """Raise `ValueError` for values that are each possible, but not with the others."""
-    train_freq = values.get("train_freq")
-    if n_envs > 1 and isinstance(train_freq, list) and train_freq[1] == "episode":
-        raise ValueError(
-            f"algo_kwargs.train_freq: {short_repr(train_freq)} counts the episodes of one environment, and n_envs is "
-            f"{n_envs}; count steps, such as train_freq: {train_freq[0]}, or set n_envs: 1"
-        )
-    dropped, quantiles = values.get("top_quantiles_to_drop_per_net", 0), policy.get("n_quantiles", _QUANTILES)
-    if algo == "tqc" and dropped >= quantiles:
-        raise ValueError(
-            f"algo_kwargs.top_quantiles_to_drop_per_net: {dropped} of {quantiles} leaves nothing; "
-            "it must be below policy_kwargs.n_quantiles"
-        )
-
-
-def with_whole_numbers(name: str, value: Any) -> Any:
-    """Return a value with `1e3` made 1000 wherever a parameter counts something; SB3 takes no float there."""
-    rule = _ALGORITHM.get(name) or _POLICY.get(name)
-    if isinstance(rule, Range) and not rule.integer:
+    @pydantic.field_validator("optimize_memory_usage")
+    @classmethod
+    def _refuse(cls, value: bool) -> bool:
+        if value:
+            raise ValueError("not supported: checkpoints need the whole buffer; leave it out")
         return value
-    if isinstance(value, Mapping):
-        return {key: with_whole_numbers(key, each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [with_whole_numbers(name, each) for each in value]
-    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _check_all(values: Mapping[str, Any], rules: Mapping[str, Rule], known_only: bool = False) -> None:
-    for name, value in values.items():
-        if name in rules:
-            _checked(name, value, rules[name])
-        elif known_only:
-            raise ValueError(
-                f"no key {short_repr(name)!r}.{did_you_mean(str(name), rules)} Keys here: {', '.join(rules)}"
-            )
+class _Continuous(_OffPolicy):
+    action_noise: _NotNegative | None = None
+    """Standard deviation of normal noise on actions scaled to [-1, 1]; null: none."""
 
 
-def _checked(name: str, value: Any, rule: Rule) -> None:
-    try:
-        rule(value)
-    except ValueError as error:
-        text = str(error)
-        inside = isinstance(value, Mapping) and any(text.startswith(f"{key}: ") for key in value)
-        raise ValueError(f"{name}{'.' if inside else ': '}{text}") from None
+class _MaximumEntropy(_Continuous):
+    ent_coef: _EntropyCoefficient = "auto"
+    """Weight of the entropy; `auto` learns it, `auto_0.1` from 0.1 on."""
+    target_entropy: Number | Literal["auto"] = "auto"
+    """Entropy that `ent_coef: auto` aims at; `auto`: minus the number of action elements."""
+    use_sde: Switch = False
+    """State-dependent exploration (gSDE)."""
+    sde_sample_freq: _Count | Literal[-1] = -1
+    """Steps between new gSDE noise; -1: once per rollout."""
+    use_sde_at_warmup: Switch = False
+    """Whether to use gSDE instead of random actions before `learning_starts`."""
+    stats_window_size: _Count = 100
+    """Episodes in the running means of TensorBoard."""
+
+
+class Sac(_MaximumEntropy):
+    """Soft actor-critic."""
+
+    tau: _PositiveFraction = 0.005
+    """Share of the online network in each update of the target network."""
+    target_update_interval: _Count = 1
+    """Gradient steps between updates of the target network."""
+
+
+class Tqc(Sac):
+    """Truncated quantile critics."""
+
+    top_quantiles_to_drop_per_net: _CountFrom0 = 2
+    """Highest quantiles of each critic that are left out; fewer than `policy_kwargs.n_quantiles`."""
+
+
+class CrossQ(_MaximumEntropy):
+    """CrossQ: SAC with batch normalisation instead of target networks."""
+
+    learning_rate: _Schedule = 1e-3
+    policy_delay: _Count = 3
+    """Critic updates per update of the actor."""
+
+
+class Ddpg(_Continuous):
+    """Deep deterministic policy gradient."""
+
+    learning_rate: _Schedule = 1e-3
+    tau: _PositiveFraction = 0.005
+    """Share of the online network in each update of the target network."""
+    action_noise: _NotNegative | None = Field(None, json_schema_extra=decide_by("0.1"))
+    """Standard deviation of normal noise on actions scaled to [-1, 1]; null: none."""
+
+
+class Td3(Ddpg):
+    """Twin delayed DDPG."""
+
+    policy_delay: _Count = 2
+    """Critic updates per update of the actor."""
+    target_policy_noise: _NotNegative = 0.2
+    """Standard deviation of the noise that smooths the target policy."""
+    target_noise_clip: _NotNegative = 0.5
+    """That noise is clipped to this."""
+    stats_window_size: _Count = 100
+    """Episodes in the running means of TensorBoard."""
+
+
+class Dqn(_OffPolicy):
+    """Deep Q-network."""
+
+    learning_rate: _Schedule = 1e-4
+    batch_size: Whole = Field(32, ge=2, le=10**9)
+    tau: _PositiveFraction = 1.0
+    """Share of the online network in each update of the target network."""
+    train_freq: _TrainFreq = Field(4, examples=["[1, episode]"], json_schema_extra=decide_by("1"))
+    """Steps of each environment between updates."""
+    target_update_interval: _Count = 10_000
+    """Steps between updates of the target network."""
+    exploration_fraction: _Fraction = 0.1
+    """Part of the training over which the random actions become fewer."""
+    exploration_initial_eps: _Fraction = 1.0
+    """Share of random actions at the beginning."""
+    exploration_final_eps: _Fraction = 0.05
+    """Share of random actions at the end."""
+    max_grad_norm: _Positive = 10.0
+    """Gradients are clipped to this norm."""
+    stats_window_size: _Count = 100
+    """Episodes in the running means of TensorBoard."""
+
+
+ALGORITHM_PARAMETERS: dict[str, type[Parameters]] = {
+    "ppo": Ppo,
+    "a2c": A2c,
+    "sac": Sac,
+    "td3": Td3,
+    "ddpg": Ddpg,
+    "dqn": Dqn,
+    "tqc": Tqc,
+    "crossq": CrossQ,
+    "recurrent_ppo": RecurrentPpo,
+}

@@ -1,38 +1,62 @@
-"""Types of a recipe's fields: a number is no text and no bool, and a switch is no number."""
+"""Types of a recipe's values: a number is not a text and not a bool, and a switch is not a number."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Annotated, Any
 
 import pydantic
+from pydantic_core import PydanticCustomError, core_schema
 
-from rlctl.errors import short_repr
+_WRONG = PydanticCustomError("wrong_type", "wrong type")
+"""The type's description says what would be right; see `rlctl.run.schema_text`."""
 
 
-def _number(value: Any) -> Any:
+def _check_number(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"expected a number, got {_quoted(value)}")
+        raise _WRONG
     return value
 
 
-def _whole(value: Any) -> Any:
-    number = _number(value)
+def _check_whole(value: Any) -> Any:
+    number = _check_number(value)
     return int(number) if isinstance(number, float) and number.is_integer() else number
 
 
-def _switch(value: Any) -> Any:
+def _check_switch(value: Any) -> Any:
     if not isinstance(value, bool):
-        raise ValueError(f"expected true or false, got {_quoted(value)}")
+        raise _WRONG
     return value
 
 
-def _quoted(value: Any) -> str:
-    return repr(short_repr(value)) if isinstance(value, str) else short_repr(value)
-
-
-Whole = Annotated[int, pydantic.BeforeValidator(_whole)]
+Whole = Annotated[int, pydantic.BeforeValidator(_check_whole)]
 """A whole number; `1e6` is one."""
-Number = Annotated[pydantic.FiniteFloat, pydantic.BeforeValidator(_number)]
+Number = Annotated[pydantic.FiniteFloat, pydantic.BeforeValidator(_check_number)]
 """A finite number."""
-Switch = Annotated[bool, pydantic.BeforeValidator(_switch)]
+Switch = Annotated[bool, pydantic.BeforeValidator(_check_switch)]
 """true or false."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NumberAfter:
+    """Marks texts such as `lin_3e-4`: a prefix and a number of the type `kind`."""
+
+    prefix: str
+    kind: Any
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
+        adapter = pydantic.TypeAdapter[Any](self.kind)
+
+        def check(text: str) -> str:
+            try:
+                adapter.validate_python(float(text.removeprefix(self.prefix)))
+            except ValueError:
+                raise _WRONG from None
+            if not text.startswith(self.prefix):
+                raise _WRONG
+            return text
+
+        return core_schema.no_info_after_validator_function(check, core_schema.str_schema(strict=True))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return {"type": "string", "pattern": f"{self.prefix}NUMBER"}

@@ -16,11 +16,12 @@ from pydantic import Field
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
-from rlctl.run import untrusted, yaml_text
+from rlctl.run import schema_text, untrusted, yaml_text
+from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.run.hyperparameters import ON_POLICY as ON_POLICY
-from rlctl.run.hyperparameters import check_algorithm, check_policy, check_together
+from rlctl.run.network_parameters import NETWORK_PARAMETERS
 from rlctl.run.quantities import Number, Switch, Whole
-from rlctl.run.stages import Promotion, Stage, check_promotions
+from rlctl.run.stages import Stage, check_promotions
 
 Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
@@ -30,30 +31,37 @@ IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
 _DEEPEST_KEY = 20
 _LONGEST = 2**20  # [bytes] of a recipe file
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
-
-
+_QUANTILES = 25  # per critic, where a recipe does not say
 _MOST_STEPS = 10**12
 _MOST_ENVS = 10_000
 
 
 class _Section(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class Normalize(_Section):
     """Running normalisation, as SB3's VecNormalize does it."""
 
     observation: Switch = True
+    """Whether to normalise observations."""
     reward: Switch = True
+    """Whether to scale rewards by the deviation of the return."""
     clip_observation: Number = Field(10.0, gt=0)
+    """Bound of normalised observations."""
     clip_reward: Number = Field(10.0, gt=0)
+    """Bound of normalised rewards."""
 
 
 class Evaluation(_Section):
     """Evaluation while training; steps are environment steps, all environments together."""
 
-    every_steps: Whole | None = Field(None, ge=1, le=_MOST_STEPS)
+    every_steps: Whole | None = Field(
+        None, ge=1, le=_MOST_STEPS, json_schema_extra=decide_by("a tenth of total_timesteps")
+    )
+    """Steps between evaluations."""
     episodes: Whole = Field(100, ge=1, le=1_000_000)
+    """Episodes per evaluation, the same seeds each time."""
     deterministic: Switch = True
     """Whether to take the mean action, and not a sample."""
 
@@ -62,57 +70,95 @@ class Hindsight(_Section):
     """Hindsight experience replay, by the names of SB3's `HerReplayBuffer`; see `rlctl.train.hindsight`."""
 
     n_sampled_goal: Whole = Field(4, ge=1, le=1000)
+    """Goals in hindsight per real one."""
     goal_selection_strategy: Literal["future", "final", "episode"] = "future"
+    """Which of the goals that an episode reached are taken."""
 
 
 class Checkpoints(_Section):
+    """Which checkpoints are kept."""
+
     keep: Whole = Field(3, ge=1, le=1_000_000)
+    """How many of the newest are kept."""
 
 
 class Recipe(_Section):
     """How to train a task. `algo_kwargs` and `policy_kwargs` are SB3's own names."""
 
     task: dict[str, Any] = {}
+    """Parameters of the task: what its constructor takes."""
     reward_weights: dict[str, Number] = {}
+    """Weights of reward terms, where they differ from the task's."""
     randomize: Switch = False
+    """Whether all random changes (`events`) that the task offers act."""
     events: dict[str, dict[str, Any]] = {}
+    """Random changes that act, by name, with the parameters that differ from the task's."""
     algo: Algorithm = "ppo"
+    """The algorithm."""
     algo_kwargs: dict[str, Any] = {}
+    """Parameters of the algorithm; see its own table."""
     policy_kwargs: dict[str, Any] = {}
+    """Parameters of the networks; see the algorithm's own table."""
     her: Hindsight | None = None
-    normalize: Normalize | None = None
+    """Hindsight experience replay, for tasks with goals; null: none."""
+    normalize: Normalize | None = Field(
+        None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; else neither")
+    )
+    """Running normalisation of observations and rewards."""
     frame_stack: Whole = Field(1, ge=1, le=1000)
+    """How many of the last observations the policy gets."""
     n_envs: Whole = Field(8, ge=1, le=_MOST_ENVS)
+    """Environments stepped side by side."""
     total_timesteps: Whole = Field(300_000, ge=1, le=_MOST_STEPS)
+    """Environment steps, all environments together."""
     seed: Whole = Field(0, ge=0, lt=2**32)
+    """Seed of everything random."""
     eval: Evaluation = Evaluation()
+    """Evaluation while training."""
     stop_success: Number | None = Field(None, gt=0, le=1)
+    """Stop after two evaluations in a row at this success rate; null: never."""
     checkpoint: Checkpoints = Checkpoints()
+    """Which checkpoints are kept."""
     stages: list[Stage] = []
+    """Curriculum: what each stage changes, and when it ends."""
 
     @pydantic.field_validator("algo_kwargs", "policy_kwargs")
     @classmethod
-    def _in_range(cls, values: dict[str, Any], info: pydantic.ValidationInfo) -> dict[str, Any]:
-        check = check_algorithm if info.field_name == "algo_kwargs" else check_policy
-        check(info.data.get("algo", "ppo"), values)
-        return values
+    def _check_parameters(cls, values: dict[str, Any], info: pydantic.ValidationInfo) -> dict[str, Any]:
+        models = ALGORITHM_PARAMETERS if info.field_name == "algo_kwargs" else NETWORK_PARAMETERS
+        model = models.get(info.data.get("algo", ""))  # not there if it is wrong itself, which is then reported
+        if model is None:
+            return values
+        checked = model.model_validate(values)
+        return checked.model_dump(mode="json", exclude_unset=True)
 
     @pydantic.model_validator(mode="after")
     def _fit_together(self) -> Recipe:
-        check_together(self.algo, self.algo_kwargs, self.policy_kwargs, self.n_envs)
+        train_freq = self.algo_kwargs.get("train_freq")
+        if self.n_envs > 1 and isinstance(train_freq, list) and train_freq[1] == "episode":
+            raise ValueError(
+                f"algo_kwargs.train_freq: {train_freq} counts the episodes of one environment, and n_envs is "
+                f"{self.n_envs}; count steps, such as train_freq: {train_freq[0]}, or set n_envs: 1"
+            )
+        dropped = self.algo_kwargs.get("top_quantiles_to_drop_per_net", 0)
+        if dropped >= (quantiles := self.policy_kwargs.get("n_quantiles", _QUANTILES)):
+            raise ValueError(
+                f"algo_kwargs.top_quantiles_to_drop_per_net: {dropped} of {quantiles} leaves nothing; "
+                "it must be below policy_kwargs.n_quantiles"
+            )
         return self
 
     @pydantic.field_validator("her")
     @classmethod
-    def _has_replay(cls, value: Hindsight | None, others: pydantic.ValidationInfo) -> Hindsight | None:
-        algo = others.data.get("algo")  # not there if it is wrong itself, which is then told
+    def _check_replay(cls, value: Hindsight | None, others: pydantic.ValidationInfo) -> Hindsight | None:
+        algo = others.data.get("algo")
         if value is not None and algo is not None and algo not in IN_HINDSIGHT:
             raise ValueError(f"{algo} cannot learn in hindsight; {', '.join(IN_HINDSIGHT)} can")
         return value
 
     @pydantic.field_validator("stages")
     @classmethod
-    def _end_in_turn(cls, values: list[Stage]) -> list[Stage]:
+    def _check_promotions(cls, values: list[Stage]) -> list[Stage]:
         check_promotions(values)
         return values
 
@@ -188,7 +234,13 @@ def resolve(
     """
     packaged_file = registry.find_recipe_file(task)
     packaged = read(packaged_file) if packaged_file else {}
-    given = merge(read(config) if config else {}, settings)
+    from_config = read(config) if config else {}
+    given = merge(from_config, settings)
+    sources = [
+        Source("command line", settings),
+        Source(str(config), from_config, config),
+        Source(str(packaged_file), packaged, packaged_file),
+    ]
     algo = given.get("algo", packaged.get("algo", "ppo"))
     if packaged.get("algo", "ppo") != algo:
         # Hyperparameters of another algorithm would be wrong here, and so would its number of environments.
@@ -196,8 +248,7 @@ def resolve(
     merged = merge(packaged, given)
     if stages and "stages" not in merged:
         merged["stages"] = validate({"stages": list(stages)}, f"class of {task}").model_dump(by_alias=True)["stages"]
-    source = "recipe" if not config else f"recipe {config}"
-    return fill_defaults(validate(merged, source))
+    return fill_defaults(validate(merged, *sources))
 
 
 _OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
@@ -213,39 +264,74 @@ def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def validate(values: Mapping[str, Any], source: str) -> Recipe:
-    """Check plain data; raises `RecipeError` that names the key, what was expected, and the closest name."""
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """Values of a recipe, and where they are from."""
+
+    name: str
+    values: Mapping[str, Any]
+    file: Path | None = None
+
+    def find(self, path: Sequence[str | int]) -> str | None:
+        """Return where the value at `path` is from, with the line of a file; None if it is not from here."""
+        value: Any = self.values
+        for part in path:
+            if not (isinstance(value, Mapping) and part in value) and not (isinstance(part, int) and value):
+                return None
+            value = value[part]
+        return self.name if self.file is None else f"{self.file}:{yaml_text.find_line(self.file.read_text(), path)}"
+
+
+def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
+    """Check plain data; raises `RecipeError` that names the key, what was expected, and the closest name.
+
+    `sources` are where values are from, topmost first: of the first that has the key the error names the place.
+    """
     try:
         return Recipe.model_validate(values)
     except pydantic.ValidationError as error:
-        raise RecipeError(f"{source}: {_explain(error.errors()[0])}") from None
+        problem = error.errors()[0]
+        schema = build_schema(values.get("algo", "ppo"))
+        loc = problem["loc"]
+        depth = schema_text.find_depth(schema, loc) if problem["type"] != "extra_forbidden" else len(loc)
+        path = loc[:depth]
+        places = (each if isinstance(each, str) else each.find(path) for each in sources)
+        where = next((place for place in places if place), "recipe")
+        raise RecipeError(f"{where}: {_explain(problem, path, schema, values)}") from None
 
 
-def _explain(problem: Any) -> str:
-    path = [short_repr(str(part)) for part in problem["loc"]]
-    where = ""
-    if path[:1] == ["stages"] and len(path) > 1:
-        where, path = f"stage {problem['loc'][1] + 1}: ", path[2:]
-    key = ".".join(path)
+def build_schema(algo: Any = None) -> schema_text.Schema:
+    """Return the JSON schema of a recipe, with the parameters of an algorithm and its networks."""
+    schema = Recipe.model_json_schema()
+    for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
+        if isinstance(algo, str) and algo in models:
+            own = models[algo].model_json_schema()
+            schema["$defs"] |= own.pop("$defs", {})
+            schema["properties"][key] |= own
+    return schema
+
+
+def _explain(problem: Any, path: Sequence[str | int], schema: schema_text.Schema, values: Mapping[str, Any]) -> str:
+    where, shown = "", path
+    if len(path) > 1 and path[0] == "stages":
+        where, shown = f"stage {int(path[1]) + 1}: ", path[2:]
+    key = ".".join(short_repr(str(part)) for part in shown)
     if problem["type"] == "extra_forbidden":
-        section = _SECTIONS.get(path[-2], Recipe) if len(path) > 1 else Stage if where else Recipe
-        names = [field.alias or name for name, field in section.model_fields.items()]
-        return f"{where}no key {key!r}.{did_you_mean(path[-1], names)} Keys here: {', '.join(names)}."
-    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
-    if problem["type"] == "value_error":
-        between = "." if key in ("algo_kwargs", "policy_kwargs") else ": " if key else ""
-        return f"{where}{key}{between}{message}"
-    given = repr(problem["input"]) if isinstance(problem["input"], str) else problem["input"]
-    return f"{where}{key + ': ' if key else ''}{message}, got {short_repr(given)}"
-
-
-_SECTIONS: dict[str, type[pydantic.BaseModel]] = {
-    "her": Hindsight,
-    "normalize": Normalize,
-    "eval": Evaluation,
-    "checkpoint": Checkpoints,
-    "promote": Promotion,
-}
+        keys = schema_text.list_keys(schema, schema_text.find_schema(schema, path[:-1]))
+        algo = f" for {values.get('algo', 'ppo')}" if path[0] in ("algo_kwargs", "policy_kwargs") else ""
+        return f"{where}no key {key!r}{algo}.{did_you_mean(str(path[-1]), keys)} Keys here: {', '.join(keys)}."
+    label = f"{where}{key}{': ' if key else ''}"
+    if problem["type"] == "value_error":  # of a check of ours that needs more than a type
+        return f"{label}{problem['ctx']['error']}"
+    part = schema_text.find_schema(schema, path)
+    given: Any = values
+    for each in path:
+        given = given[each]
+    examples = f", such as {' or '.join(part['examples'])}" if "examples" in part else ""
+    close = did_you_mean(given, part.get("enum", ())) if isinstance(given, str) else ""
+    given = repr(short_repr(given)) if isinstance(given, str) else short_repr(given)
+    expected = f"expected {schema_text.describe_value(schema, part)}{examples}"
+    return f"{label}{expected}, got {given}{close and f'.{close}'}"
 
 
 def fill_defaults(recipe: Recipe) -> Recipe:

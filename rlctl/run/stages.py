@@ -11,7 +11,7 @@ from pydantic import Field
 from rlctl.env_spec import EnvSpec
 from rlctl.run.quantities import Number, Whole
 
-_STRICT = pydantic.ConfigDict(extra="forbid", frozen=True)
+_STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class Promotion(pydantic.BaseModel):
@@ -20,7 +20,9 @@ class Promotion(pydantic.BaseModel):
     model_config = _STRICT
 
     success: Number | None = Field(None, gt=0, le=1)
+    """Success rate to reach."""
     mean_return: Number | None = Field(None, alias="return")
+    """Mean return to reach."""
     window: Whole = Field(100, ge=1, le=1_000_000)
     """How many finished training episodes of the stage are looked at; the rule holds no earlier than that."""
     min_steps: Whole = Field(0, ge=0)
@@ -47,11 +49,15 @@ class Stage(pydantic.BaseModel):
     model_config = _STRICT
 
     task: dict[str, Any] = {}
+    """Changes of the recipe's `task`."""
     reward_weights: dict[str, Number] = {}
+    """Changes of the recipe's `reward_weights`."""
     events: dict[str, dict[str, Any]] = {}
+    """Changes of the recipe's `events`."""
     level: Number = Field(1.0, ge=0, le=1)
     """How far ranges of events written `{from: ..., to: ...}` have widened."""
     promote: Promotion | None = None
+    """When the stage ends; the last stage has none."""
 
     def __str__(self) -> str:
         changes = [f"{name} {value}" for name, value in self.task.items()]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import yaml
@@ -12,7 +12,6 @@ from rlctl.errors import RecipeError, short_repr
 
 _PREFIX = "tag:yaml.org,2002:"
 _DEEPEST = 50
-_MOST_VALUES = 100_000  # with each alias written out
 
 
 class _Dumper(yaml.SafeDumper):
@@ -20,6 +19,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 class _Loader(yaml.SafeLoader):
+    depth = 0
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
     # Plain data only: no dates, no bytes, no sets.
     yaml_constructors = {
@@ -27,6 +27,17 @@ class _Loader(yaml.SafeLoader):
         for tag, construct in yaml.SafeLoader.yaml_constructors.items()
         if tag is None or tag.removeprefix(_PREFIX) in ("null", "bool", "str", "seq", "map")
     }
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
+        if getattr(event, "anchor", None) is not None:  # of an alias too
+            raise _problem("anchors and aliases (&name, *name) are not supported: write the values out", event)
+        if self.depth >= _DEEPEST:
+            raise _problem(f"nested more than {_DEEPEST} deep", event)
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         if not isinstance(node, yaml.MappingNode):  # text or a list with an explicit tag
@@ -65,48 +76,21 @@ class _Loader(yaml.SafeLoader):
     def construct_text(self, node: yaml.ScalarNode) -> str:
         text: str = self.construct_scalar(node)
         if any("\ud800" <= character <= "\udfff" for character in text):
-            raise _problem(f"{short_repr(ascii(text))} has half a character, which no file can hold", node)
+            raise _problem(f"{short_repr(ascii(text))} has an unpaired surrogate, which no file can hold", node)
         return text
 
 
-def _problem(told: str, node: yaml.Node) -> yaml.YAMLError:
-    return yaml.constructor.ConstructorError(problem=told, problem_mark=node.start_mark)
+def _problem(message: str, node: Any) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(problem=message, problem_mark=node.start_mark)
 
 
 def _text_of_key(node: yaml.Node) -> str:
     if node.tag != f"{_PREFIX}str" or not isinstance(node.value, str):
-        told = short_repr(node.value) if isinstance(node.value, str) else "a list or a mapping"
-        raise _problem(f"{told} cannot be a key: keys are text, numbers in quotes", node)
+        given = short_repr(node.value) if isinstance(node.value, str) else "a list or a mapping"
+        raise _problem(f"{given} cannot be a key: keys are text, numbers in quotes", node)
     if node.value == "<<":
-        raise _problem("merge keys (<<) are not read: write the values out, or give them by name (*name)", node)
+        raise _problem("merge keys (<<) are not supported: write the values out", node)
     return node.value
-
-
-def _expanded(root: yaml.Node) -> int:
-    """Count the values of a document with each alias written out; raises `YAMLError` when there are too many."""
-    counted: dict[int, int] = {}
-    inside: set[int] = set()
-
-    def count(node: yaml.Node) -> int:
-        if id(node) in counted:
-            return counted[id(node)]
-        if id(node) in inside:
-            raise _problem("an alias that contains itself", node)
-        if len(inside) >= _DEEPEST:
-            raise _problem(f"nested more than {_DEEPEST} deep", node)
-        inside.add(id(node))
-        parts: list[yaml.Node] = []
-        if isinstance(node, yaml.MappingNode):
-            parts = [part for pair in node.value for part in pair]
-        elif isinstance(node, yaml.SequenceNode):
-            parts = node.value
-        counted[id(node)] = total = 1 + sum(count(part) for part in parts)
-        inside.discard(id(node))
-        if total > _MOST_VALUES:
-            raise _problem(f"its aliases make more than {_MOST_VALUES:,} values of it", node)
-        return total
-
-    return count(root)
 
 
 for _tag, _construct in (
@@ -133,15 +117,11 @@ for _tag, _pattern, _first in (
 
 
 def load(text: str, source: str) -> Any:
-    """Parse YAML; raises `RecipeError` with `source` and the line."""
+    """Parse YAML without anchors and aliases; raises `RecipeError` with `source` and the line."""
     try:
         loader = _Loader(text)
         try:
-            root = loader.get_single_node()
-            if root is None:
-                return None
-            _expanded(root)
-            return loader.construct_document(root)
+            return loader.get_single_data()
         finally:
             loader.dispose()
     except RecursionError:
@@ -155,6 +135,22 @@ def load(text: str, source: str) -> Any:
         if isinstance(error, yaml.composer.ComposerError) and error.context:
             problem = f"{error.context}, {problem}"
         raise RecipeError(f"{where}: {short_repr(problem, 200)}") from None
+
+
+def find_line(text: str, path: Sequence[str | int]) -> int:
+    """Return the line, from 1, of the key at `path` in YAML that `load` has read."""
+    loader = _Loader(text)
+    node = loader.get_single_node()
+    line = 1
+    for part in path:
+        if isinstance(node, yaml.MappingNode):
+            key, node = next((key, value) for key, value in node.value if key.value == part)
+            line = key.start_mark.line + 1
+        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
+            node = node.value[part]
+            line = node.start_mark.line + 1
+    loader.dispose()
+    return line
 
 
 def dump(value: Any) -> str:

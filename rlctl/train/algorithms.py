@@ -1,9 +1,8 @@
-"""From a recipe to an SB3 model: names checked against SB3's own signatures."""
+"""From a recipe to an SB3 model."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,27 +13,13 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from rlctl.errors import RecipeError, UsageError, did_you_mean, short_repr
-from rlctl.run.hyperparameters import with_whole_numbers
+from rlctl.errors import RecipeError, UsageError, short_repr
 from rlctl.run.recipe import Normalize, Recipe
 from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
 from rlctl.train import footprint
 from rlctl.train.hindsight import replay_arguments
 from rlctl.train.vec_env import WorkerVecEnv
 
-# Set by rlctl itself, or not plain data.
-_NOT_FOR_RECIPES = frozenset(
-    {
-        "self", "policy", "env", "seed", "device", "verbose", "tensorboard_log", "policy_kwargs", "_init_setup_model",
-        "rollout_buffer_class", "rollout_buffer_kwargs", "replay_buffer_class", "replay_buffer_kwargs",
-    }
-)  # fmt: skip
-_NOT_FOR_POLICIES = frozenset(
-    {
-        "self", "observation_space", "action_space", "lr_schedule", "optimizer_class", "optimizer_kwargs",
-        "features_extractor_class", "use_sde", "normalize_images",
-    }
-)  # fmt: skip
 _DETERMINISTIC_EXPLORERS = frozenset({"td3", "ddpg"})
 
 
@@ -42,21 +27,20 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     """Build the model of a recipe on vector environments; raises `RecipeError` for what does not fit."""
     _check_device(device)
     cls = ALGORITHMS[recipe.algo]
-    kwargs = _algorithm_kwargs(recipe, cls, env.action_space)
+    kwargs = _algorithm_kwargs(recipe, env.action_space)
     if recipe.her is not None:
         kwargs = {**replay_arguments(recipe, recipe.her, env.workers.info), **kwargs}
     name = policy_name(recipe.algo, env.observation_space)
     if name not in cls.policy_aliases:
         kind = "dictionaries" if isinstance(env.observation_space, spaces.Dict) else "images"
         raise RecipeError(f"{recipe.algo} cannot be used here: it has no network for {kind}")
-    policy_kwargs = _policy_kwargs(recipe, cls.policy_aliases[name])
     _check_rollout(recipe, env.num_envs)
     footprint.check(recipe, env.observation_space, env.action_space, env.num_envs)
     try:
         return cls(
             name,
             wrap_normalize(env, recipe.normalize, kwargs.get("gamma", 0.99)),
-            policy_kwargs=policy_kwargs,
+            policy_kwargs=_policy_kwargs(recipe),
             seed=recipe.seed,
             device=device,
             **kwargs,
@@ -79,16 +63,8 @@ def _check_device(device: str) -> None:
         )
 
 
-def _algorithm_kwargs(recipe: Recipe, cls: type[BaseAlgorithm], action_space: spaces.Space[Any]) -> dict[str, Any]:
-    known = _names(cls.__init__, _NOT_FOR_RECIPES)
-    kwargs: dict[str, Any] = {}
-    for name, value in recipe.algo_kwargs.items():
-        if name not in known:
-            raise RecipeError(
-                f"algo_kwargs.{name}: {recipe.algo} has no parameter {name!r}.{did_you_mean(name, known)} "
-                f"It has: {', '.join(known)}."
-            )
-        kwargs[name] = _value(name, value)
+def _algorithm_kwargs(recipe: Recipe, action_space: spaces.Space[Any]) -> dict[str, Any]:
+    kwargs = {name: _convert(value) for name, value in recipe.algo_kwargs.items()}
     if recipe.algo in _DETERMINISTIC_EXPLORERS:
         # Their policies are deterministic: without noise they would not explore at all.
         kwargs.setdefault("action_noise", 0.1)
@@ -98,10 +74,9 @@ def _algorithm_kwargs(recipe: Recipe, cls: type[BaseAlgorithm], action_space: sp
     return kwargs
 
 
-def _value(name: str, value: Any) -> Any:
+def _convert(value: Any) -> Any:
     if isinstance(value, str) and value.startswith("lin_"):
         return _linear(value)
-    value = with_whole_numbers(name, value)
     return tuple(value) if isinstance(value, list) else value
 
 
@@ -112,21 +87,11 @@ def _linear(text: str) -> Callable[[float], float]:
     return lambda remaining: max(remaining, 0.0) * start
 
 
-def _policy_kwargs(recipe: Recipe, policy_class: Any) -> dict[str, Any]:
-    known = _names(policy_class.__init__, _NOT_FOR_POLICIES)
-    kwargs = {}
-    for name, value in recipe.policy_kwargs.items():
-        if name not in known:
-            raise RecipeError(
-                f"policy_kwargs.{name}: {policy_class.__name__} has no parameter {name!r}."
-                f"{did_you_mean(name, known)} It has: {', '.join(known)}."
-            )
-        kwargs[name] = activation(value) if name == "activation_fn" else with_whole_numbers(name, value)
+def _policy_kwargs(recipe: Recipe) -> dict[str, Any]:
+    kwargs = dict(recipe.policy_kwargs)
+    if "activation_fn" in kwargs:
+        kwargs["activation_fn"] = activation(kwargs["activation_fn"])
     return kwargs
-
-
-def _names(function: Any, without: Iterable[str]) -> list[str]:
-    return [name for name in inspect.signature(function).parameters if name not in without]
 
 
 def _check_rollout(recipe: Recipe, n_envs: int) -> None:

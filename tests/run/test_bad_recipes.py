@@ -35,11 +35,12 @@ def refused(config, settings=()):
         ("- n_envs\n", ": a recipe is a mapping of keys to values, this is a list"),
         ("ppo\n", ": a recipe is a mapping of keys to values, this is a str"),
         ("7\n", ": a recipe is a mapping of keys to values, this is a int"),
-        (BOMB, ":6: its aliases make more than 100,000 values of it"),
-        (MERGE_BOMB, ": its aliases make more than 100,000 values of it"),
-        ("task: &a {b: *a}\n", ":1: an alias that contains itself"),
-        ("task: *b\n", ":1: found undefined alias 'b'"),
-        ("base: &b {n_envs: 1}\n<<: *b\n", ":2: merge keys (<<) are not read: write the values out, or "),
+        (BOMB, ":1: anchors and aliases (&name, *name) are not supported: write the values out"),
+        (MERGE_BOMB, ":1: anchors and aliases (&name, *name) are not supported"),
+        ("task: &a {b: *a}\n", ":1: anchors and aliases (&name, *name) are not supported"),
+        ("task: *b\n", ":1: anchors and aliases (&name, *name) are not supported"),
+        ("base: &b {n_envs: 1}\n<<: *b\n", ":1: anchors and aliases (&name, *name) are not supported"),
+        ("n_envs: 1\n<<: {seed: 1}\n", ":2: merge keys (<<) are not supported: write the values out"),
         ("task: " + "[" * 10_000 + "]" * 10_000, ": nested more than 50 deep"),
         ("task: " + "{a: " * 10_000 + "}" * 10_000, ": nested more than 50 deep"),
         ("task: " + "[" * 60 + "]" * 60, ":1: nested more than 50 deep"),
@@ -58,7 +59,7 @@ def refused(config, settings=()):
         ("true: 2\n", ":1: true cannot be a key"),
         ("null: 2\n", ":1: null cannot be a key"),
         ("[a, b]: 2\n", ":1: a list or a mapping cannot be a key"),
-        ('task: {a: "\\ud800"}\n', ":1: '\\ud800' has half a character"),
+        ('task: {a: "\\ud800"}\n', ":1: '\\ud800' has an unpaired surrogate"),
         ("task: a\0b\n", ": character 0x0 at 7 cannot be in YAML"),
         (b"\xff\xfet\x00a\x00s\x00k\x00", ": not UTF-8 text: invalid start byte at byte 0; save it as UTF-8"),
         ("n_envs: 1\n".encode("utf-16-be"), ": character 0x0 at 0 cannot be in YAML"),
@@ -80,63 +81,69 @@ def test_what_looks_wrong_and_is_right(tmp_path):
     file.write_text(
         "\ufefftotal_timesteps: 1e6\n"
         "algo_kwargs: {learning_rate: 3e-4, n_steps: 010, target_kl: null}\n"
-        "task: {mode: on, time: 1:30, same: &s [1], again: *s}\n",
+        "task: {mode: on, time: 1:30}\n",
         encoding="utf-8",
     )
     recipe = resolve("Pendulum-v1", file, {})
     assert recipe.total_timesteps == 1_000_000
     assert recipe.algo_kwargs["learning_rate"] == 3e-4
     assert recipe.algo_kwargs["n_steps"] == 10
-    assert recipe.task == {"mode": "on", "time": "1:30", "same": [1], "again": [1]}
+    assert recipe.task == {"mode": "on", "time": "1:30"}
 
 
 @pytest.mark.parametrize(
     ("setting", "told"),
     [
-        ("n_envs=0", "n_envs: should be greater than or equal to 1, got 0"),
-        ("n_envs=1e6", "n_envs: should be less than or equal to 10000, got 1000000"),
-        ("n_envs='4'", "n_envs: expected a number, got '4'"),
-        ("n_envs=true", "n_envs: expected a number, got True"),
-        ("n_envs=.nan", "n_envs: should be a finite number, got nan"),
-        ("total_timesteps=0", "total_timesteps: should be greater than or equal to 1, got 0"),
+        ("n_envs=0", "n_envs: expected a whole number in [1, 10000], got 0"),
+        ("n_envs=1e6", "n_envs: expected a whole number in [1, 10000], got 1000000.0"),
+        ("n_envs='4'", "n_envs: expected a whole number in [1, 10000], got '4'"),
+        ("n_envs=true", "n_envs: expected a whole number in [1, 10000], got True"),
+        ("n_envs=.nan", "n_envs: expected a whole number in [1, 10000], got nan"),
+        ("total_timesteps=0", "total_timesteps: expected a whole number in [1, 1e12], got 0"),
         (
             "total_timesteps=1e30",
-            "total_timesteps: should be less than or equal to 1000000000000, got 1000000000000000019884624838656",
+            "total_timesteps: expected a whole number in [1, 1e12], got 1e+30",
         ),
-        ("total_timesteps=-.inf", "total_timesteps: should be a finite number, got -inf"),
-        ("seed=-1", "seed: should be greater than or equal to 0, got -1"),
-        ("seed=1099511627776", "seed: should be less than 4294967296, got 1099511627776"),
-        ("frame_stack=0", "frame_stack: should be greater than or equal to 1, got 0"),
-        ("frame_stack=1e9", "frame_stack: should be less than or equal to 1000, got 1000000000"),
+        ("total_timesteps=-.inf", "total_timesteps: expected a whole number in [1, 1e12], got -inf"),
+        ("seed=-1", "seed: expected a whole number in [0, 4294967296), got -1"),
+        ("seed=1099511627776", "seed: expected a whole number in [0, 4294967296), got 1099511627776"),
+        ("frame_stack=0", "frame_stack: expected a whole number in [1, 1000], got 0"),
+        ("frame_stack=1e9", "frame_stack: expected a whole number in [1, 1000], got 1000000000.0"),
         ("randomize=yes", "randomize: expected true or false, got 'yes'"),
         ("randomize=1", "randomize: expected true or false, got 1"),
-        ("stop_success=.inf", "stop_success: should be a finite number, got inf"),
-        ("stop_success='1'", "stop_success: expected a number, got '1'"),
-        ("eval=null", "eval: should be a valid dictionary or instance of Evaluation, got None"),
-        ("eval.episodes=0", "eval.episodes: should be greater than or equal to 1, got 0"),
-        ("eval.every_steps=0", "eval.every_steps: should be greater than or equal to 1, got 0"),
-        ("checkpoint.keep=0", "checkpoint.keep: should be greater than or equal to 1, got 0"),
+        ("stop_success=.inf", "stop_success: expected a number in (0, 1] or null, got inf"),
+        ("stop_success='1'", "stop_success: expected a number in (0, 1] or null, got '1'"),
+        ("eval=null", "eval: expected a mapping of every_steps, episodes, deterministic, got None"),
+        ("eval.episodes=0", "eval.episodes: expected a whole number in [1, 1e6], got 0"),
+        ("eval.every_steps=0", "eval.every_steps: expected a whole number in [1, 1e12] or null, got 0"),
+        ("checkpoint.keep=0", "checkpoint.keep: expected a whole number in [1, 1e6], got 0"),
         ("normalize.observation=1", "normalize.observation: expected true or false, got 1"),
-        ("normalize.clip_reward=.inf", "normalize.clip_reward: should be a finite number, got inf"),
-        ("normalize.clip_observation=-1", "normalize.clip_observation: should be greater than 0, got -1"),
-        ("reward_weights.a=.nan", "reward_weights.a: should be a finite number, got nan"),
+        ("normalize.clip_reward=.inf", "normalize.clip_reward: expected a number > 0, got inf"),
+        ("normalize.clip_observation=-1", "normalize.clip_observation: expected a number > 0, got -1"),
+        ("reward_weights.a=.nan", "reward_weights.a: expected a number, got nan"),
         ("reward_weights.a=true", "reward_weights.a: expected a number, got True"),
-        ("events.mass=3", "events.mass: should be a valid dictionary, got 3"),
-        ("task=3", "task: should be a valid dictionary, got 3"),
-        ("stages=3", "stages: should be a valid list, got 3"),
+        ("events.mass=3", "events.mass: expected a mapping, got 3"),
+        ("task=3", "task: expected a mapping, got 3"),
+        ("stages=3", "stages: expected a list, each element a mapping of task, reward_weights, events, level, pr"),
         ("stages=[{}, {}]", "stages: stage 1 of 2 (the recipe's own task) has no promotion rule"),
-        ("stages=[{level: .nan}]", "stage 1: level: should be a finite number, got nan"),
-        ("stages=[{level: 2}]", "stage 1: level: should be less than or equal to 1, got 2"),
+        ("stages=[{level: .nan}]", "stage 1: level: expected a number in [0, 1], got nan"),
+        ("stages=[{level: 2}]", "stage 1: level: expected a number in [0, 1], got 2"),
         ("stages=[{promote: {}}]", "stage 1: promote: give success or return, one of the two"),
-        ("stages=[{promote: {success: 0.5, window: 0}}]", "stage 1: promote.window: should be greater than or equal"),
-        ("stages=[{promote: {success: '0.5'}}]", "stage 1: promote.success: expected a number, got '0.5'"),
-        ("algo=[ppo]", "algo: should be 'ppo', 'a2c', 'sac', 'td3', 'ddpg', 'dqn', 'tqc', 'crossq' or "),
+        (
+            "stages=[{promote: {success: 0.5, window: 0}}]",
+            "stage 1: promote.window: expected a whole number in [1, 1e6], got 0",
+        ),
+        (
+            "stages=[{promote: {success: '0.5'}}]",
+            "stage 1: promote.success: expected a number in (0, 1] or null, got '0.5'",
+        ),
+        ("algo=[ppo]", "algo: expected ppo or a2c or sac or td3 or ddpg or dqn or tqc or crossq or recurrent_ppo, "),
         ("stage=[]", "no key 'stage'. Did you mean 'stages'? Keys here: "),
     ],
 )
 def test_values_that_cannot_be(setting, told):
     message = refused(None, [setting])
-    assert message.startswith(f"recipe: {told}")
+    assert message.startswith(f"command line: {told}")
 
 
 def test_a_key_that_never_ends():
@@ -149,8 +156,8 @@ def test_a_key_that_never_ends():
 def test_every_number_is_a_finite_one(name, value):
     section = "policy_kwargs" if name == "log_std_init" else "algo_kwargs"
     message = refused(None, [f"{section}.{name}={value}"])
-    assert message.startswith(f"recipe: {section}.{name}: ")
-    assert " is not in " in message or "expected a number" in message
+    assert message.startswith(f"command line: {section}.{name}: ")
+    assert ": expected a number" in message
 
 
 NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
@@ -159,66 +166,121 @@ NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
 @pytest.mark.parametrize(
     ("algo", "setting", "told"),
     [
-        ("ppo", "learning_rate=3", "3 is not in (0, 1]"),
-        ("ppo", "learning_rate=0", "0 is not in (0, 1]"),
-        ("ppo", "learning_rate=lin_-3e-4", "'lin_-3e-4' is not lin_ and a number in (0, 1], such as lin_0.1"),
-        ("ppo", "learning_rate=lin_inf", "'lin_inf' is not lin_ and a number in (0, 1]"),
-        ("ppo", "learning_rate=lin_", "'lin_' is not lin_ and a number in (0, 1]"),
-        ("ppo", "learning_rate=linear", "expected a number or lin_ and a number, got 'linear'"),
-        ("ppo", "gamma=99", "99 is not in (0, 1]"),
-        ("ppo", "gae_lambda=1.5", "1.5 is not in [0, 1]"),
-        ("ppo", "n_epochs=0", "0 is not in [1, 1e+09]"),
-        ("ppo", "batch_size=0", "0 is not in [2, 1e+09]"),
-        ("ppo", "n_steps=1.5", "expected a whole number, got 1.5"),
-        ("ppo", "ent_coef=auto", "expected a number, got 'auto'"),
-        ("ppo", "vf_coef=-1", "-1 is not in [0, inf]"),
-        ("ppo", "clip_range=-1", "-1 is not in (0, 10]"),
-        ("ppo", "clip_range_vf=0", "0 is not in (0, inf]"),
-        ("ppo", "target_kl=0", "0 is not in (0, inf]"),
+        ("ppo", "learning_rate=3", "expected a number in (0, 1] or lin_NUMBER, got 3"),
+        ("ppo", "learning_rate=0", "expected a number in (0, 1] or lin_NUMBER, got 0"),
+        ("ppo", "learning_rate=lin_-3e-4", "expected a number in (0, 1] or lin_NUMBER, got 'lin_-3e-4'"),
+        ("ppo", "learning_rate=lin_inf", "expected a number in (0, 1] or lin_NUMBER, got 'lin_inf'"),
+        ("ppo", "learning_rate=lin_", "expected a number in (0, 1] or lin_NUMBER, got 'lin_'"),
+        ("ppo", "learning_rate=linear", "expected a number in (0, 1] or lin_NUMBER, got 'linear'"),
+        ("ppo", "gamma=99", "expected a number in (0, 1], got 99"),
+        ("ppo", "gae_lambda=1.5", "expected a number in [0, 1], got 1.5"),
+        ("ppo", "n_epochs=0", "expected a whole number in [1, 1e9], got 0"),
+        ("ppo", "batch_size=0", "expected a whole number in [2, 1e9], got 0"),
+        ("ppo", "n_steps=1.5", "expected a whole number in [1, 1e9], got 1.5"),
+        ("ppo", "ent_coef=auto", "expected a number >= 0, got 'auto'"),
+        ("ppo", "vf_coef=-1", "expected a number >= 0, got -1"),
+        ("ppo", "clip_range=-1", "expected a number in (0, 10] or lin_NUMBER, got -1"),
+        ("ppo", "clip_range_vf=0", "expected a number > 0 or lin_NUMBER or null, got 0"),
+        ("ppo", "target_kl=0", "expected a number > 0 or null, got 0"),
         ("ppo", "normalize_advantage=1", "expected true or false, got 1"),
-        ("ppo", "use_sde=on", "expected true or false, got on"),
-        ("ppo", "sde_sample_freq=-2", "-2 is not in [1, 1e+09]"),
-        ("ppo", "stats_window_size=0", "0 is not in [1, 1e+09]"),
-        ("a2c", "rms_prop_eps=0", "0 is not in (0, 1]"),
+        ("ppo", "use_sde=on", "expected true or false, got 'on'"),
+        ("ppo", "sde_sample_freq=-2", "expected a whole number in [1, 1e9] or -1, got -2"),
+        ("ppo", "stats_window_size=0", "expected a whole number in [1, 1e9], got 0"),
+        ("a2c", "rms_prop_eps=0", "expected a number in (0, 1], got 0"),
         ("a2c", "use_rms_prop=null", "expected true or false, got None"),
-        ("sac", "ent_coef=autoo", "expected a number or auto, got 'autoo'"),
-        ("sac", "ent_coef=auto_-1", "'auto_-1' is not auto_ and a number in [0, inf], such as auto_0.1"),
-        ("sac", "ent_coef=-1", "-1 is not in [0, inf]"),
-        ("sac", "tau=0", "0 is not in (0, 1]"),
-        ("sac", "buffer_size=0", "0 is not in [1, 1e+15]"),
-        ("sac", "train_freq=0", "0 is not in [1, 1e+09]"),
-        ("sac", "train_freq=[1]", "expected a number of steps, or a pair such as [1, episode], got [1]"),
-        ("sac", "train_freq=[1, year]", "expected a number of steps, or a pair such as [1, episode], got [1, 'year']"),
+        ("sac", "ent_coef=autoo", "expected a number >= 0 or auto or auto_NUMBER, got 'autoo'"),
+        ("sac", "ent_coef=auto_-1", "expected a number >= 0 or auto or auto_NUMBER, got 'auto_-1'"),
+        ("sac", "ent_coef=-1", "expected a number >= 0 or auto or auto_NUMBER, got -1"),
+        ("sac", "tau=0", "expected a number in (0, 1], got 0"),
+        ("sac", "buffer_size=0", "expected a whole number in [1, 1e15], got 0"),
+        (
+            "sac",
+            "train_freq=0",
+            "expected a whole number in [1, 1e9] or [a whole number in [1, 1e9], step or episode], such",
+        ),
+        (
+            "sac",
+            "train_freq=[1]",
+            "expected a whole number in [1, 1e9] or [a whole number in [1, 1e9], step or episode], such",
+        ),
+        (
+            "sac",
+            "train_freq=[1, year]",
+            "expected a whole number in [1, 1e9] or [a whole number in [1, 1e9], step or episode], such",
+        ),
         ("sac", "train_freq=[1, episode]", "[1, 'episode'] counts the episodes of one environment, and n_envs is 8; "),
-        ("sac", "gradient_steps=-2", "-2 is not in [1, 1e+09]"),
-        ("sac", "gradient_steps=0", "0 is not in [1, 1e+09]"),
-        ("sac", "learning_starts=-1", "-1 is not in [0, 1e+09]"),
+        ("sac", "gradient_steps=-2", "expected a whole number in [1, 1e9] or -1, got -2"),
+        ("sac", "gradient_steps=0", "expected a whole number in [1, 1e9] or -1, got 0"),
+        ("sac", "learning_starts=-1", "expected a whole number in [0, 1e9], got -1"),
         ("sac", "target_entropy=low", "expected a number or auto, got 'low'"),
-        ("sac", "target_entropy=.nan", "nan is not in [-inf, inf]"),
+        ("sac", "target_entropy=.nan", "expected a number or auto, got nan"),
         ("sac", "optimize_memory_usage=true", "not supported: checkpoints need the whole buffer; leave it out"),
-        ("td3", "action_noise=-1", "-1 is not in [0, inf]"),
-        ("td3", "action_noise=.nan", "nan is not in [0, inf]"),
-        ("td3", "policy_delay=0", "0 is not in [1, 1e+09]"),
-        ("td3", "target_noise_clip=-0.5", "-0.5 is not in [0, inf]"),
-        ("dqn", "exploration_final_eps=2", "2 is not in [0, 1]"),
-        ("dqn", "target_update_interval=0", "0 is not in [1, 1e+09]"),
+        ("td3", "action_noise=-1", "expected a number >= 0 or null, got -1"),
+        ("td3", "action_noise=.nan", "expected a number >= 0 or null, got nan"),
+        ("td3", "policy_delay=0", "expected a whole number in [1, 1e9], got 0"),
+        ("td3", "target_noise_clip=-0.5", "expected a number >= 0, got -0.5"),
+        ("dqn", "exploration_final_eps=2", "expected a number in [0, 1], got 2"),
+        ("dqn", "target_update_interval=0", "expected a whole number in [1, 1e9], got 0"),
         ("tqc", "top_quantiles_to_drop_per_net=25", "25 of 25 leaves nothing; it must be below "),
-        ("ppo", "net_arch=[-1]", "-1 is not in [1, 65536]"),
-        ("ppo", "net_arch=[0]", "0 is not in [1, 65536]"),
-        ("ppo", "net_arch=[a]", "expected a whole number, got 'a'"),
-        ("ppo", "net_arch=64", "expected a list of layer widths, such as [64, 64], got 64"),
-        ("ppo", "net_arch={pi: [64]}", f"{NETWORK}{{'pi': [64]}}"),
-        ("ppo", "net_arch={pi: [64], qf: [64]}", f"{NETWORK}{{'pi': [64], 'qf': [64]}}"),
-        ("ppo", "net_arch={pi: [64], vf: [0]}", "0 is not in [1, 65536]"),
-        ("dqn", "net_arch={pi: [64], qf: [64]}", "expected a list of layer widths, such as [64, 64], got {"),
-        ("ppo", "log_std_init=100", "100 is not in [-20, 10]"),
-        ("ppo", "activation_fn=[tanh]", "expected a name, such as tanh, got ['tanh']"),
-        ("ppo", "features_extractor_kwargs={features_dim: 0}", "0 is not in [1, 65536]"),
-        ("ppo", "features_extractor_kwargs={feature_dim: 9}", "no key 'feature_dim'. Did you mean 'features_dim'?"),
-        ("sac", "n_critics=1e6", "1000000.0 is not in [1, 100]"),
-        ("recurrent_ppo", "lstm_hidden_size=0", "0 is not in [1, 65536]"),
-        ("recurrent_ppo", "lstm_kwargs={device: meta}", "no key 'device'. Keys here: dropout, bias"),
-        ("tqc", "n_quantiles=0", "0 is not in [1, 10000]"),
+        (
+            "ppo",
+            "net_arch=[-1]",
+            "expected a list, each element a whole number in [1, 65536] or a mapping of pi, vf or null,",
+        ),
+        (
+            "ppo",
+            "net_arch=[0]",
+            "expected a list, each element a whole number in [1, 65536] or a mapping of pi, vf or null,",
+        ),
+        (
+            "ppo",
+            "net_arch=[a]",
+            "expected a list, each element a whole number in [1, 65536] or a mapping of pi, vf or null,",
+        ),
+        (
+            "ppo",
+            "net_arch=64",
+            "expected a list, each element a whole number in [1, 65536] or a mapping of pi, vf or null,",
+        ),
+        (
+            "ppo",
+            "net_arch={pi: [64]}",
+            "expected a list, each element a whole number in [1, 65536] or a mapping of pi, vf or null,",
+        ),
+        (
+            "ppo",
+            "net_arch={pi: [64], qf: [64]}",
+            "expected a list, each element a whole number in [1, 65536] or a mapping of pi, vf or null,",
+        ),
+        (
+            "ppo",
+            "net_arch={pi: [64], vf: [0]}",
+            "expected a list, each element a whole number in [1, 65536] or a mapping of pi, vf or null,",
+        ),
+        (
+            "dqn",
+            "net_arch={pi: [64], qf: [64]}",
+            "expected a list, each element a whole number in [1, 65536] or null, got {'pi': [64], 'qf':",
+        ),
+        ("ppo", "log_std_init=100", "expected a number in [-20, 10], got 100"),
+        ("ppo", "activation_fn=[tanh]", "expected tanh or relu or elu or leaky_relu or silu or gelu, got ['tanh']"),
+        ("ppo", "features_extractor_kwargs={features_dim: 0}", "expected a whole number in [1, 65536], got 0"),
+        (
+            "ppo",
+            "features_extractor_kwargs={feature_dim: 9}",
+            "feature_dim' for ppo. Did you mean 'features_dim'? Keys here: features_dim, ",
+        ),
+        ("sac", "n_critics=1e6", "expected a whole number in [1, 100], got 1000000.0"),
+        ("recurrent_ppo", "lstm_hidden_size=0", "expected a whole number in [1, 65536], got 0"),
+        (
+            "recurrent_ppo",
+            "lstm_kwargs={device: meta}",
+            "no key 'policy_kwargs.lstm_kwargs.device' for recurrent_ppo. Keys here: dropout, bias.",
+        ),
+        ("ppo", "activation_fn=tahn", "silu or gelu, got 'tahn'. Did you mean 'tanh'?"),
+        ("ppo", "gama=0.9", "no key 'algo_kwargs.gama' for ppo. Did you mean 'gamma'? Keys here: learning_rate, "),
+        ("dqn", "use_sde=true", "no key 'algo_kwargs.use_sde' for dqn."),
+        ("tqc", "n_quantiles=0", "expected a whole number in [1, 10000], got 0"),
     ],
 )
 def test_hyperparameters_that_make_no_sense(algo, setting, told):
@@ -226,8 +288,8 @@ def test_hyperparameters_that_make_no_sense(algo, setting, told):
     of_the_network = name.startswith(("net_", "log_std", "activation", "features", "n_crit", "lstm", "n_quant"))
     section = "policy_kwargs" if of_the_network else "algo_kwargs"
     message = refused(None, [f"algo={algo}", f"{section}.{setting}"])
-    assert message.startswith(f"recipe: {section}.{name}")
-    assert f": {told}" in message
+    assert message.startswith((f"command line: {section}.{name}", f"command line: no key '{section}.{name}"))
+    assert told in message
 
 
 def not_built(task, root, settings):
@@ -244,13 +306,10 @@ def not_built(task, root, settings):
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        (["algo=sac", "algo_kwargs.buffer_size=1e12"], "algo_kwargs.buffer_size: 1000000000000.0 needs 40,000 GB of "),
+        (["algo=sac", "algo_kwargs.buffer_size=1e12"], "algo_kwargs.buffer_size: 1000000000000 needs 40,000 GB of "),
         (["algo=sac", "algo_kwargs.batch_size=1e9", "algo_kwargs.learning_starts=9"], "algo_kwargs.batch_size: "),
-        (["algo_kwargs.n_steps=1e9"], "algo_kwargs.n_steps: 1000000000.0 needs 80 GB of memory, and "),
+        (["algo_kwargs.n_steps=1e9"], "algo_kwargs.n_steps: 1000000000 needs 80 GB of memory, and "),
         (["policy_kwargs.net_arch=[65536, 65536, 65536]"], "policy_kwargs: this network needs 275 GB of memory, and "),
-        (["policy_kwargs.activation_fn=tahn"], "policy_kwargs.activation_fn: no activation 'tahn'. Did you mean"),
-        (["algo_kwargs.gama=0.9"], "algo_kwargs.gama: ppo has no parameter 'gama'. Did you mean 'gamma'?"),
-        (["algo=dqn", "algo_kwargs.use_sde=true"], "algo_kwargs.use_sde: dqn has no parameter 'use_sde'."),
         (["algo=dqn"], "dqn cannot be used here: "),
         (["policy_kwargs.squash_output=true"], "ppo cannot be used here: squash_output=True is only available when"),
     ],

@@ -42,14 +42,18 @@ RULE = {"success": 0.8, "window": 100}
         ),
         (
             [{"promote": {"success": 80}}, {}],
-            "recipe: stage 1: promote.success: should be less than or equal to 1, got 80",
+            "recipe: stage 1: promote.success: expected a number in (0, 1] or null, got 80",
         ),
         (
             [{"promote": {**RULE, "window": 0}}, {}],
-            "recipe: stage 1: promote.window: should be greater than or equal to 1, got 0",
+            "recipe: stage 1: promote.window: expected a whole number in [1, 1e6], got 0",
         ),
-        ([5], "recipe: stage 1: should be a valid dictionary or instance of Stage, got 5"),
-        ({"task": {}}, "recipe: stages: should be a valid list, got {'task': {}}"),
+        ([5], "recipe: stage 1: expected a mapping of task, reward_weights, events, level, promote, got 5"),
+        (
+            {"task": {}},
+            "recipe: stages: expected a list, each element a mapping of task, reward_weights, events, level, promote, "
+            "got {'task': {}}",
+        ),
     ],
 )
 def test_refused_stages_are_named(stages, told):

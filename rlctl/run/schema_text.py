@@ -1,0 +1,95 @@
+"""What a JSON schema says of a value, in words: for messages about a recipe, and for the page that describes one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from rlctl.run import yaml_text
+
+Schema = dict[str, Any]
+
+
+def find_schema(root: Schema, path: Sequence[str | int]) -> Schema:
+    """Return the part of a schema that describes the value at `path`, or the closest value around it."""
+    return _descend(root, path)[0]
+
+
+def find_depth(root: Schema, path: Sequence[str | int]) -> int:
+    """Return how many parts of `path` a schema has; what comes after are names that pydantic has for types."""
+    return _descend(root, path)[1]
+
+
+def _descend(root: Schema, path: Sequence[str | int]) -> tuple[Schema, int]:
+    node = root
+    for depth, part in enumerate(path):
+        inner = next((each for each in (_inside(one, part) for one in _alternatives(root, node)) if each), None)
+        if inner is None:
+            return node, depth
+        node = inner
+    return node, len(path)
+
+
+def _inside(node: Schema, part: str | int) -> Schema | None:
+    if isinstance(part, int):
+        return node.get("items")
+    own: Schema | None = node.get("properties", {}).get(part)
+    others = node.get("additionalProperties")
+    return own or (others if isinstance(others, dict) else None)
+
+
+def list_keys(root: Schema, node: Schema) -> list[str]:
+    """Return the keys that a mapping may have; none if `node` describes no mapping, or one of any keys."""
+    return next((list(each["properties"]) for each in _alternatives(root, node) if "properties" in each), [])
+
+
+def describe_value(root: Schema, node: Schema) -> str:
+    """Return what a value must be: `a number in (0, 1]`, `a whole number in [1, 1e9] or -1`."""
+    return " or ".join(dict.fromkeys(_describe(root, each) for each in _alternatives(root, node)))
+
+
+def _alternatives(root: Schema, node: Schema) -> Iterator[Schema]:
+    if "$ref" in node:
+        yield from _alternatives(root, root["$defs"][node["$ref"].rpartition("/")[2]])
+    elif "anyOf" in node:
+        for each in node["anyOf"]:
+            yield from _alternatives(root, each)
+    else:
+        yield node
+
+
+def _describe(root: Schema, node: Schema) -> str:
+    if "const" in node:
+        return yaml_text.dump(node["const"]).partition("\n")[0]
+    if "enum" in node:
+        return " or ".join(map(str, node["enum"]))
+    if "pattern" in node:
+        return str(node["pattern"])
+    if "prefixItems" in node:
+        return f"[{', '.join(describe_value(root, each) for each in node['prefixItems'])}]"
+    kind = node.get("type")
+    if kind in ("integer", "number"):
+        return f"{'a whole number' if kind == 'integer' else 'a number'}{_range(node)}"
+    if kind == "array":
+        return f"a list, each element {describe_value(root, node['items'])}"
+    if kind == "object":
+        keys = list_keys(root, node)
+        return f"a mapping of {', '.join(keys)}" if keys else "a mapping"
+    return {"boolean": "true or false", "null": "null", "string": "text"}.get(str(kind), "any value")
+
+
+def _range(node: Schema) -> str:
+    low, above = node.get("minimum", node.get("ge")), node.get("exclusiveMinimum", node.get("gt"))
+    high, below = node.get("maximum", node.get("le")), node.get("exclusiveMaximum", node.get("lt"))
+    left = f"[{_number(low)}" if low is not None else f"({_number(above)}" if above is not None else ""
+    right = f"{_number(high)}]" if high is not None else f"{_number(below)})" if below is not None else ""
+    if left and right:
+        return f" in {left}, {right}"
+    if left:
+        return f" {'>=' if low is not None else '>'} {left[1:]}"
+    return ""
+
+
+def _number(value: float) -> str:
+    short = f"{value:.0e}".replace("e+0", "e").replace("e+", "e")
+    return short if value >= 1e6 and float(short) == value else str(value)
