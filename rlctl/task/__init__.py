@@ -4,11 +4,14 @@ from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from rlctl.task import events, rewards
 from rlctl.task.body import Body
+from rlctl.task.constraints import Attachment
 from rlctl.task.events import Event
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task
+from rlctl.task.terrain import rough_heights
 
 __all__ = [
+    "Attachment",
     "Body",
     "Box",
     "Discrete",
@@ -19,4 +22,5 @@ __all__ = [
     "Task",
     "events",
     "rewards",
+    "rough_heights",
 ]

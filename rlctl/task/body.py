@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.errors import TaskError, did_you_mean
 from rlctl.task.bullet import pybullet
-from rlctl.task.properties import Properties
+from rlctl.task.motors import Motors
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -34,7 +35,18 @@ class MassState(NamedTuple):
         return pybullet.getEulerFromQuaternion(self.orientation)  # type: ignore[no-any-return]
 
 
-class Body(Properties):
+class Contacts(NamedTuple):
+    """Points where a body touches another: one element each, none where they are apart."""
+
+    links: list[str]
+    """The body's own link, or its base."""
+    forces: Array
+    """Normal forces [N], shape (points,), 0 or more."""
+    distances: Array
+    """Distances [m], shape (points,), negative where the bodies overlap: `rewards.penetration` takes them."""
+
+
+class Body(Motors):
     """A body of the world. Joint arrays have one element per movable joint, in `joint_names` order."""
 
     def __init__(self, client: int, substeps: int, name: str, body_id: int, file: Path, fixed: bool) -> None:
@@ -43,10 +55,11 @@ class Body(Properties):
         self.id = body_id
         self.file = file
         self.fixed = fixed
+        self.inertia_from_file = False
         self.client = client
         self._substeps = substeps
-        self._motor_limits: tuple[Sequence[float], Sequence[float], float] | None = None
         self._cache: dict[Any, Any] = {}
+        self._force_sensors: set[str] = set()
         infos = [
             pybullet.getJointInfo(body_id, index, physicsClientId=client)
             for index in range(pybullet.getNumJoints(body_id, physicsClientId=client))
@@ -64,6 +77,8 @@ class Body(Properties):
         self.joint_high: Array = np.array([info[9] for info in movable])
         self.joint_max_force: Array = np.array([info[10] for info in movable])
         """Torque or force limit in the model file [N m or N], shape (joints,)."""
+        self.joint_max_speed: Array = np.array([info[11] for info in movable])
+        """Velocity limit in the model file [rad/s or m/s], shape (joints,)."""
 
     @property
     def link_names(self) -> list[str]:
@@ -92,6 +107,65 @@ class Body(Properties):
     def joint_velocities(self) -> Array:
         """Joint velocities [rad/s] or [m/s], shape (joints,)."""
         return self._joint_states()[1]
+
+    @property
+    def joint_torques(self) -> Array:
+        """Torques [N m] or forces [N] that the motors gave in the last physics step, shape (joints,).
+
+        Those of `drive_to` and `drive_at` within their force limits, and those set by `set_torques`.
+        """
+        torques: Array | None = self._cache.get("torques")
+        if torques is None:
+            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client) or ()
+            # PyBullet divides a substep's impulse by the time of the whole step.
+            torques = self._substeps * np.array([joint[3] for joint in raw])
+            if self._commanded is not None:
+                torques = np.where(np.isnan(self._commanded), torques, self._commanded)
+            self._cache["torques"] = torques
+        return torques
+
+    def add_force_sensor(self, joint: str) -> None:
+        """Measure what a joint, which may be a fixed one, carries: read it with `joint_reaction`. For `build`."""
+        pybullet.enableJointForceTorqueSensor(self.id, self._joint_number(joint), True, physicsClientId=self.client)
+        self._force_sensors.add(joint)
+
+    def joint_reaction(self, joint: str) -> Array:
+        """Return the force [N] and torque [N m] that a joint carried in the last physics step, shape (6,).
+
+        It acts on the link that the joint moves, in the axes of that link's inertial frame and about its centre of
+        mass, without the torque of the joint's own motor. A load that hangs from the joint is pulled up.
+        """
+        if joint not in self._force_sensors:
+            raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build")
+        state = pybullet.getJointState(self.id, self._joint_number(joint), physicsClientId=self.client)
+        return np.array(state[2])
+
+    def _joint_number(self, joint: str) -> int:
+        if joint not in self.all_joint_names:
+            raise TaskError(
+                f"{self.file.name} has no joint {joint!r}.{did_you_mean(joint, self.all_joint_names)} "
+                f"It has: {', '.join(self.all_joint_names) or 'none'}."
+            )
+        return self.all_joint_names.index(joint)
+
+    def solve_inverse_kinematics(
+        self, link: str, position: Sequence[float] | Array, orientation: Sequence[float] | Array | None = None
+    ) -> Array:
+        """Return joint positions [rad or m], shape (joints,), that bring a link's frame to a world pose.
+
+        `position` [m], `orientation` a quaternion (x, y, z, w), any if not given. The search starts at the present
+        joint positions and stops within 0.1 mm or after 100 iterations, also where the pose cannot be reached.
+        """
+        pose = [position] if orientation is None else [position, orientation]
+        solution = pybullet.calculateInverseKinematics(
+            self.id,
+            self._link_index(link),
+            *[list(part) for part in pose],
+            maxNumIterations=100,
+            residualThreshold=1e-4,
+            physicsClientId=self.client,
+        )
+        return np.array(solution)
 
     def _link_state(self, link: str) -> tuple[Array, Array]:
         state = self._cache.get(("link", link))  # a link may be called "base" or "joints"
@@ -144,14 +218,26 @@ class Body(Properties):
 
     def links_touching(self, other: Body) -> set[str]:
         """Return the links, or the base, in contact with `other`, which may be the body itself, at the last step."""
-        points = self._cache.get("contacts")
-        if points is None:
-            points = self._cache["contacts"] = pybullet.getContactPoints(self.id, physicsClientId=self.client)
+        points = self._contact_points()
         # A point has this body first; where it touches itself, it is there once for both links.
         numbers = {point[3] for point in points if point[2] == other.id}
         if other is self:
             numbers |= {point[4] for point in points if point[2] == self.id}
         return {self._all_names[number] for number in numbers}  # -1, the base, is the last
+
+    def contacts_with(self, other: Body) -> Contacts:
+        """Return the points where this body touches `other`, at the last physics step."""
+        points = [point for point in self._contact_points() if point[2] == other.id]
+        names = [self._all_names[point[3]] for point in points]
+        # PyBullet divides a substep's impulse by the time of the whole step.
+        forces = np.array([point[9] for point in points]) * self._substeps
+        return Contacts(names, forces, np.array([point[8] for point in points]))
+
+    def _contact_points(self) -> Any:
+        points = self._cache.get("contacts")
+        if points is None:
+            points = self._cache["contacts"] = pybullet.getContactPoints(self.id, physicsClientId=self.client)
+        return points
 
     def _base_state(self) -> tuple[Array, Array]:
         state = self._cache.get("base")
@@ -192,64 +278,3 @@ class Body(Properties):
             physicsClientId=self.client,
         )
         self._cache.clear()
-
-    def drive_to(
-        self, positions: Array, *, max_speed: Sequence[float], max_force: Sequence[float], gain: float = 0.1
-    ) -> None:
-        """Set position targets [rad or m] of every joint; speed [rad/s or m/s] and force [N m or N] are limited.
-
-        `gain` is the part of the position error that a physics step takes away, in (0, 1].
-        """
-        limits = (max_speed, max_force, gain)
-        if self._motor_limits != limits:
-            self._limit_motors(max_speed, max_force, gain)
-            self._motor_limits = limits
-        pybullet.setJointMotorControlArray(
-            self.id,
-            self.joint_indices,
-            pybullet.POSITION_CONTROL,
-            targetPositions=positions.tolist(),  # half the time of an array
-            forces=self._apply_strength(self._motor_impulses),
-            positionGains=self._motor_gains,
-            physicsClientId=self.client,
-        )
-
-    def _limit_motors(self, max_speed: Sequence[float], max_force: Sequence[float], gain: float) -> None:
-        # PyBullet makes an impulse of a motor's force with the time of a whole step, and gives it in every substep.
-        self._motor_impulses = [force / self._substeps for force in max_force]
-        self._motor_gains = [gain] * len(self.joint_indices)
-        # Only the call for one joint takes a speed; the motor keeps it when the call for all sets the targets.
-        for index, speed in zip(self.joint_indices, max_speed, strict=True):
-            pybullet.setJointMotorControl2(
-                self.id, index, pybullet.POSITION_CONTROL, maxVelocity=speed, physicsClientId=self.client
-            )
-
-    def disable_motors(self) -> None:
-        """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves it."""
-        count = len(self.joint_indices)
-        pybullet.setJointMotorControlArray(
-            self.id,
-            self.joint_indices,
-            pybullet.POSITION_CONTROL,
-            forces=[0.0] * count,
-            positionGains=[0.1] * count,
-            velocityGains=[0.1] * count,
-            physicsClientId=self.client,
-        )
-
-    def set_torques(self, torques: Array) -> None:
-        """Turn or push the joints with `torques` [N m or N], shape (joints,), in all substeps of the next step.
-
-        For a body whose motors are disabled: see `disable_motors`.
-        """
-        pybullet.setJointMotorControlArray(
-            self.id,
-            self.joint_indices,
-            pybullet.TORQUE_CONTROL,
-            forces=self._apply_strength(torques.tolist()),
-            physicsClientId=self.client,
-        )
-
-    def cap_joint_speed(self, speed: float) -> None:
-        """Never let a joint, whatever pushes it, turn or slide faster than `speed` [rad/s or m/s]."""
-        pybullet.changeDynamics(self.id, -1, maxJointVelocity=speed, physicsClientId=self.client)

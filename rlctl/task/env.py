@@ -82,6 +82,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise
         self.observation_sizes = {name: int(np.size(value)) for name, value in first.items()}
         self._shapes = {name: np.shape(value) for name, value in first.items()}
+        # Camera pictures: bytes, as every library that takes images expects them.
+        self._pictures = {name for name, value in first.items() if np.asarray(value).dtype == np.uint8}
         self.observation_space = self._make_observation_space()
 
     def set_level(self, level: float) -> None:
@@ -115,7 +117,12 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
         if task.observation_layout == "dict":
             return spaces.Dict(
-                {name: spaces.Box(*bounds(name), shape, np.float32) for name, shape in self._shapes.items()}
+                {
+                    name: spaces.Box(0, 255, shape, np.uint8)
+                    if name in self._pictures
+                    else spaces.Box(*bounds(name), shape, np.float32)
+                    for name, shape in self._shapes.items()
+                }
             )
         low = np.concatenate([np.full(size, bounds(name)[0]) for name, size in self.observation_sizes.items()])
         high = np.concatenate([np.full(size, bounds(name)[1]) for name, size in self.observation_sizes.items()])
@@ -195,10 +202,13 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise TaskError(f"{self.name}: action is not finite at step {self._step + 1}")
         return action
 
+    def _dtype(self, name: str) -> type[np.uint8] | type[np.float32]:
+        return np.uint8 if name in self._pictures else np.float32
+
     def _observe(self) -> Observation:
         parts = self._signals.observe(self.task.observe())
         if self.task.observation_layout == "dict":
-            dictionary = {name: np.array(value, np.float32) for name, value in parts.items()}
+            dictionary: dict[str, Any] = {name: np.array(value, self._dtype(name)) for name, value in parts.items()}
             if {name: value.shape for name, value in dictionary.items()} != self._shapes:
                 raise self._shape_mismatch(parts)
             if not all(math.isfinite(value.sum()) for value in dictionary.values()):

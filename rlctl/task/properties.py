@@ -85,9 +85,9 @@ class Properties:
             colors[shape[1], index] = shape[7]
         return colors
 
-    def _apply_strength(self, forces: list[float]) -> list[float]:
-        # What the motors give of what they are asked for: one element per joint.
-        return forces if self.motor_strength is None else (self.motor_strength * forces).tolist()
+    def _apply_strength(self, forces: list[float], joints: list[int]) -> list[float]:
+        # What the motors give of what they are asked for: one element per index in `joints`.
+        return forces if self.motor_strength is None else (self.motor_strength[joints] * forces).tolist()
 
     def _change(self, link: int, **values: object) -> None:
         pybullet.changeDynamics(self.id, link, **values, physicsClientId=self.client)

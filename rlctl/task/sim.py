@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError, did_you_mean
 from rlctl.task.body import Array, Body
 from rlctl.task.bullet import pybullet, pybullet_data
+from rlctl.task.constraints import Constraints
 
 
 @dataclasses.dataclass
@@ -27,7 +28,7 @@ class _Push:
     steps: int  # control steps that it still acts
 
 
-class Sim:
+class Sim(Constraints):
     """A PyBullet world of its own.
 
     `control_dt` [s] is simulated by one call with `substeps` physics steps: forces then act on every one of them.
@@ -38,6 +39,7 @@ class Sim:
         if self.client < 0:
             raise TaskError("PyBullet could not open a window: is there a display? Leave out --gui to do without.")
         self.bodies: dict[str, Body] = {}
+        self._substeps = substeps
         self._settings = {
             "fixedTimeStep": control_dt,
             "numSubSteps": substeps,
@@ -75,18 +77,22 @@ class Sim:
         fixed: bool = False,
         flags: int = 0,
         self_collision: bool = False,
+        inertia: Literal["file", "shape"] = "file",
     ) -> Body:
         """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or a name in `pybullet_data`.
 
         `position` [m], `orientation` and `fixed` are for URDF: the others say themselves where a body is and whether
         it is fixed. `flags` are PyBullet's URDF_* flags. `self_collision` lets links collide that are not each
-        other's ancestors.
+        other's ancestors. `inertia` of a URDF's links is what the file says, or that of their collision shapes with
+        the file's masses, for a file whose values are no good: see `rlctl.task.inertia`.
         """
         path = Path(file)
         if not path.is_absolute() and not path.exists():
             path = Path(pybullet_data.getDataPath()) / file
         if not path.exists():
             raise TaskError(f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data")
+        if path.suffix == ".urdf" and inertia == "file":
+            flags |= pybullet.URDF_USE_INERTIA_FROM_FILE
         if self_collision:
             flags |= pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
         if path.suffix in (".xml", ".sdf"):
@@ -97,8 +103,12 @@ class Sim:
             fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0
         else:
             body_id = self._call_loader(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
-        self.bodies[name] = Body(self.client, int(self._settings["numSubSteps"]), name, body_id, path, fixed)
-        return self.bodies[name]
+        body = self.bodies[name] = Body(self.client, self._substeps, name, body_id, path, fixed)
+        body.inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
+        speeds = body.joint_max_speed
+        if path.suffix == ".urdf" and fixed and speeds.size and (speeds > 0).all():
+            body.cap_joint_speed(float(speeds.max()))
+        return body
 
     def _load_scene(self, path: Path, flags: int) -> int:
         if path.suffix == ".xml":
@@ -184,6 +194,30 @@ class Sim:
         self._saved = self._built_gravity = None
         self._prepare()
 
+    def add_height_field(
+        self, name: str, heights: Array, *, cell: float, color: Sequence[float] = (0.55, 0.6, 0.5)
+    ) -> Body:
+        """Add rough ground: `heights` [m] of shape (along x, along y), above z = 0, `cell` [m] apart, centred at 0, 0.
+
+        `rlctl.task.terrain` makes heights from a seed.
+        """
+        rows, columns = heights.shape
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_HEIGHTFIELD,
+            meshScale=(cell, cell, 1.0),
+            heightfieldTextureScaling=rows / 2,
+            heightfieldData=heights.T.ravel().tolist(),  # x goes fastest
+            numHeightfieldRows=rows,
+            numHeightfieldColumns=columns,
+            physicsClientId=self.client,
+        )
+        # Bullet puts the middle between the lowest and the highest point at the origin.
+        middle = (0.0, 0.0, float(heights.min() + heights.max()) / 2)
+        body_id = pybullet.createMultiBody(0, shape, basePosition=middle, physicsClientId=self.client)
+        pybullet.changeVisualShape(body_id, -1, rgbaColor=(*color, 1), physicsClientId=self.client)
+        self.bodies[name] = Body(self.client, self._substeps, name, body_id, Path("height field"), True)
+        return self.bodies[name]
+
     def add_marker(self, position: Sequence[float], radius: float, color: Sequence[float]) -> int:
         """Add a sphere that is seen but touches nothing; returns its id, for `move_marker`."""
         shape = pybullet.createVisualShape(
@@ -198,10 +232,23 @@ class Sim:
         """Move a marker to a world position [m]."""
         pybullet.resetBasePositionAndOrientation(marker, position, (0, 0, 0, 1), physicsClientId=self.client)
 
-    def render(self, width: int = 320, height: int = 240) -> NDArray[np.uint8]:
-        """Draw the world on the CPU: an RGB image of shape (height, width, 3). Takes 20-40 ms."""
-        view = pybullet.computeViewMatrix((1.5, 1.1, 1.1), (0.2, 0.0, 0.4), (0, 0, 1))
-        projection = pybullet.computeProjectionMatrixFOV(45.0, width / height, 0.05, 10.0)
+    def render(
+        self,
+        width: int = 320,
+        height: int = 240,
+        *,
+        eye: Sequence[float] = (1.5, 1.1, 1.1),
+        target: Sequence[float] = (0.2, 0.0, 0.4),
+        up: Sequence[float] = (0.0, 0.0, 1.0),
+        field_of_view: float = 45.0,
+    ) -> NDArray[np.uint8]:
+        """Draw the world on the CPU: an RGB image of shape (height, width, 3); a camera's picture in `Task.observe`.
+
+        The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees]. Takes 20-40 ms
+        at 320x240.
+        """
+        view = pybullet.computeViewMatrix(eye, target, up)
+        projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
         image = pybullet.getCameraImage(
             width,
             height,

@@ -28,8 +28,8 @@ class Task:
     substeps: ClassVar[int] = 4
     """Physics steps per action; each takes `control_dt / substeps`."""
     solver_iterations: ClassVar[int] = 50
-    episode_s: ClassVar[float] = 5.0
-    """Time limit of an episode [s]; reaching it truncates, never terminates."""
+    episode_s: float = 5.0
+    """Time limit of an episode [s]; reaching it truncates, never terminates. Annotated in a task, a parameter of it."""
     action_space: ClassVar[spaces.Space[Any]]
     action_meaning: ClassVar[str] = ""
     observation_layout: ClassVar[Literal["flat", "dict"]] = "flat"

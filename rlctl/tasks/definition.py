@@ -56,10 +56,14 @@ class Definition:
     observation_layout: str
     rewards: list[RewardTerm]
     events: list[OfferedEvent]
+    model_faults: list[str]
+    """Links of its URDFs whose mass or inertia is missing or impossible."""
 
 
 def definition_of(env: TaskEnv) -> Definition:
     """Read a task's definition off the environment that was built for it."""
+    from rlctl.task.inertia import find_inertia_faults
+
     task = env.task
     return Definition(
         robot=task.robot,
@@ -73,6 +77,7 @@ def definition_of(env: TaskEnv) -> Definition:
             RewardTerm(name, weight, float(task.reward_weights[name])) for name, weight in env.reward_weights.items()
         ],
         events=[_event(name, event, env.events.get(name)) for name, event in task.events.items()],
+        model_faults=[fault for body in env.sim.bodies.values() for fault in find_inertia_faults(body)],
     )
 
 

@@ -37,6 +37,8 @@ def show(description: Description, json: str | None) -> None:
     if definition is not None:
         _section(out, "reward terms", _rewards(definition))
         _section(out, "events", [_event(each) for each in definition.events], none="none")
+        if definition.model_faults:
+            _section(out, "model files", [(fault,) for fault in definition.model_faults])
     if description.recipe.stages:
         _section(out, "stages", [_stage(number, each) for number, each in enumerate(description.recipe.stages, 1)])
     _section(out, f"recipe  {description.recipe_file or 'none packaged; the defaults'}", ())

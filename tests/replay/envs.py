@@ -25,7 +25,7 @@ class Tumble(Task):
 
     def build(self, sim: Sim) -> None:
         sim.load("ground", "plane.urdf", fixed=True)
-        self.cube = sim.load("cube", "cube_small.urdf", position=(0.5, 0.2, 0.4))
+        self.cube = sim.load("cube", "cube_small.urdf", position=(0.5, 0.2, 0.4), inertia="shape")
         sim.load("car", self.car, position=(-0.5, 0.0, 0.1))
 
     def reset(self, rng: np.random.Generator) -> None:

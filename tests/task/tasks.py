@@ -139,7 +139,7 @@ class Cart(Task):
 
     def build(self, sim: Sim) -> None:
         self.plane = sim.load("plane", "plane.urdf", fixed=True)
-        self.cube = sim.load("cube", "cube_small.urdf", position=(0.0, 0.0, 0.1))
+        self.cube = sim.load("cube", "cube_small.urdf", position=(0.0, 0.0, 0.1), inertia="shape")
 
     def reset(self, rng):
         self.cube.set_base((0.0, 0.0, 0.1 + 0.1 * rng.random()))
@@ -165,7 +165,10 @@ class Pile(Task):
     def build(self, sim: Sim) -> None:
         sim.load("plane", "plane.urdf", fixed=True)
         files = [self.models[i % len(self.models)] for i in range(self.pieces_count)]
-        self.pieces = [sim.load(f"piece{i}", file, position=(0.0, 0.0, 0.2 * i)) for i, file in enumerate(files, 1)]
+        self.pieces = [
+            sim.load(f"piece{i}", file, position=(0.0, 0.0, 0.2 * i), inertia="shape")
+            for i, file in enumerate(files, 1)
+        ]
 
     def reset(self, rng):
         for i, piece in enumerate(self.pieces):

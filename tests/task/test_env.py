@@ -1,6 +1,7 @@
 """One step of a task: its arithmetic, its flags, and what it says when something is wrong."""
 
 import math
+from dataclasses import dataclass
 
 import gymnasium
 import numpy as np
@@ -158,11 +159,22 @@ def test_a_definition_must_not_be_annotated():
     with pytest.raises(TaskError) as caught:
 
         class Wrong(Task):
-            episode_s: float = 3.0
+            substeps: int = 3
 
     assert str(caught.value) == (
-        "Wrong.episode_s is annotated, which would make it a parameter: write `episode_s = ...` without the annotation"
+        "Wrong.substeps is annotated, which would make it a parameter: write `substeps = ...` without the annotation"
     )
+
+
+def test_the_time_limit_may_be_a_parameter(make):
+    @dataclass
+    class Patient(Slider):
+        episode_s: float = 3.0
+
+    assert make(Slider()).max_steps == 5  # 0.5 s / 0.1 s
+    assert make(Patient()).max_steps == 30
+    assert make(Patient(episode_s=1.0)).max_steps == 10
+    assert list(Patient.parameters()) == ["start", "fault", "episode_s"]
 
 
 def test_spaces_are_not_shared_between_instances(make):

@@ -5,7 +5,7 @@ import pytest
 from rlctl.errors import RecipeError, TaskError
 from rlctl.task import Event, events
 from rlctl.task.env import TaskEnv
-from rlctl.task.events import EventSettings
+from rlctl.task.events import EventSettings, Range
 from tests.task.tasks import Cart, Slider
 from tests.task.test_changes import Arm
 
@@ -96,7 +96,11 @@ def test_what_a_recipe_gets_wrong_is_found_when_the_environment_is_built(changes
     assert str(caught.value) == message
 
 
-def forgets_its_draw(sim, rng, *, size):
+def untyped(sim, rng, *, size):
+    return {}
+
+
+def forgets_its_draw(sim, rng, *, size: Range):
     rng.uniform(*size)
 
 
@@ -120,6 +124,11 @@ def forgets_its_draw(sim, rng, *, size):
         (
             Event("reset", forgets_its_draw, enabled=True, size=(0, 1)),
             "events.e: its function must return what it drew, as numbers by name, not None",
+        ),
+        (
+            Event("reset", untyped, size=(0, 1)),
+            "events.e: 'size' of untyped has no type, so nothing can be checked. Write `size: Range` if it is drawn "
+            "from, else its type.",
         ),
         (Event("reset", events.scale_mass, body="cub", factor=1.0, enabled=True), "events.e: no body 'cub'. Did you"),
     ],

@@ -7,6 +7,7 @@ from rlctl.errors import RecipeError
 from rlctl.task import Event, events
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
+from rlctl.task.events import Range
 from tests.task.tasks import Cart
 
 
@@ -149,7 +150,7 @@ def test_a_level_that_is_none(make, level):
 
 
 def test_an_event_of_the_authors_own(make):
-    def tilt(sim, rng, *, angle):
+    def tilt(sim, rng, *, angle: Range):
         drawn = float(rng.uniform(*angle))
         sim.body("cube").set_base((0, 0, 1), (np.sin(drawn / 2), 0, 0, np.cos(drawn / 2)))
         return {"angle": drawn}

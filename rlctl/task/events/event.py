@@ -104,6 +104,12 @@ class Event:
             function = getattr(self.function, "__name__", str(self.function))
             raise error(f"{where}: {function} does not act at {self.when!r}, but at: {', '.join(possible)}.")
         for key, parameter in self._signature.items():
+            if parameter.annotation is parameter.empty:
+                function = getattr(self.function, "__name__", str(self.function))
+                raise TaskError(
+                    f"{where}: {key!r} of {function} has no type, so nothing can be checked. Write `{key}: Range` if "
+                    "it is drawn from, else its type."
+                )
             if parameter.default is parameter.empty and key not in self.parameters:
                 raise error(f"{where}: parameter {key!r} is missing. It has: {', '.join(self.parameter_names)}.")
         values = {key: self._read(f"{where}.{key}", key, value, error) for key, value in self.parameters.items()}

@@ -1,0 +1,77 @@
+"""Masses and inertias in a URDF that no real link has."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+
+import numpy as np
+
+from rlctl.task.body import Body
+from rlctl.task.bullet import pybullet
+
+_ROUNDING = 1.01  # of values written with a few digits
+
+
+def find_inertia_faults(body: Body) -> list[str]:
+    """Return a line for every link of a URDF body whose mass or inertia is missing or impossible.
+
+    A link without `<inertial>` weighs 1 kg in PyBullet. Principal moments [kg m^2] are positive, none exceeds the sum
+    of the others, and none exceeds mass x size^2, where size [m] is the diagonal of the link's collision shape.
+    """
+    if body.file.suffix != ".urdf":
+        return []
+    try:
+        root = ElementTree.fromstring(body.file.read_text().strip())
+    except ElementTree.ParseError:
+        return []  # PyBullet reads more than XML allows
+    return [f"{body.file.name}, link {name!r}: {fault}" for name, fault in _find_faults(body, root)]
+
+
+def _find_faults(body: Body, root: ElementTree.Element) -> Iterator[tuple[str, str]]:
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        index = -1 if name == body.base_name else body._links.get(name)
+        if index is None or (index == -1 and body.fixed):
+            continue  # merged with its parent, or held by the world: its mass is not used
+        if not _is_heavy(body, index):
+            continue
+        inertial = link.find("inertial")
+        if inertial is None or inertial.find("mass") is None:
+            yield name, "no <inertial>, so PyBullet gives it a mass of 1 kg. Write its mass and inertia."
+        elif body.inertia_from_file and (fault := _judge_inertia(body, index, inertial)):
+            yield name, fault
+
+
+def _is_heavy(body: Body, index: int) -> bool:
+    # Frames of a gram with a rounded-up inertia are common, keep a solver stable, and do no harm.
+    masses = [
+        pybullet.getDynamicsInfo(body.id, link, physicsClientId=body.client)[0]
+        for link in range(-1, len(body.link_names))
+    ]
+    return bool(masses[index + 1] > 0.01 * sum(masses))
+
+
+def _judge_inertia(body: Body, index: int, inertial: ElementTree.Element) -> str:
+    mass = float(inertial.find("mass").get("value", 0))  # type: ignore[union-attr]
+    element = inertial.find("inertia")
+    if mass == 0 or element is None:
+        return ""
+    ixx, iyy, izz, ixy, ixz, iyz = (float(element.get(name, 0)) for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+    moments = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])  # rising
+    written = ", ".join(f"{moment:.3g}" for moment in moments)
+    if moments[0] <= 0:
+        return f"principal moments {written} kg m^2 are not all above 0, as those of a link of {mass:g} kg are."
+    if moments[2] > _ROUNDING * (moments[0] + moments[1]):
+        return f"principal moments {written} kg m^2: the largest exceeds the sum of the others, as in no solid."
+    if not pybullet.getCollisionShapeData(body.id, index, physicsClientId=body.client):
+        return ""
+    low, high = pybullet.getAABB(body.id, index, physicsClientId=body.client)
+    size = float(np.linalg.norm(np.subtract(high, low)))
+    most = mass * size**2
+    if moments[2] > _ROUNDING * most:
+        return (
+            f"a moment of {moments[2]:.3g} kg m^2 is more than {mass:g} kg within {size:.2g} m can have "
+            f"({most:.2g}). Mend the file, or load it with inertia='shape'."
+        )
+    return ""

@@ -1,0 +1,156 @@
+"""What drives the joints of a body: position, velocity and torque control, limits, and the torques applied."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError
+from rlctl.task.bullet import pybullet
+from rlctl.task.properties import Properties
+
+Array = NDArray[np.float64]
+
+
+class _Plan(NamedTuple):
+    # What a call of `drive_to` repeats.
+    limits: tuple[object, ...]
+    joints: list[int]
+    links: list[int]
+    impulses: list[float]  # force of a substep [N m or N]
+    gains: list[float]
+
+
+class Motors(Properties):
+    """The part of `Body` that drives its joints.
+
+    `joints` are names; none means all, in `joint_names` order. Arrays have one element per joint that is named. Forces
+    are in [N m], of sliding joints in [N]; speeds in [rad/s], of sliding joints in [m/s].
+    """
+
+    joint_max_force: Array
+    joint_max_speed: Array
+    _substeps: int
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._plans: dict[tuple[str, ...], _Plan] = {}
+        self._commanded: Array | None = None  # by `set_torques`, shape (all joints,); NaN: the motor's
+
+    def _restore_nominal(self) -> None:
+        super()._restore_nominal()
+        self._commanded = None
+
+    def drive_to(
+        self,
+        positions: Array,
+        *,
+        max_speed: Sequence[float] | None = None,
+        max_force: Sequence[float] | None = None,
+        gain: float = 0.1,
+        joints: Sequence[str] = (),
+    ) -> None:
+        """Set position targets [rad or m]; speed and force are limited, by the model file's limits if not given.
+
+        `gain` is the part of the position error that a physics step takes away, in (0, 1].
+        """
+        limits = (max_speed, max_force, gain)
+        plan = self._plans.get(tuple(joints))
+        if plan is None or plan.limits != limits:
+            plan = self._plans[tuple(joints)] = self._plan_motors(joints, max_speed, max_force, gain)
+        self._forget_torques(plan.joints)
+        pybullet.setJointMotorControlArray(
+            self.id,
+            plan.links,
+            pybullet.POSITION_CONTROL,
+            targetPositions=positions.tolist(),  # half the time of an array
+            forces=self._apply_strength(plan.impulses, plan.joints),
+            positionGains=plan.gains,
+            physicsClientId=self.client,
+        )
+
+    def _plan_motors(
+        self, joints: Sequence[str], max_speed: Sequence[float] | None, max_force: Sequence[float] | None, gain: float
+    ) -> _Plan:
+        chosen = self._find_joints(joints)
+        links = [self.joint_indices[joint] for joint in chosen]
+        speeds = self.joint_max_speed[chosen].tolist() if max_speed is None else max_speed
+        # Only the call for one joint takes a speed; the motor keeps it when the call for all sets the targets.
+        for index, speed in zip(links, speeds, strict=True):
+            pybullet.setJointMotorControl2(
+                self.id, index, pybullet.POSITION_CONTROL, maxVelocity=speed, physicsClientId=self.client
+            )
+        impulses = self._motor_impulses(chosen, max_force)
+        return _Plan((max_speed, max_force, gain), chosen, links, impulses, [gain] * len(links))
+
+    def drive_at(
+        self, velocities: Array, *, max_force: Sequence[float] | None = None, joints: Sequence[str] = ()
+    ) -> None:
+        """Set velocity targets [rad/s or m/s]; the force is limited, by the model file's limit if not given.
+
+        A velocity of 0 is a brake of that force.
+        """
+        chosen = self._find_joints(joints)
+        self._forget_torques(chosen)
+        pybullet.setJointMotorControlArray(
+            self.id,
+            [self.joint_indices[joint] for joint in chosen],
+            pybullet.VELOCITY_CONTROL,
+            targetVelocities=velocities.tolist(),
+            forces=self._apply_strength(self._motor_impulses(chosen, max_force), chosen),
+            physicsClientId=self.client,
+        )
+
+    def _motor_impulses(self, joints: list[int], max_force: Sequence[float] | None) -> list[float]:
+        # PyBullet makes an impulse of a motor's force with the time of a whole step, and gives it in every substep.
+        forces = self.joint_max_force[joints].tolist() if max_force is None else max_force
+        return [force / self._substeps for force in forces]
+
+    def _forget_torques(self, joints: list[int]) -> None:
+        if self._commanded is not None:
+            self._commanded[joints] = np.nan
+
+    def disable_motors(self, joints: Sequence[str] = ()) -> None:
+        """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves it."""
+        links = [self.joint_indices[joint] for joint in self._find_joints(joints)]
+        count = len(links)
+        pybullet.setJointMotorControlArray(
+            self.id,
+            links,
+            pybullet.POSITION_CONTROL,
+            forces=[0.0] * count,
+            positionGains=[0.1] * count,
+            velocityGains=[0.1] * count,
+            physicsClientId=self.client,
+        )
+
+    def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
+        """Turn or push the joints with `torques` [N m or N] in all substeps of the next step.
+
+        For joints whose motors are disabled: see `disable_motors`.
+        """
+        chosen = self._find_joints(joints)
+        given = self._apply_strength(torques.tolist(), chosen)
+        if self._commanded is None:
+            self._commanded = np.full(len(self.joint_indices), np.nan)
+        self._commanded[chosen] = given
+        pybullet.setJointMotorControlArray(
+            self.id,
+            [self.joint_indices[joint] for joint in chosen],
+            pybullet.TORQUE_CONTROL,
+            forces=given,
+            physicsClientId=self.client,
+        )
+
+    def cap_joint_speed(self, speed: float) -> None:
+        """Never let a joint, whatever pushes it, turn or slide faster than `speed` [rad/s or m/s].
+
+        PyBullet has one such limit per body, and of a body that is not fixed it also limits the base. `Sim.load` sets
+        it for a fixed body, to the fastest of its joints' limits in the URDF.
+        """
+        if speed <= 0:
+            raise TaskError(f"cap_joint_speed: {speed:g} is not above 0")
+        pybullet.changeDynamics(self.id, -1, maxJointVelocity=speed, physicsClientId=self.client)

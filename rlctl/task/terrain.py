@@ -1,0 +1,33 @@
+"""Rough ground from a seed: heights for `Sim.add_height_field`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError
+
+Array = NDArray[np.float64]
+
+
+def rough_heights(
+    seed: int, *, size: tuple[float, float], cell: float, roughness: float, flat_radius: float = 0.0
+) -> Array:
+    """Return heights [m] of shape (along x, along y): uniform in [0, roughness] at points `cell` [m] apart.
+
+    `size` [m] is covered, centred at 0, 0. Within `flat_radius` [m] of the centre the ground is at 0, where a robot
+    starts; it rises to its full roughness over as much again. Equal seeds give equal ground. Raises `TaskError` for a
+    negative roughness, and for a size of less than two cells.
+    """
+    if roughness < 0:
+        raise TaskError(f"terrain: roughness {roughness:g} m is negative")
+    rows, columns = (round(length / cell) + 1 for length in size)
+    if min(rows, columns) < 3:
+        raise TaskError(f"terrain: {size[0]:g} m x {size[1]:g} m is less than two cells of {cell:g} m")
+    heights = np.random.default_rng(seed).uniform(0.0, roughness, (rows, columns))
+    x = (np.arange(rows) - (rows - 1) / 2) * cell
+    y = (np.arange(columns) - (columns - 1) / 2) * cell
+    if flat_radius > 0:
+        distance = np.hypot(x[:, None], y[None, :])
+        heights *= np.clip((distance - flat_radius) / flat_radius, 0.0, 1.0)
+    return heights

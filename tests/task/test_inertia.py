@@ -1,0 +1,74 @@
+"""What a URDF says of masses and inertias: used, and judged."""
+
+import numpy as np
+import pytest
+
+from rlctl.task import Sim
+from rlctl.task.bullet import pybullet
+from rlctl.task.inertia import find_inertia_faults
+from tests.task import models
+
+BOX = '<collision><geometry><box size="0.3 0.04 0.04"/></geometry></collision>'
+
+
+@pytest.fixture
+def sim():
+    sim = Sim(control_dt=1 / 60, substeps=4)
+    yield sim
+    sim.close()
+
+
+def load(sim, folder, inertial, **kwargs):
+    """A held base and one link of 0.3 m x 0.04 m x 0.04 m."""
+    link = f'<link name="rod">{inertial}{BOX}</link>'
+    file = models.urdf(folder, models.link("base", 1.0), link, models.joint("joint", "base", "rod"))
+    return sim.load("body", file, fixed=True, **kwargs)
+
+
+def inertial(ixx, iyy, izz, mass=1.0):
+    values = f'ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"'
+    return f'<inertial><mass value="{mass}"/><inertia {values}/></inertial>'
+
+
+def diagonal(body):
+    return pybullet.getDynamicsInfo(body.id, 0, physicsClientId=body.client)[2]
+
+
+def test_the_inertia_of_the_file(sim, tmp_path):
+    said = (0.0003, 0.0076, 0.0076)
+    assert diagonal(load(sim, tmp_path, inertial(*said))) == pytest.approx(said)
+    # of a box of 1 kg: (0.3^2 + 0.04^2) / 12 = 0.00763, 2 * 0.04^2 / 12 = 0.000267
+    by_shape = diagonal(load(sim, tmp_path, inertial(1, 1, 1), inertia="shape"))
+    assert by_shape == pytest.approx((0.000267, 0.00763, 0.00763), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("inertial", "fault"),
+    [
+        ("", "no <inertial>, so PyBullet gives it a mass of 1 kg. Write its mass and inertia."),
+        (
+            inertial(0, 0.01, 0.01),
+            "principal moments 0, 0.01, 0.01 kg m^2 are not all above 0, as those of a link of 1 kg are.",
+        ),
+        (
+            inertial(0.001, 0.001, 0.01),
+            "principal moments 0.001, 0.001, 0.01 kg m^2: the largest exceeds the sum of the others, as in no solid.",
+        ),
+        (
+            inertial(1, 1, 1),
+            "a moment of 1 kg m^2 is more than 1 kg within 0.31 m can have (0.093). "
+            "Mend the file, or load it with inertia='shape'.",
+        ),
+        (inertial(0.0003, 0.0076, 0.0076), None),
+    ],
+)
+def test_faults(sim, tmp_path, inertial, fault):
+    found = find_inertia_faults(load(sim, tmp_path, inertial))
+    assert found == ([f"model.urdf, link 'rod': {fault}"] if fault else [])
+
+
+def test_what_is_not_used_is_no_fault(sim, tmp_path):
+    assert find_inertia_faults(load(sim, tmp_path, inertial(1, 1, 1), inertia="shape")) == []
+    assert find_inertia_faults(sim.load("plane", "plane.urdf", fixed=True)) == []
+    assert find_inertia_faults(sim.load("hopper", "mjcf/hopper.xml")) == []
+    assert find_inertia_faults(sim.add_height_field("ground", np.zeros((3, 3)), cell=0.1)) == []

@@ -1,0 +1,129 @@
+"""Driving joints: targets, speeds, torques, some joints only; what the motors give and what joints carry."""
+
+import numpy as np
+import pytest
+
+from rlctl.errors import TaskError
+from rlctl.task import Sim
+from tests.task import models
+
+
+@pytest.fixture(params=[1, 4], ids=["1 substep", "4 substeps"])
+def sim(request):
+    sim = Sim(control_dt=1 / 60, substeps=request.param)
+    yield sim
+    sim.close()
+
+
+def test_what_holds_an_arm_up(sim, tmp_path):
+    arm = sim.load("arm", models.arm(tmp_path), fixed=True)
+    arm.add_force_sensor("weld")
+    for _ in range(60):
+        arm.drive_to(np.zeros(1))
+        sim.step()
+    # About the shoulder, y axis: -(1 kg * 0.5 m + 0.5 kg * 1 m) * 9.81 m/s^2
+    assert arm.joint_torques == pytest.approx([-9.81], abs=1e-3)
+    # 0.5 kg * 9.81 m/s^2, through its centre
+    assert arm.joint_reaction("weld") == pytest.approx([0, 0, 4.905, 0, 0, 0], abs=2e-3)
+
+
+def test_a_sensor_that_was_not_added(sim, tmp_path):
+    arm = sim.load("arm", models.arm(tmp_path), fixed=True)
+    with pytest.raises(
+        TaskError, match=r"^joint 'weld' has no force sensor: call add_force_sensor\('weld'\) in build$"
+    ):
+        arm.joint_reaction("weld")
+    with pytest.raises(TaskError, match=r"^model.urdf has no joint 'wled'. Did you mean 'weld'\? It has: shoulder, we"):
+        arm.add_force_sensor("wled")
+
+
+def test_a_motor_gives_no_more_than_its_force(sim, tmp_path):
+    arm = sim.load("arm", models.arm(tmp_path), fixed=True)
+    for _ in range(60):
+        arm.drive_to(np.zeros(1), max_force=[5.0])
+        sim.step()
+    assert arm.joint_torques == pytest.approx([-5.0])
+    assert arm.joint_positions[0] > 0.5  # it falls
+
+
+def test_set_torques_are_what_is_given(sim, tmp_path):
+    wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
+    wheels.disable_motors()
+    wheels.set_torques(np.array([0.001]), joints=["right_joint"])
+    sim.step()
+    assert wheels.joint_torques[1] == 0.001
+    # 0.001 N m / (0.2 kg * (0.02^2 / 6 + 0.05^2) m^2) * 1/60 s = 0.0325 rad/s; nothing turns the other
+    assert wheels.joint_velocities == pytest.approx([0, 0.0325], abs=2e-4)
+
+
+def test_speeds_of_some_joints(sim, tmp_path):
+    wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
+    for _ in range(30):
+        wheels.drive_at(np.array([2.0]), joints=["right_joint"])
+        wheels.drive_to(np.array([0.3]), joints=["left_joint"], gain=0.3)
+        sim.step()
+    assert wheels.joint_velocities == pytest.approx([0, 2], abs=1e-2)
+    assert wheels.joint_positions == pytest.approx([0.3, 1.0], abs=0.05)  # 2 rad/s for 0.5 s
+    with pytest.raises(TaskError, match=r"^model.urdf has no joint 'rigth_joint'. Did you mean 'right_joint'\?"):
+        wheels.drive_at(np.array([2.0]), joints=["rigth_joint"])
+
+
+def test_the_speed_limits_of_the_file(sim, tmp_path):
+    wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
+    assert wheels.joint_max_speed.tolist() == [5, 5]
+    fastest = 0.0
+    for _ in range(12):
+        wheels.drive_to(np.array([2.5, -2.5]), gain=1.0)
+        sim.step()
+        fastest = max(fastest, np.abs(wheels.joint_velocities).max())
+    assert 4.5 < fastest <= 5.001  # rad/s, of the motors
+    wheels.disable_motors()
+    for _ in range(12):
+        wheels.set_torques(np.array([1.0, -1.0]))
+        sim.step()
+    assert np.abs(wheels.joint_velocities) == pytest.approx([5, 5])  # and of whatever pushes
+
+
+def test_a_cap_of_nothing(sim, tmp_path):
+    wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
+    with pytest.raises(TaskError, match=r"^cap_joint_speed: 0 is not above 0$"):
+        wheels.cap_joint_speed(0)
+
+
+def test_inverse_kinematics(sim):
+    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    home = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])
+    arm.set_joints(home)
+    wanted = np.array([0.5, 0.2, 0.5])
+    down = (1.0, 0.0, 0.0, 0.0)  # [quaternion], the hand's z axis points to the floor
+    solution = arm.solve_inverse_kinematics("lbr_iiwa_link_7", wanted, down)
+    assert arm.joint_positions.tolist() == home.tolist()  # looked for, not moved
+    arm.set_joints(solution)
+    np.testing.assert_allclose(arm.link_position("lbr_iiwa_link_7"), wanted, atol=2e-4)
+    assert abs(np.dot(arm.link_orientation("lbr_iiwa_link_7"), down)) == pytest.approx(1, abs=1e-3)
+    np.testing.assert_array_equal(solution, _solve_anew(home, wanted, down))
+
+
+def _solve_anew(home, wanted, down):
+    sim = Sim(control_dt=1 / 60, substeps=1)
+    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    for start in (home + 0.3, home):  # what was solved before changes nothing
+        arm.set_joints(start)
+        solution = arm.solve_inverse_kinematics("lbr_iiwa_link_7", wanted, down)
+    sim.close()
+    return solution
+
+
+def test_contact_forces(sim):
+    floor = sim.load("floor", "plane.urdf", fixed=True)
+    cube = sim.load("cube", "cube_small.urdf", position=(0, 0, 0.025), inertia="shape")
+    for _ in range(60):
+        sim.step()
+    contacts = cube.contacts_with(floor)
+    assert set(contacts.links) == {"baseLink"}
+    assert contacts.forces.sum() == pytest.approx(0.981, rel=1e-3)  # 0.1 kg * 9.81 m/s^2
+    assert -1e-4 < contacts.distances.min() < 1e-4
+    assert cube.contacts_with(cube) == ([], pytest.approx(np.zeros(0)), pytest.approx(np.zeros(0)))
+    cube.set_base((0, 0, 0.02))
+    sim.step()
+    assert cube.contacts_with(floor).distances.min() == pytest.approx(-0.005, rel=0.3)  # [m], 5 mm deep
