@@ -1,4 +1,4 @@
-"""Fixtures for all tests: the command line as a user runs it, installed plugins, and processes left behind."""
+"""Fixtures for all tests: the command line, how its processes start, installed plugins, and processes left behind."""
 
 import os
 import subprocess
@@ -9,18 +9,41 @@ from pathlib import Path
 import psutil
 import pytest
 
+from rlctl.rollout.process_start import set_default_start
+from tests import fork_server
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _forked_workers():
+    """Fork workers from a warm process, which is launched when the first is started."""
+    set_default_start(fork_server.start)
+    yield
+    set_default_start(subprocess.Popen)
+    fork_server.close()
+
 
 @pytest.fixture
 def rlctl(tmp_path):
-    """Run the command line in a process of its own, in `tmp_path`; `path` goes before the installed packages."""
+    """Run the command line in a forked process, in `tmp_path`; `path` goes before the installed packages."""
 
     def run(*arguments, path=None, env=None, **options) -> subprocess.CompletedProcess:
         environment = {**os.environ, "NO_COLOR": "1", **(env or {})}
         if path is not None:
             environment["PYTHONPATH"] = str(path)
+        command = [sys.executable, "-m", "rlctl", *map(str, arguments)]
+        return fork_server.for_commands().run(command, **{"cwd": tmp_path, "timeout": 60, "env": environment, **options})
+
+    return run
+
+
+@pytest.fixture
+def installed_rlctl(tmp_path):
+    """Run the command line as a user does, in an interpreter of its own, in `tmp_path`."""
+
+    def run(*arguments, **options) -> subprocess.CompletedProcess:
         return subprocess.run(
             [sys.executable, "-m", "rlctl", *map(str, arguments)],
-            **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 60, "env": environment, **options},
+            **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 60, **options},
         )
 
     return run
@@ -59,8 +82,11 @@ def install(tmp_path):
 
 
 @pytest.fixture
-def no_child_left():
+def no_child_left(request):
     """Fail if the test leaves a process behind."""
+    fork_server.for_workers()
+    if "rlctl" in request.fixturenames:
+        fork_server.for_commands()
     before = set(psutil.Process().children(recursive=True))
     yield
     left = [child for child in psutil.Process().children(recursive=True) if child not in before]

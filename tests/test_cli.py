@@ -170,7 +170,7 @@ def test_an_environment_that_fails_in_an_evaluation(rlctl, printing, policy):
 def test_a_closed_stdout_ends_quietly(rlctl, arguments):
     read_end, write_end = os.pipe()
     os.close(read_end)
-    result = rlctl(*arguments, capture_output=False, stdout=write_end, stderr=subprocess.PIPE)
+    result = rlctl(*arguments, stdout=write_end)
     os.close(write_end)
     assert (result.returncode, result.stderr) == (141, "")
 

@@ -1,6 +1,7 @@
 """Fresh Python interpreters as child processes, each in a process group of its own, with a connection to it.
 
-Never forks: a process that holds PyBullet or torch cannot be forked safely. What a child and its own children print
+Never forks: a process that holds PyBullet or torch cannot be forked safely. (Tests fork from one that does not run any
+environment: `process_start.set_default_start`.) What a child and its own children print
 goes to descriptors that the caller gives, for example to a `LineReader`.
 """
 
@@ -21,6 +22,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from rlctl.rollout.process_group import block_signals, end, end_with_parent
+from rlctl.rollout.process_start import StartProcess, default_start
 
 # Started this way a child finds the modules that its parent finds, and the caller's script is not run again.
 # Ctrl-C and `kill` may reach a child too, but its parent decides: ignored before anything slow is imported, and held
@@ -51,6 +53,7 @@ class ChildProcess:
         stderr: int,
         descriptors: Sequence[int] = (),
         environment: Mapping[str, str] | None = None,
+        start: StartProcess | None = None,
     ) -> None:
         """`main` is "package.module:function"; `arguments` are what JSON can hold."""
         ours, theirs = socket.socketpair()
@@ -66,7 +69,7 @@ class ChildProcess:
         }
         try:
             with theirs, open(lifeline, "rb"), block_signals():
-                self.process = subprocess.Popen(
+                self.process = (start or default_start())(
                     [sys.executable, "-c", _BOOTSTRAP, json.dumps(job)],
                     pass_fds=(theirs.fileno(), lifeline, *descriptors),
                     stdin=subprocess.DEVNULL,

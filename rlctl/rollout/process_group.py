@@ -11,6 +11,8 @@ import threading
 import time
 from collections.abc import Iterator
 
+from rlctl.rollout.process_start import Process
+
 
 @contextlib.contextmanager
 def block_signals() -> Iterator[None]:
@@ -22,7 +24,7 @@ def block_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def end(process: subprocess.Popen[bytes], deadline: float) -> None:
+def end(process: Process, deadline: float) -> None:
     """Wait until a worker ends or `time.monotonic()` reaches `deadline`; then kill what is left of its group."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(timeout=max(0.0, deadline - time.monotonic()))

@@ -28,6 +28,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.rollout import goal_rewards
 from rlctl.rollout.process_group import block_signals, end
+from rlctl.rollout.process_start import Process, StartProcess, default_start
 from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
 from rlctl.rollout.worker_output import forward
 from rlctl.run.env_info import EnvInfo
@@ -72,7 +73,7 @@ class Workers:
     Building starts at once and is waited for by the first use, so that a caller can do its own slow imports
     meanwhile. Errors in an environment raise `TaskError` with the episode's seed and step; a worker that dies or
     does not answer within `timeout_s` does too. After an error the workers are gone. What environments print goes to
-    `on_output`, line by line, from a thread; without it to stderr.
+    `on_output`, line by line, from a thread; without it to stderr. `start` starts a process, as `subprocess.Popen` does.
     """
 
     def __init__(
@@ -83,15 +84,17 @@ class Workers:
         n_workers: int | None = None,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         on_output: Callable[[str], None] | None = None,
+        start: StartProcess | None = None,
     ) -> None:
         self.n_envs = n_envs
         self.timeout_s = timeout_s
         self._spec = spec
+        self._start_process = start or default_start()
         n_workers = min(n_envs, n_workers or available_cores())
         bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
         self._ranges = list(itertools.pairwise(bounds))
         self._memory = anonymous_file()
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: list[Process] = []
         self._connections: list[Connection] = []
         self._lifelines: list[int] = []
         self._ready = False
@@ -133,7 +136,7 @@ class Workers:
         }
         passed = (theirs.fileno(), self._memory, lifeline)
         with theirs, open(lifeline, "rb"), block_signals():
-            process = subprocess.Popen(
+            process = self._start_process(
                 [sys.executable, "-c", _BOOTSTRAP, *map(str, passed[:2]), json.dumps(job), str(lifeline)],
                 pass_fds=passed,
                 stdin=subprocess.DEVNULL,

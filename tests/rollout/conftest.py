@@ -1,9 +1,11 @@
 from pathlib import Path
 
+import psutil
 import pytest
 
 from rlctl.env_spec import EnvSpec
 from rlctl.rollout.workers import Workers
+from tests import fork_server
 
 ENVS = Path(__file__).with_name("envs.py")
 
@@ -30,3 +32,11 @@ def start():
     yield make
     for workers in started:
         workers.close()
+
+
+@pytest.fixture
+def children():
+    """Return the processes that the test has started, in that order."""
+    fork_server.for_workers()
+    before = set(psutil.Process().children())
+    return lambda: [child for child in psutil.Process().children() if child not in before]

@@ -66,12 +66,12 @@ def test_a_hang_is_ended(spec, start):
     )
 
 
-def test_a_worker_that_is_killed_while_idle(spec, start):
+def test_a_worker_that_is_killed_while_idle(spec, start, children):
     workers = start(spec("Walk"), 4, n_workers=2)
     workers.reset({env: env for env in range(4)})
-    victim = workers._processes[1]
+    _, victim = children()
     victim.kill()
-    victim.wait()
+    os.waitid(os.P_PID, victim.pid, os.WEXITED | os.WNOWAIT)
     workers.arrays.action[:] = 0.0
     with pytest.raises(TaskError) as caught:
         workers.step()
@@ -131,12 +131,13 @@ def test_workers_end_with_a_killed_parent(first_seed):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("built", [True, False])
-def test_to_stop_is_for_the_main_process(spec, start, number, built):
-    workers = start(spec("Walk"), 2, n_workers=2)
+def test_to_stop_is_for_the_main_process(spec, start, children, number, built):
+    # A fresh interpreter takes a while until it is ready for signals.
+    workers = start(spec("Walk"), 2, n_workers=2, start=subprocess.Popen if number == signal.SIGINT else None)
     if built:
         workers.reset({0: 0, 1: 1})
-    for process in workers._processes:
-        os.kill(process.pid, number)
+    for process in children():
+        process.send_signal(number)
     workers.reset({0: 0, 1: 1})
     workers.arrays.action[:] = 0.0
     for _ in range(3):

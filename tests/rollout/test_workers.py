@@ -1,6 +1,7 @@
 """Environments in worker processes: the same bits however they are spread, every kind of space, all output told."""
 
 import os
+import subprocess
 import sys
 import time
 
@@ -174,7 +175,7 @@ def test_workers_import_no_learning_library(spec, start, tmp_path):
         "        return super().reset(**options)\n"
     )
     told = []
-    workers = start(EnvSpec(f"{module}:Spy"), 1, on_output=told.append)
+    workers = start(EnvSpec(f"{module}:Spy"), 1, on_output=told.append, start=subprocess.Popen)
     workers.reset({0: 0})
     workers.close()
     loaded = set(told[0].split())
@@ -183,15 +184,14 @@ def test_workers_import_no_learning_library(spec, start, tmp_path):
 
 
 def test_nothing_is_left_open(spec):
-    Workers(spec("Walk"), 1).close()
+    Workers(spec("Walk"), 1, start=subprocess.Popen).close()
     process = psutil.Process()
     files, threads = process.num_fds(), process.num_threads()
-    for _ in range(3):
-        with Workers(spec("Walk"), 2) as workers:
-            workers.reset({0: 0, 1: 1})
-            workers.step()
-        del workers
-    workers = Workers(spec("Walk"), 2)
+    with Workers(spec("Walk"), 2, start=subprocess.Popen) as workers:
+        workers.reset({0: 0, 1: 1})
+        workers.step()
+    del workers
+    workers = Workers(spec("Walk"), 2, start=subprocess.Popen)
     workers.close()  # before it was used
     workers.close()
     del workers
@@ -216,7 +216,7 @@ def test_a_misspelt_parameter_keeps_its_kind_of_error(spec, start):
 def test_paths_of_this_process_are_those_of_its_workers(start, tmp_path, monkeypatch):
     (tmp_path / "only_here.py").write_text("from tests.rollout.envs import Walk as Here\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    workers = start(EnvSpec("only_here:Here"), 1)
+    workers = start(EnvSpec("only_here:Here"), 1, start=subprocess.Popen)
     workers.reset({0: 0})
     assert workers.info.action_space["shape"] == [2]
 

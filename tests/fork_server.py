@@ -1,0 +1,335 @@
+"""Processes forked from one that has imported what they import: started as by `subprocess.Popen`, in milliseconds.
+
+Most of the time of a small training is spent on imports, so tests start processes this way unless the start itself is
+what they test. A process has the folder, environment, descriptors, process group and signal mask that its caller gives
+it, and is the caller's child: exit codes, `getppid` and `psutil` see no difference. It differs from a fresh interpreter
+in that everything is imported already, and in that no `atexit` function runs. Linux only.
+"""
+
+import contextlib
+import ctypes
+import fcntl
+import functools
+import gc
+import importlib
+import json
+import os
+import pkgutil
+import runpy
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FOR_WORKERS = ("rlctl.rollout.worker_process", "rlctl.task.env", "rlctl.run.env_info", "gymnasium.envs.registration")
+FOR_COMMANDS = (
+    *("torch._dynamo", "torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
+    *("rlctl.eval.evaluate", "rlctl.run.torch_policy", "typer.rich_utils", "yaml"),
+)
+"""What is imported when it is needed; one that is missing here costs time only."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_PR_SET_CHILD_SUBREAPER = 36
+
+
+class ForkedProcess:
+    """A child of this process, with the part of `subprocess.Popen` that is used here."""
+
+    def __init__(self, command, pid):
+        self.args = command
+        self.pid = pid
+        self.returncode = None
+
+    def poll(self):
+        return self._wait(0.0)
+
+    def wait(self, timeout=None):
+        if self._wait(timeout) is None:
+            raise subprocess.TimeoutExpired(self.args, timeout)
+        return self.returncode
+
+    def _wait(self, timeout):
+        if self.returncode is None and self._has_ended(timeout):
+            try:
+                self.returncode = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+            except ChildProcessError:  # somebody else has waited for it
+                self.returncode = 0
+        return self.returncode
+
+    def _has_ended(self, timeout):
+        try:
+            descriptor = os.pidfd_open(self.pid)
+        except ProcessLookupError:
+            return True
+        with open(descriptor, "rb"):
+            return bool(select.select([descriptor], [], [], timeout)[0])
+
+    def send_signal(self, number):
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self):
+        self.send_signal(signal.SIGKILL)
+
+    def terminate(self):
+        self.send_signal(signal.SIGTERM)
+
+
+class ForkServer:
+    """A process that forks on request."""
+
+    def __init__(self, connection, process):
+        self._connection = connection
+        self._process = process
+        self._lock = threading.Lock()
+
+    @classmethod
+    def launch(cls, start_process=subprocess.Popen, *, commands=False):
+        """Start a server for workers, or for whole commands."""
+        ours, theirs = socket.socketpair()
+        code = f"from tests import fork_server; fork_server.main({theirs.fileno()}, {commands})"
+        with theirs:
+            process = start_process(
+                [sys.executable, "-c", code],
+                cwd=ROOT,
+                pass_fds=(theirs.fileno(),),
+                env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+                process_group=0,  # an interrupt at the terminal is for the tests
+            )
+        return cls(ours, process)
+
+    @classmethod
+    def fork(cls):
+        """Make a fork of this process the server: before it has threads."""
+        ours, theirs = socket.socketpair()
+        pid = os.fork()
+        if pid == 0:
+            ours.close()
+            with open(os.devnull, "r+b") as nothing:
+                for descriptor in (0, 1, 2):  # or a reader of this process's output would wait for the server's end
+                    os.dup2(nothing.fileno(), descriptor)
+            serve(theirs)
+        theirs.close()
+        return cls(ours, ForkedProcess([], pid))
+
+    def start(
+        self,
+        command,
+        *,
+        pass_fds=(),
+        stdin=None,
+        stdout=None,
+        stderr=None,
+        env=None,
+        cwd=None,
+        process_group=None,
+        start_new_session=False,
+    ):
+        """Start `[python, "-c", code, ...]` or `[python, "-m", module, ...]` with options of `subprocess.Popen`."""
+        with contextlib.ExitStack() as opened:
+            standard = [
+                opened.enter_context(open(os.devnull, "r+b")).fileno() if each == subprocess.DEVNULL else each
+                for each in (stdin, stdout, stderr)
+            ]
+            descriptors = [number if each is None else each for number, each in enumerate(standard)]
+            request = {
+                "command": command,
+                "descriptors": [0, 1, 2, *pass_fds],
+                "env": dict(os.environ if env is None else env),
+                "cwd": str(cwd or os.getcwd()),
+                "process_group": process_group,
+                "session": start_new_session,
+                "blocked": [int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, ())],
+            }
+            with self._lock, _adopting():
+                _send(self._connection, request, [*descriptors, *pass_fds])
+                (pid,) = struct.unpack("i", self._connection.recv(4, socket.MSG_WAITALL))
+        return ForkedProcess(command, pid)
+
+    def run(self, command, *, timeout=None, stdout=None, **options):
+        """Run a command to its end; return what `subprocess.run` returns, with the output as text."""
+        with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+            output = {"stdout": out.fileno() if stdout is None else stdout, "stderr": err.fileno()}
+            process = self.start(command, **output, **options)
+            try:
+                process.wait(timeout)
+            finally:
+                process.kill()
+                process.wait()
+            told = [(file.seek(0), file.read().decode(errors="replace"))[1] for file in (out, err)]
+        return subprocess.CompletedProcess(command, process.returncode, *told)
+
+    def close(self):
+        self._connection.close()
+        self._process.wait()
+
+
+@functools.cache
+def for_workers():
+    """Return the server of this process that has imported what a worker imports."""
+    return ForkServer.launch()
+
+
+@functools.cache
+def for_commands():
+    """Return the server of this process that has also imported torch and the command line."""
+    return ForkServer.launch(for_workers().start, commands=True)
+
+
+def close():
+    """End the servers of this process."""
+    for server in (for_commands, for_workers):
+        if server.cache_info().currsize:
+            server().close()
+            server.cache_clear()
+
+
+def start(command, **options):
+    """Start a worker as `subprocess.Popen` does: by the server of this process, unless hashes are to be others."""
+    if options.get("env", {}).get("PYTHONHASHSEED") != os.environ.get("PYTHONHASHSEED"):
+        return subprocess.Popen(command, **options)
+    return for_workers().start(command, **options)
+
+
+@contextlib.contextmanager
+def _adopting():
+    """Make this process the parent of what the server starts: the next one above a process whose parent has ended."""
+    prctl = ctypes.CDLL(None).prctl
+    prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    try:
+        yield
+    finally:
+        prctl(_PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
+
+
+def _send(connection, request, descriptors):
+    content = json.dumps(request).encode()
+    socket.send_fds(connection, [struct.pack("i", len(content))], descriptors)
+    connection.sendall(content)
+
+
+def _receive(connection):
+    head, descriptors, _, _ = socket.recv_fds(connection, 4, 64)
+    if not head:
+        return None
+    request = json.loads(connection.recv(struct.unpack("i", head)[0], socket.MSG_WAITALL))
+    return request, descriptors
+
+
+def serve(connection):
+    """Fork for every request until the other end is closed; does not return."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    while received := _receive(connection):
+        read_end, write_end = os.pipe()
+        between = os.fork()
+        if between == 0:
+            # It ends at once, so that the new process gets the caller as its parent.
+            received[0]["between"] = os.getpid()
+            if os.fork() == 0:
+                _become(*received, write_end)
+            os._exit(0)
+        os.close(write_end)
+        for descriptor in received[1]:
+            os.close(descriptor)
+        with open(read_end, "rb") as pipe:
+            pid = pipe.read(4)
+        os.waitpid(between, 0)
+        connection.sendall(pid)
+    os._exit(0)
+
+
+def _become(request, received, ready):
+    """Be the new process; does not return."""
+    code = 70
+    try:
+        if request["session"]:
+            os.setsid()
+        elif request["process_group"] is not None:
+            os.setpgid(0, request["process_group"])
+        while os.getppid() == request["between"]:  # until it has ended
+            time.sleep(0.0001)
+        os.write(ready, struct.pack("i", os.getpid()))
+        _take_descriptors(request["descriptors"], received)
+        _take_surroundings(request)
+        code = _run(request["command"][1:])
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(Exception):
+                stream.flush()
+        os._exit(code)
+
+
+def _take_descriptors(numbers, received):
+    lowest = max(*numbers, *received) + 1
+    moved = [fcntl.fcntl(each, fcntl.F_DUPFD, lowest) for each in received]
+    os.closerange(3, lowest)
+    for number, descriptor in zip(numbers, moved, strict=True):
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+    sys.stdin = open(0, closefd=False)
+    sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
+    sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", buffering=1, closefd=False)
+
+
+def _take_surroundings(request):
+    os.chdir(request["cwd"])
+    os.environ.clear()
+    os.environ.update(request["env"])
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in SIGNALS[1:]:
+        signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, request["blocked"])
+    first = os.getcwd() if request["command"][1] == "-m" else ""
+    given = [each for each in request["env"].get("PYTHONPATH", "").split(os.pathsep) if each]
+    sys.path[:] = [first, *given, *sys.path[1:]]
+    importlib.invalidate_caches()
+    import numpy as np
+
+    np.random.seed()  # every fork would draw the same  # noqa: NPY002
+
+
+def _run(arguments):
+    """Run `-c code ...` or `-m module ...`; return the exit code."""
+    kind, what, *rest = arguments
+    sys.argv = [kind, *rest]
+    try:
+        if kind == "-m":
+            from rlctl.rollout.process_start import set_default_start
+
+            set_default_start(ForkServer.fork().start)
+            runpy.run_module(what, run_name="__main__", alter_sys=True)
+        else:
+            exec(compile(what, "<string>", "exec"), {"__name__": "__main__"})
+    except SystemExit as end:
+        if end.code is None or isinstance(end.code, int):
+            return end.code or 0
+        print(end.code, file=sys.stderr)
+        return 1
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+def main(descriptor, commands):
+    """Import what the processes need, and serve."""
+    for name in FOR_WORKERS + (FOR_COMMANDS if commands else ()):
+        importlib.import_module(name)
+    if commands:
+        import rlctl.train
+
+        for module in pkgutil.iter_modules(rlctl.train.__path__, "rlctl.train."):
+            importlib.import_module(module.name)
+    gc.collect()
+    gc.freeze()
+    serve(socket.socket(fileno=descriptor))
