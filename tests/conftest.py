@@ -31,7 +31,9 @@ def rlctl(tmp_path):
         if path is not None:
             environment["PYTHONPATH"] = str(path)
         command = [sys.executable, "-m", "rlctl", *map(str, arguments)]
-        return fork_server.for_commands().run(command, **{"cwd": tmp_path, "timeout": 60, "env": environment, **options})
+        return fork_server.for_commands().run(
+            command, **{"cwd": tmp_path, "timeout": 60, "env": environment, **options}
+        )
 
     return run
 

@@ -276,9 +276,9 @@ def _take_descriptors(numbers, received):
     for number, descriptor in zip(numbers, moved, strict=True):
         os.dup2(descriptor, number)
         os.close(descriptor)
-    sys.stdin = open(0, closefd=False)
-    sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
-    sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", buffering=1, closefd=False)
+    sys.stdin = os.fdopen(0, closefd=False)
+    sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    sys.stderr = os.fdopen(2, "w", encoding="utf-8", errors="backslashreplace", buffering=1, closefd=False)
 
 
 def _take_surroundings(request):
@@ -295,7 +295,7 @@ def _take_surroundings(request):
     importlib.invalidate_caches()
     import numpy as np
 
-    np.random.seed()  # every fork would draw the same  # noqa: NPY002
+    np.random.seed()  # noqa: NPY002 (every fork would draw the same)
 
 
 def _run(arguments):

@@ -73,7 +73,8 @@ class Workers:
     Building starts at once and is waited for by the first use, so that a caller can do its own slow imports
     meanwhile. Errors in an environment raise `TaskError` with the episode's seed and step; a worker that dies or
     does not answer within `timeout_s` does too. After an error the workers are gone. What environments print goes to
-    `on_output`, line by line, from a thread; without it to stderr. `start` starts a process, as `subprocess.Popen` does.
+    `on_output`, line by line, from a thread; without it to stderr. `start` starts a process as `subprocess.Popen`
+    does; without it `process_start.default_start()` does.
     """
 
     def __init__(
