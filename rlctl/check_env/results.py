@@ -248,8 +248,6 @@ class TimedCall:
     """Where in the environment's code most of its time goes, `file.py:12`; empty if that is not known."""
     share: float
     """Its part of the time of all steps, or of all resets."""
-    calls: float
-    """How many per step, or per reset."""
     kind: str = ""
     """`rendering`, `sleeping`, `loading` or `connecting`, for what is suspicious."""
     inside: str = ""

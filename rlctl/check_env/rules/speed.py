@@ -111,7 +111,7 @@ def draws(evidence: Evidence) -> Iterator[Seen]:
             inside = f", there {each.inside}" if each.inside else ""
             yield Seen(
                 f"{call} calls {each.name}{_at(each)}{inside}: {lost} per {call}, {each.share:.0%} of its time",
-                {"call": call, "value": each.name, "place": each.place, "share": each.share, "calls": each.calls},
+                {"call": call, "value": each.name, "place": each.place, "share": each.share},
             )
 
 
@@ -144,7 +144,7 @@ def _loads(call: str, calls: Sequence[TimedCall], seconds: float, whole_s: float
     more = f" and {len(named) - NAMED_CALLS} more" if len(named) > NAMED_CALLS else ""
     part = "an episode" if call == "reset" else "its time"
     return Seen(
-        f"{call} calls {', '.join(f'{each.name}{_times(each)}{_at(each)}' for each in named[:NAMED_CALLS])}{more}: "
+        f"{call} calls {', '.join(f'{each.name}{_at(each)}' for each in named[:NAMED_CALLS])}{more}: "
         f"{_time(seconds)} per {call}, {share:.0%} of {part}",
         {"call": call, "value": [each.name for each in named], "ms": 1e3 * seconds, "share": share},
         INFO if call == "reset" and not connects and share < LITTLE_LOADING else None,
@@ -222,10 +222,6 @@ def _slowest(calls: Sequence[TimedCall]) -> str:
 
 def _at(call: TimedCall) -> str:
     return f" ({call.place})" if call.place else ""
-
-
-def _times(call: TimedCall) -> str:
-    return "" if round(call.calls, 1) == 1 else f" {call.calls:.3g} times"
 
 
 def _time(seconds: float) -> str:

@@ -13,19 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.check_env.actions import actions
-from rlctl.check_env.call_times import Calls
 from rlctl.check_env.context import Context
 from rlctl.check_env.instance import Instance
-from rlctl.check_env.results import Speed, TimedCall
-from rlctl.check_env.stopwatch import CallWatch, Stopwatch
+from rlctl.check_env.results import Speed
+from rlctl.check_env.sampling import Sampler, Samples, Stopwatch
 from rlctl.check_env.wire import Message, result
 
 FIRST_SPEED_SEED = 5000
 TIMED_STEPS = 200
 TIMED_RESETS = 5
-WATCHED_STEPS = 100
-"""How many steps are taken while their calls are timed too."""
-WATCHED_RESETS = 3
+SAMPLED_S = 0.25
+"""How long steps are sampled, and resets: some hundred samples each [s]."""
+MOST_STEPS = 20_000
+"""So many steps, or resets, are enough."""
 BATCH = 25
 """The time of a step is the median of the means over so many: a disturbance is left out, a step that takes longer every
 now and then is not."""
@@ -49,25 +49,25 @@ _KINDS = {kind: re.compile(pattern) for kind, pattern in KINDS.items()}
 
 
 def speed(context: Context) -> Iterator[Message]:
-    """Live random episodes: first with nothing but a clock, then with every call timed."""
+    """Live random episodes: first with nothing but a clock, then sampled."""
     instance, seconds = context.instance, min(LONGEST_S, context.budget.seconds_left)
     steps, resets = Stopwatch(), Stopwatch()
     _live(instance, steps, resets, TIMED_STEPS, TIMED_RESETS, time.monotonic() + seconds / 2)
-    is_own = own_code(instance.env)
-    in_step, in_reset = CallWatch(is_own, kind_of), CallWatch(is_own, kind_of)
-    _live(instance, in_step, in_reset, WATCHED_STEPS, WATCHED_RESETS, time.monotonic() + seconds / 2)
-    if error := in_step.error or in_reset.error:
-        raise error
+    sampler = Sampler(own_code(instance.env), kind_of)
+    in_step, in_reset = Samples(sampler), Samples(sampler)
+    with sampler.running():
+        _live(instance, in_step, in_reset, MOST_STEPS, 0, time.monotonic() + min(seconds / 4, SAMPLED_S))
+        _live(instance, in_step, in_reset, 0, MOST_STEPS, time.monotonic() + min(seconds / 4, SAMPLED_S))
     yield result(
         Speed(
             step_s=typical(steps.seconds, BATCH),
             reset_s=typical(resets.seconds, 1),
             steps=len(steps.seconds),
             resets=len(resets.seconds),
-            slowest_in_step=_slowest(in_step),
-            slowest_in_reset=_slowest(in_reset),
-            suspicious_in_step=_suspicious(in_step),
-            suspicious_in_reset=_suspicious(in_reset),
+            slowest_in_step=in_step.slowest()[:NAMED_CALLS],
+            slowest_in_reset=in_reset.slowest()[:NAMED_CALLS],
+            suspicious_in_step=in_step.suspicious(),
+            suspicious_in_reset=in_reset.suspicious(),
             rebuilds=_rebuilds(instance.env),
         )
     )
@@ -159,17 +159,3 @@ def _is_task(inner: Any) -> bool:
 def _rebuilds(env: Any) -> bool:
     inner = getattr(env, "unwrapped", env)
     return _is_task(inner) and not inner.task.fast_reset
-
-
-def _slowest(watch: CallWatch) -> list[TimedCall]:
-    return [_timed(each, each.own_s, each.count, watch) for each in watch.slowest()[:NAMED_CALLS] if each.own_s > 0]
-
-
-def _suspicious(watch: CallWatch) -> list[TimedCall]:
-    return [_timed(each, each.whole_s, each.whole_count, watch) for each in watch.suspicious()]
-
-
-def _timed(calls: Calls, seconds: float, count: int, watch: CallWatch) -> TimedCall:
-    place = f"{Path(calls.file).name}:{calls.line}" if calls.line else ""
-    share = seconds / watch.seconds if watch.seconds else 0.0
-    return TimedCall(calls.name, place, share, count / len(watch.runs), calls.kind, calls.inside)
