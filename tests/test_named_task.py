@@ -13,7 +13,7 @@ from rlctl.errors import ArtifactError, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.run import files
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
-from rlctl.run.policy import read_policy
+from rlctl.run.policy import compute_digest, read_policy
 from rlctl.train.request import TrainRequest, run_training
 from tests.train.conftest import ENVS, SMALL_PPO
 
@@ -98,7 +98,8 @@ def test_a_policy_that_names_a_function_runs_nothing(run, tmp_path):
     mark = tmp_path / "ran"
     evil = {**json.loads(info.model_dump_json()), "task": "os:system", "task_parameters": {"command": f"touch {mark}"}}
     path = tmp_path / "evil.safetensors"
-    path.write_bytes(save(load_file(run.best_policy), metadata={"rlctl": json.dumps(evil)}))
+    text, tensors = json.dumps(evil), load_file(run.best_policy)
+    path.write_bytes(save(tensors, metadata={"rlctl": text, "sha256": compute_digest(text, tensors)}))
     with pytest.raises(ArtifactError, match=r"^a policy file names 'os:system' as its task"):
         run_evaluation(EvalRequest(str(path), episodes=1), Gates())
     assert not mark.exists()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.export.report import ExportReport, Port, agreement_line, closed_loop_line
 from rlctl.rollout.workers import Workers
-from rlctl.run import directory, files
+from rlctl.run import directory, files, onnx_file
 from rlctl.run.policy import PolicyInfo, read_policy
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def _export(policy_file: Path, target: Path) -> ExportReport:
         reports: list[ExportReport] = []
 
         def write(part: Path) -> None:
-            part.write_bytes(model.SerializeToString())
+            part.write_bytes(onnx_file.encode(model))
             reports.append(_verified(policy_file, target, part, policy, model, workers))
 
         files.write_with(target, write)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gymnasium import spaces
 
-from rlctl.run.onnx_policy import METADATA_KEY
+from rlctl.run.onnx_file import METADATA_KEY
 from rlctl.run.policy import PolicyInfo
 
 

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from rlctl.env_spec import LARGEST_SPACE
 from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.run import memory, onnx_file, untrusted
+from rlctl.run.onnx_file import METADATA_KEY
 from rlctl.run.policy import ROWS, Observations, Policy, PolicyInfo, State, parse_info
 
-METADATA_KEY = "rlctl"
-"""Where an exported file keeps its description."""
 SINGLE_INPUT = "obs"
 """Name of the input of an observation that is no dictionary; those of a dictionary are named by their keys."""
 ACTION = "action"
@@ -55,7 +54,7 @@ class OnnxPolicy(Policy):
     @classmethod
     def load(cls, path: Path) -> OnnxPolicy:
         """Read an exported file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
-        session, metadata = _opened(path)
+        session, metadata = _open_session(path)
         text = metadata.get(METADATA_KEY)
         if text is None:
             raise ArtifactError(
@@ -123,11 +122,14 @@ class OnnxPolicy(Policy):
         return tuple(np.zeros((layers, rows, hidden), np.float32) for _ in STATE_INPUTS)
 
 
-def _opened(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
+def _open_session(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
     """Return a session on a file, and the file's metadata."""
     content = untrusted.read_bytes(path, _LARGEST)
     try:
         onnx_file.check(content)
+    except ValueError as error:
+        raise ArtifactError(f"{path}: damaged, or not an ONNX file of rlctl: {error}") from None
+    try:
         _limit_memory()
         session = onnxruntime.InferenceSession(content, _options(), providers=["CPUExecutionProvider"])
         return session, session.get_modelmeta().custom_metadata_map

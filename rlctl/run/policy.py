@@ -145,16 +145,16 @@ def encode_policy(info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> bytes:
 
     contiguous = {name: np.asarray(value, order="C") for name, value in tensors.items()}
     text = info.model_dump_json()
-    return save(contiguous, metadata={"rlctl": text, "sha256": _digest(text, contiguous)})
+    return save(contiguous, metadata={"rlctl": text, "sha256": compute_digest(text, contiguous)})
 
 
-def _digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
+def compute_digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
     """Return the sha256 of what a policy file says: a disk may give back other bits, and they load as well."""
-    told = hashlib.sha256(info.encode())
+    content = hashlib.sha256(info.encode())
     for name, values in sorted(tensors.items()):
-        told.update(f"{name} {values.dtype} {values.shape}".encode())
-        told.update(np.ascontiguousarray(values).data)
-    return told.hexdigest()
+        content.update(f"{name} {values.dtype} {values.shape}".encode())
+        content.update(np.ascontiguousarray(values).data)
+    return content.hexdigest()
 
 
 def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
@@ -169,8 +169,9 @@ def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
         raise ArtifactError(f"{path}: damaged, or not a .safetensors file: {error}") from None
-    # Other programs may leave it out.
-    if metadata.get("sha256", digest := _digest(metadata["rlctl"], tensors)) != digest:
+    if "sha256" not in metadata:
+        raise ArtifactError(f"{path}: damaged: its metadata has no sha256, which every policy of rlctl has")
+    if metadata["sha256"] != compute_digest(metadata["rlctl"], tensors):
         raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
     for name, values in tensors.items():
         if not np.isfinite(values).all():

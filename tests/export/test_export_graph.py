@@ -3,13 +3,13 @@
 import math
 
 import numpy as np
-import onnx
 import onnxruntime
 import pytest
 from gymnasium import spaces
 
 from rlctl.errors import UsageError
 from rlctl.export.actor import build
+from rlctl.run import onnx_file
 from rlctl.run.env_info import describe
 from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import read_policy
@@ -208,7 +208,7 @@ def test_file_says_what_it_is(train, tmp_path):
     assert metadata["training_steps"] == "0"
     assert "stable-baselines3 " in metadata["versions"]
     path = tmp_path / "policy.onnx"
-    onnx.save(proto, path)
+    path.write_bytes(onnx_file.encode(proto))
     assert OnnxPolicy.load(path).info == info
 
 

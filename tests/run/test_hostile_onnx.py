@@ -8,6 +8,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from rlctl.errors import ArtifactError
+from rlctl.run import onnx_file
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import PolicyInfo
@@ -27,7 +28,7 @@ def write(tmp_path):
         entry = made.metadata_props.add()
         entry.key, entry.value = "rlctl", description or INFO.model_dump_json()
         path = tmp_path / "policy.onnx"
-        path.write_bytes(made.SerializeToString())
+        path.write_bytes(onnx_file.encode(made))
         return path
 
     return written
@@ -122,7 +123,7 @@ def test_a_state_without_measure(write):
             shape = [layers, "batch", hidden]
             model.graph.input.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
         other = path.with_name("state.onnx")
-        other.write_bytes(model.SerializeToString())
+        other.write_bytes(onnx_file.encode(model))
         assert "its graph does not fit its description: " in refused(other)
 
 
@@ -134,6 +135,34 @@ def test_a_description_that_is_none(write):
     assert "1,000,000,000,000 elements, at most 10,000,000 are supported" in refused(
         write(tanh, description=json.dumps(info))
     )
+
+
+def test_no_bit_of_an_export_changes_unnoticed(write):
+    path = write([node("Add", "obs", "w")], [constant("w", np.arange(4, dtype=np.float32))])
+    whole = path.read_bytes()
+    for place in range(len(whole)):
+        content = bytearray(whole)
+        content[place] ^= 1
+        path.write_bytes(content)
+        refused(path)
+
+
+def test_changed_weights_are_named_as_such(write):
+    path = write([node("Add", "obs", "w")], [constant("w", np.ones(4, np.float32))])
+    model = onnx.load(path)
+    model.graph.initializer[0].CopyFrom(constant("w", np.zeros(4, np.float32)))
+    onnx.save(model, path)
+    assert refused(path).endswith("its sha256 is not the one it was exported with")
+
+
+def test_an_export_without_a_digest(write):
+    path = write([node("Tanh", "obs")])
+    model = onnx.load(path)
+    kept = [each for each in model.metadata_props if each.key == "rlctl"]
+    del model.metadata_props[:]
+    model.metadata_props.extend(kept)
+    onnx.save(model, path)
+    assert refused(path).endswith("its metadata has no sha256, which every export of rlctl has; export it again")
 
 
 def test_any_cut_and_any_flipped_byte(write):

@@ -11,7 +11,7 @@ from safetensors.numpy import load_file, save
 
 from rlctl.errors import RlctlError
 from rlctl.run.env_info import EnvInfo, space_to_json
-from rlctl.run.policy import PolicyInfo, load_policy, save_policy
+from rlctl.run.policy import PolicyInfo, compute_digest, load_policy, save_policy
 from rlctl.run.torch_policy import build_network
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
@@ -38,7 +38,8 @@ def changed(good, tmp_path):
         path = tmp_path / "policy.safetensors"
         info = json.loads(PolicyInfo.model_dump_json(load_policy(good).info)) if description is None else description
         text = info if isinstance(info, str) else json.dumps(info)
-        path.write_bytes(save({**load_file(good), **tensors}, metadata={"rlctl": text}))
+        content = {**load_file(good), **tensors}
+        path.write_bytes(save(content, metadata={"rlctl": text, "sha256": compute_digest(text, content)}))
         return path
 
     return change

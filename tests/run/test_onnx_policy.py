@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.export.actor import build
+from rlctl.run import onnx_file
 from rlctl.run.env_info import describe
 from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import ROWS, BatchActor, load_policy
@@ -28,7 +29,7 @@ def exported(path, algo="ppo", **kwargs):
     model = ALGORITHMS[algo](policy_name(algo, env.observation_space), env, device="cpu", seed=0, **kwargs)
     model.policy.action_net.weight.data.mul_(100.0)  # SB3 begins with actions near zero
     info, tensors = pack(model, algo, PENDULUM, describe(PENDULUM.make()))
-    onnx.save(build(info, model.policy, tensors), path)
+    path.write_bytes(onnx_file.encode(build(info, model.policy, tensors)))
     return path
 
 
@@ -133,7 +134,7 @@ def with_description(path, target, change):
     description = json.loads(entry.value)
     change(description)
     entry.value = json.dumps(description)
-    onnx.save(model, target)
+    target.write_bytes(onnx_file.encode(model))
     return target
 
 
@@ -152,11 +153,11 @@ def test_description_of_another_graph(pendulum, tmp_path):
         OnnxPolicy.load(path)
 
 
-def test_neither_torch_nor_sb3_nor_onnx_is_imported(pendulum):
+def test_neither_torch_nor_sb3_is_imported(pendulum):
     code = (
         "import sys, numpy, rlctl\n"
         f"action = rlctl.load_policy({str(pendulum)!r}).predict(numpy.zeros(3))\n"
-        "print(action.shape, [name for name in ('torch', 'stable_baselines3', 'sb3_contrib', 'onnx', 'pybullet')"
+        "print(action.shape, [name for name in ('torch', 'stable_baselines3', 'sb3_contrib', 'pybullet')"
         " if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

@@ -6,11 +6,12 @@ import json
 import numpy as np
 import pytest
 from gymnasium import spaces
+from safetensors.numpy import load_file, save
 
 import rlctl
 from rlctl.errors import ArtifactError
 from rlctl.run.env_info import EnvInfo, space_to_json
-from rlctl.run.policy import ROWS, BatchActor, PolicyInfo, read_policy, save_policy
+from rlctl.run.policy import ROWS, BatchActor, PolicyInfo, compute_digest, read_policy, save_policy
 from rlctl.run.torch_policy import build_network, pin_threads
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
@@ -102,9 +103,9 @@ def test_normalisation_by_hand(path):
 
 
 def rewrite(path, metadata):
-    from safetensors.numpy import load_file, save
-
-    path.write_bytes(save(load_file(path), metadata=metadata))
+    tensors = load_file(path)
+    digest = {"sha256": compute_digest(metadata["rlctl"], tensors)} if "rlctl" in metadata else {}
+    path.write_bytes(save(tensors, metadata={**metadata, **digest}))
 
 
 @pytest.mark.parametrize("size", [0, 4, 100, -1])
@@ -135,6 +136,13 @@ def test_a_newer_format(path):
 def test_damaged_metadata(path, text):
     rewrite(path, {"rlctl": text})
     with pytest.raises(ArtifactError, match=r"policy.safetensors: its rlctl metadata is damaged: "):
+        rlctl.load_policy(path)
+
+
+def test_a_policy_without_a_digest(path):
+    info, tensors = read_policy(path)
+    path.write_bytes(save(tensors, metadata={"rlctl": info.model_dump_json()}))
+    with pytest.raises(ArtifactError, match=r"damaged: its metadata has no sha256, which every policy of rlctl has$"):
         rlctl.load_policy(path)
 
 
