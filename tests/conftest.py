@@ -1,6 +1,10 @@
 """Fixtures for all tests: the command line, how its processes start, installed plugins, and processes left behind."""
 
 import os
+
+# Each of the processes that run the tests has a core: threads of a library would only wait for each other.
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+
 import subprocess
 import sys
 import textwrap

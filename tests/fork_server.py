@@ -28,6 +28,8 @@ import time
 import traceback
 from pathlib import Path
 
+from rlctl.rollout.process_start import set_default_start
+
 ROOT = Path(__file__).parents[1]
 FOR_WORKERS = ("rlctl.rollout.worker_process", "rlctl.task.env", "rlctl.run.env_info", "gymnasium.envs.registration")
 FOR_COMMANDS = (
@@ -100,7 +102,6 @@ class ForkServer:
                 [sys.executable, "-c", code],
                 cwd=ROOT,
                 pass_fds=(theirs.fileno(),),
-                env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
                 process_group=0,  # an interrupt at the terminal is for the tests
             )
         return cls(ours, process)
@@ -223,8 +224,8 @@ def _receive(connection):
     return request, descriptors
 
 
-def serve(connection):
-    """Fork for every request until the other end is closed; does not return."""
+def serve(connection, commands=False):
+    """Fork for every request until the other end is closed; does not return. Commands get a server for their workers."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     while received := _receive(connection):
@@ -234,7 +235,7 @@ def serve(connection):
             # It ends at once, so that the new process gets the caller as its parent.
             received[0]["between"] = os.getpid()
             if os.fork() == 0:
-                _become(*received, write_end)
+                _become(*received, write_end, commands)
             os._exit(0)
         os.close(write_end)
         for descriptor in received[1]:
@@ -246,7 +247,7 @@ def serve(connection):
     os._exit(0)
 
 
-def _become(request, received, ready):
+def _become(request, received, ready, commands):
     """Be the new process; does not return."""
     code = 70
     try:
@@ -259,6 +260,8 @@ def _become(request, received, ready):
         os.write(ready, struct.pack("i", os.getpid()))
         _take_descriptors(request["descriptors"], received)
         _take_surroundings(request)
+        if commands:
+            set_default_start(ForkServer.fork().start)
         code = _run(request["command"][1:])
     except BaseException:
         traceback.print_exc()
@@ -304,9 +307,6 @@ def _run(arguments):
     sys.argv = [kind, *rest]
     try:
         if kind == "-m":
-            from rlctl.rollout.process_start import set_default_start
-
-            set_default_start(ForkServer.fork().start)
             runpy.run_module(what, run_name="__main__", alter_sys=True)
         else:
             exec(compile(what, "<string>", "exec"), {"__name__": "__main__"})
@@ -332,4 +332,4 @@ def main(descriptor, commands):
             importlib.import_module(module.name)
     gc.collect()
     gc.freeze()
-    serve(socket.socket(fileno=descriptor))
+    serve(socket.socket(fileno=descriptor), commands)

@@ -1,12 +1,11 @@
 """What may import what, so that each part can be read, tested and started alone."""
 
 import ast
+import functools
 import json
 import subprocess
 import sys
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parent.parent
 
@@ -38,6 +37,7 @@ MAY_IMPORT_TORCH = {  # besides train/
 }
 
 
+@functools.cache
 def imports(file: Path) -> set[str]:
     """Every module a file imports, anywhere in it but under TYPE_CHECKING."""
     tree = ast.parse(file.read_text())
@@ -72,69 +72,71 @@ def test_every_part_has_a_layer():
     assert {part for part in parts - {"py", "__pycache__"} if not any(part in layer for layer in LAYERS)} == set()
 
 
-@pytest.mark.parametrize("file", files("rlctl"), ids=lambda file: str(file.relative_to(ROOT)))
-def test_imports_run_one_way(file):
-    relative = file.relative_to(ROOT / "rlctl")
-    part = relative.parts[0].removesuffix(".py")
-    for module in imports(file):
-        assert not module.startswith("rlctl_"), "a plugin"
-        if module.split(".")[0] != "rlctl":
-            continue
-        other = part_of(module)
-        allowed = other == part or level(other) > level(part) or (part, other) in ALSO
-        assert allowed, f"{part} imports {module}"
-        assert (part, other) not in NOT_AMONG_VERBS, f"{part} imports {module}"
+def test_imports_run_one_way():
+    wrong = []
+    for file in files("rlctl"):
+        part = file.relative_to(ROOT / "rlctl").parts[0].removesuffix(".py")
+        for module in imports(file):
+            package, other = module.split(".")[0], part_of(module)
+            if package.startswith("rlctl_") or (package == "rlctl" and not may_import(part, other)):
+                wrong.append(f"{file.relative_to(ROOT)} imports {module}")
+    assert wrong == []
 
 
-@pytest.mark.parametrize("file", files("rlctl"), ids=lambda file: str(file.relative_to(ROOT)))
-def test_who_imports_torch(file):
-    name = str(file.relative_to(ROOT))
-    if name in MAY_IMPORT_TORCH or name.startswith("rlctl/train/"):
-        return
-    used = {module.split(".")[0] for module in imports(file)} & TORCH
-    assert not used, f"{name} imports {used}"
-
-
-@pytest.mark.parametrize("file", files("plugins"), ids=lambda file: str(file.relative_to(ROOT)))
-def test_plugins_know_the_task_layer_only(file):
-    for module in imports(file):
-        assert module.split(".")[0] != "rlctl" or module.startswith("rlctl.task"), module
-
-
-def loaded_after(code: str) -> set[str]:
-    told = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            f"{code}\nimport json, sys; print('\\n' + json.dumps(list(sys.modules)), file=sys.stderr)",
-        ],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=ROOT.parent,
+def may_import(part: str, other: str) -> bool:
+    return (
+        other == part or (level(other) > level(part) and (part, other) not in NOT_AMONG_VERBS) or (part, other) in ALSO
     )
-    return {name.partition(".")[0] for name in json.loads(told.stderr.splitlines()[-1])}
+
+
+def test_who_imports_torch():
+    found = [
+        f"{name} imports {module}"
+        for file in files("rlctl")
+        if (name := str(file.relative_to(ROOT))) not in MAY_IMPORT_TORCH and not name.startswith("rlctl/train/")
+        for module in imports(file)
+        if module.split(".")[0] in TORCH
+    ]
+    assert found == []
+
+
+def test_plugins_know_the_task_layer_only():
+    wrong = [
+        f"{file.relative_to(ROOT)} imports {module}"
+        for file in files("plugins")
+        for module in imports(file)
+        if module.split(".")[0] == "rlctl" and not module.startswith("rlctl.task")
+    ]
+    assert wrong == []
+
+
+def loaded_after(*lines: str) -> dict[str, set[str]]:
+    """Run lines of Python in one fresh interpreter; return the packages that are loaded after each."""
+    note = "print('@' + json.dumps(sorted({name.partition('.')[0] for name in sys.modules})), file=sys.stderr)"
+    code = "\n".join(["import json, sys", *(f"{line}\n{note}" for line in lines)])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT.parent)
+    found = [set(json.loads(line[1:])) for line in done.stderr.splitlines() if line.startswith("@")]
+    return dict(zip(lines, found, strict=True))
 
 
 HEAVY = {"numpy", "torch", "gymnasium", "pybullet", "rerun", "scipy", "stable_baselines3", "onnx", "onnxruntime"}
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
+def test_what_must_start_at_once():
+    commands = [["--help"], ["train", "--help"], ["tasks"], ["--version"]]
+    loaded = loaded_after(
         "import rlctl",
-        "from rlctl.cli import run; assert run(['--help']) == 0",
-        "from rlctl.cli import run; assert run(['train', '--help']) == 0",
-        "from rlctl.cli import run; assert run(['tasks']) == 0",
-        "from rlctl.cli import run; assert run(['--version']) == 0",
-        "from rlctl.cli import run; assert run(['evil']) == 2",
-    ],
-)
-def test_what_must_start_at_once(code):
-    assert not loaded_after(code) & HEAVY
+        "from rlctl.cli import run",
+        *(f"assert run({command}) == 0" for command in commands),
+        "assert run(['evil']) == 2",
+    )
+    assert {line: modules & HEAVY for line, modules in loaded.items() if modules & HEAVY} == {}
 
 
 def test_environments_come_without_learning_libraries():
-    assert not loaded_after("import rlctl; rlctl.make('reach').close()") & TORCH
-    assert not loaded_after("from rlctl.rollout import collect, workers, worker_process") & TORCH
-    assert not loaded_after("from rlctl.env_spec import EnvSpec; EnvSpec('Pendulum-v1').make()") & TORCH
+    loaded = loaded_after(
+        "import rlctl; rlctl.make('reach').close()",
+        "from rlctl.env_spec import EnvSpec; EnvSpec('Pendulum-v1').make()",
+        "from rlctl.rollout import collect, workers, worker_process",
+    )
+    assert {line: modules & TORCH for line, modules in loaded.items() if modules & TORCH} == {}
