@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow test-crash lint format bench clean
+.PHONY: demo test test-slow test-crash test-all lint format bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/rlctl train reach
@@ -11,14 +11,22 @@ demo: $(VENV)/.installed
 	$(BIN)/rlctl export reach --onnx
 	$(BIN)/rlctl replay reach
 
-test: lint
-	$(BIN)/python -m pytest -n 2
+# Lint and types are checked beside the tests; what they say comes after the tests' own lines.
+test: $(VENV)/.dev
+	@said=$$(mktemp); $(MAKE) --no-print-directory lint > $$said 2>&1 & lint=$$!; \
+	trap 'kill $$lint 2> /dev/null; rm -f $$said' EXIT; \
+	$(BIN)/python -m pytest -n 2; tests=$$?; \
+	wait $$lint; code=$$?; cat $$said; \
+	[ $$tests -eq 0 ] && [ $$code -eq 0 ]
 
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow --timeout 3600
 
 test-crash: $(VENV)/.dev
 	$(BIN)/python -m pytest tests/crash -m "" -n 2 --timeout 3600
+
+test-all: lint
+	$(BIN)/python -m pytest -m "" -n 2 --timeout 3600
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff format --check
@@ -40,6 +48,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/pip install -q -c constraints.txt -e .
 	touch $@
 
-$(VENV)/.dev: $(VENV)/.installed
+$(VENV)/.dev: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install -q -c constraints.txt -e '.[dev]'
-	touch $@
+	touch $(VENV)/.installed $@

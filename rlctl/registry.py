@@ -58,13 +58,15 @@ def list_installed() -> list[TaskEntry]:
     """Return every installed task, by name; of two with one name the bundled one, or the first, can be used."""
     found: list[TaskEntry] = []
     seen: set[tuple[str, str]] = set()
+    named: dict[Any, tuple[str, str]] = {}  # each look at a distribution's name or version reads its metadata anew
     for point in importlib.metadata.entry_points(group=GROUP):
         if (point.name, point.value) in seen:  # a checkout on sys.path beside its own installation
             continue
         seen.add((point.name, point.value))
-        distribution = (point.dist and point.dist.name) or "?"
-        version = (point.dist and point.dist.version) or "?"
-        found.append(TaskEntry(point.name, point.value, distribution, version))
+        if point.dist not in named:
+            metadata: Any = point.dist.metadata if point.dist else {}
+            named[point.dist] = (metadata.get("Name") or "?", metadata.get("Version") or "?")
+        found.append(TaskEntry(point.name, point.value, *named[point.dist]))
     found.sort(key=lambda entry: (entry.name, entry.distribution != OURS, entry.distribution))
     entries: list[TaskEntry] = []
     for entry in found:
@@ -80,6 +82,8 @@ def list_installed() -> list[TaskEntry]:
 
 def find(name: str) -> TaskEntry | None:
     """Return the installed task that a name stands for."""
+    if ":" in name:  # names a module, a file or a package
+        return None
     return next((entry for entry in list_installed() if entry.name == name), None)
 
 

@@ -225,7 +225,7 @@ def _receive(connection):
 
 
 def serve(connection, commands=False):
-    """Fork for every request until the other end is closed; does not return. Commands get a server for their workers."""
+    """Fork for every request until the other end is closed; a command gets a server for its workers."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     while received := _receive(connection):
