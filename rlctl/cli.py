@@ -102,7 +102,7 @@ def check_env(
     from rlctl.check_env import formats
     from rlctl.check_env.check import check
     from rlctl.check_env.formats import rules
-    from rlctl.check_env.rules.selection import chosen
+    from rlctl.check_env.selection import choose_rules
     from rlctl.env_spec import EnvSpec
 
     if list_rules or explain is not None:
@@ -112,7 +112,7 @@ def check_env(
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
     form, target = formats.choose(form, output, json)
     spec = EnvSpec(task, _task_settings(settings))
-    report = check(spec, rules=chosen(select, ignore), strict=strict, env_timeout_s=env_timeout)
+    report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)
     formats.show(report, form, target)
     raise typer.Exit(report.exit_code)
 

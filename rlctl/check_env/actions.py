@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from gymnasium import spaces
+
+if TYPE_CHECKING:
+    from gymnasium import spaces
 
 HOLD_STEPS = 10
 """How long an extreme action is held."""
@@ -38,6 +40,8 @@ def actions(space: spaces.Space[Any], kind: str, seed: int) -> Iterator[Any]:
 
 def zero_action(space: spaces.Space[Any]) -> Any:
     """Return the action that is nearest to doing nothing: zeros, or what stands first."""
+    from gymnasium import spaces
+
     if isinstance(space, spaces.Box):
         return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
     if isinstance(space, spaces.Discrete):
@@ -54,6 +58,8 @@ def zero_action(space: spaces.Space[Any]) -> Any:
 
 
 def _corner(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
+    from gymnasium import spaces
+
     if isinstance(space, spaces.Box):
         corner = np.where(rng.random(space.shape) < 0.5, space.low, space.high)
         return np.where(np.isfinite(corner), corner, space.sample()).astype(space.dtype)

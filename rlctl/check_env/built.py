@@ -1,4 +1,4 @@
-"""Describes an environment that was built: its spaces, and what it tells about itself."""
+"""Describes an environment that was built: its spaces, and what it says about itself."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from typing import Any
 
 from rlctl.check_env.bullet_clients import connected
 from rlctl.check_env.instance import Instance
-from rlctl.check_env.leaves import leaf_to_wire
-from rlctl.check_env.wire import Message
+from rlctl.check_env.messages import Built
 
 WAIVERS = "rlctl_ignore"
 """The class attribute that waives rules: rule id -> reason."""
 
 
-def built(instance: Instance) -> Message:
-    """Return the message that describes an environment."""
+def describe_built(instance: Instance) -> Built:
+    """Return what is known of an environment before it is used."""
     import gymnasium
 
     env = instance.env
@@ -25,29 +24,24 @@ def built(instance: Instance) -> Message:
     task_env = sys.modules.get("rlctl.task.env")
     is_task = task_env is not None and isinstance(inner, task_env.TaskEnv)
     author = type(inner.task) if is_task else type(inner)
-    parts = {"leaves": instance.leaves, "action_leaves": instance.action_leaves}
-    header = {
-        "type": "built",
-        **{name: [leaf_to_wire(leaf) for leaf in leaves] for name, leaves in parts.items()},
-        "observation_space": _short(getattr(env, "observation_space", None)),
-        "action_space": _short(env.action_space),
-        "names": dict(inner.observation_sizes) if is_task else {},
-        "max_steps": inner.max_steps if is_task else getattr(spec, "max_episode_steps", None),
-        "nondeterministic": bool(getattr(spec, "nondeterministic", False)),
-        "accepts_seed": instance.accepts_seed,
-        "is_env": isinstance(env, gymnasium.Env),
-        "is_old_gym": any(base.__module__.partition(".")[0] == "gym" for base in type(inner).__mro__),
-        "metadata": _metadata(inner),
-        "uses_pybullet": bool(connected()),
-        "waivers": _waivers(author),
-        **_place(author),
-    }
-    arrays = {}
-    for name, leaves in parts.items():
-        for i, leaf in enumerate(leaves):
-            if leaf.low is not None and leaf.high is not None:
-                arrays[f"{name}/{i}/low"], arrays[f"{name}/{i}/high"] = leaf.low, leaf.high
-    return header, arrays
+    file, line = _place(author)
+    return Built(
+        leaves=instance.leaves,
+        action_leaves=instance.action_leaves,
+        observation_space=_short(getattr(env, "observation_space", None)),
+        action_space=_short(env.action_space),
+        names=dict(inner.observation_sizes) if is_task else {},
+        max_steps=inner.max_steps if is_task else getattr(spec, "max_episode_steps", None),
+        nondeterministic=bool(getattr(spec, "nondeterministic", False)),
+        accepts_seed=instance.accepts_seed,
+        is_env=isinstance(env, gymnasium.Env),
+        is_old_gym=any(base.__module__.partition(".")[0] == "gym" for base in type(inner).__mro__),
+        metadata=_metadata(inner),
+        uses_pybullet=bool(connected()),
+        waivers=_waivers(author),
+        file=file,
+        line=line,
+    )
 
 
 def _metadata(env: Any) -> dict[str, Any]:
@@ -69,12 +63,12 @@ def _waivers(author: type) -> Any:
     return {repr(waivers)[:40]: ""}
 
 
-def _place(author: type) -> dict[str, Any]:
-    """Return where the class that somebody wrote stands."""
+def _place(author: type) -> tuple[str | None, int | None]:
+    """Return file and line of the class that somebody wrote."""
     try:
-        return {"file": inspect.getsourcefile(author), "line": inspect.getsourcelines(author)[1]}
+        return inspect.getsourcefile(author), inspect.getsourcelines(author)[1]
     except (OSError, TypeError):
-        return {"file": None, "line": None}
+        return None, None
 
 
 def _short(space: Any) -> str:

@@ -1,4 +1,4 @@
-"""`check`: from a description of an environment to a report. It lives in child processes, never in this one."""
+"""`check`: from a description of an environment to a report. The environment runs in child processes only."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 from rlctl import registry
-from rlctl.check_env import studies
-from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import Rule, Severity
+from rlctl.check_env import families
+from rlctl.check_env.finding import RULES, Severity
 from rlctl.check_env.judge import Verdict, judge
-from rlctl.check_env.progress import Where
-from rlctl.check_env.rules import RULES
-from rlctl.check_env.watch import Watch
-from rlctl.check_env.wire import Message
+from rlctl.check_env.messages import Message, Mistake
+from rlctl.check_env.progress import Position
+from rlctl.check_env.records import Records
+from rlctl.check_env.supervisor import Supervisor
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, UsageError
 
@@ -27,11 +26,11 @@ class Report:
 
     task: str
     verdict: Verdict
-    evidence: Evidence
+    records: Records
     seconds: float
     """How long the check took."""
     budget_s: float
-    """How long the studies of one process might take."""
+    """How long the experiments of one process might take."""
     strict: bool = False
     """Whether warnings count as errors."""
 
@@ -40,7 +39,7 @@ class Report:
         """70 if a rule crashed, 3 if no instance could be built, 1 for errors, 0 otherwise."""
         if self.verdict.crashed:
             return 70
-        if self.evidence.built is None:
+        if self.records.built is None:
             return 3
         bad = (Severity.ERROR, Severity.WARNING) if self.strict else (Severity.ERROR,)
         return int(any(finding.severity in bad for finding in self.verdict.findings))
@@ -48,7 +47,7 @@ class Report:
     @property
     def place(self) -> tuple[Path, int] | None:
         """File and line of the environment's class; line 1 where only the file is known."""
-        built = self.evidence.built
+        built = self.records.built
         if built is not None and built.file is not None:
             return Path(built.file), built.line or 1
         file = registry.find_source_file(self.task)
@@ -59,42 +58,42 @@ def check(
     spec: EnvSpec,
     *,
     env_timeout_s: float,
-    rules: Sequence[Rule] = RULES,
+    rules: Sequence[str] = tuple(RULES),
     strict: bool = False,
     only: Collection[str] | None = None,
-    budget_s: float = studies.PART_S,
+    budget_s: float = families.PROCESS_S,
     show_progress: bool = True,
 ) -> Report:
-    """Check an environment with some rules, or with what these can tell from some studies `only`.
+    """Check an environment with some rules, given by id, or with what these can say from some experiments `only`.
 
     Raises `UsageError` for a task or a parameter that does not exist. Whatever the environment itself does, a crash
     or a hang of more than `env_timeout_s` seconds in a call included, is in the report.
     """
     started = time.monotonic()
-    evidence = Evidence(spec.task, normalizes=_normalizes(spec.task))
+    records = Records(spec.task, normalizes=_normalizes(spec.task))
     mistakes: list[UsageError] = []
 
     def receive(message: Message) -> None:
-        header, arrays = message
-        if header["type"] == "usage_error":
-            kind = RecipeError if header["kind"] == "RecipeError" else UsageError
-            mistakes.append(kind(header["message"]))
+        if isinstance(message, Mistake):
+            mistakes.append((RecipeError if message.is_recipe else UsageError)(message.message))
         else:
-            evidence.add(header, arrays)
+            records.add(message)
 
-    needed = {study for rule in rules for study in rule.needs if only is None or study in only}
-    parts = {part: [study.name for study in studies.of_part(part, needed)] for part in studies.PARTS}
-    watch = Watch(spec, budget_s, env_timeout_s, receive)
+    needed = {"build"} | {name for name in families.find_needs(rules) if only is None or name in only}
+    experiments = {
+        name: [each.name for each in process.experiments if each.name in needed]
+        for name, process in families.PROCESSES.items()
+    }
+    supervisor = Supervisor(spec, budget_s, env_timeout_s, receive)
     try:
         with _status(spec.task, show_progress) as say:
-            watch.run({part: names for part, names in parts.items() if names or part == "probe"}, say)
+            supervisor.run({name: names for name, names in experiments.items() if names}, say)
     finally:
-        watch.close()
+        supervisor.close()
     if mistakes:
         raise mistakes[0]
-    evidence.printed_lines, evidence.printed_first = watch.children[0].printed, watch.children[0].first_line
-    verdict = judge(evidence, rules)
-    return Report(spec.task, verdict, evidence, time.monotonic() - started, budget_s, strict)
+    records.printed_lines, records.printed_first = supervisor.children[0].printed, supervisor.children[0].first_line
+    return Report(spec.task, judge(records, rules), records, time.monotonic() - started, budget_s, strict)
 
 
 def _normalizes(task: str) -> bool | None:
@@ -108,18 +107,18 @@ def _normalizes(task: str) -> bool | None:
 
 
 @contextlib.contextmanager
-def _status(task: str, wanted: bool) -> Iterator[Callable[[Where], None]]:
+def _status(task: str, wanted: bool) -> Iterator[Callable[[Position], None]]:
     """Show a line about what is going on, on a terminal only."""
     from rlctl import output
 
     console = output.err()
     if not wanted or not console.is_terminal:
-        yield lambda where: None
+        yield lambda position: None
         return
     with console.status(f"checking {task}") as status:
 
-        def say(where: Where) -> None:
-            number = f" {where.episode + 1}" if where.phase == "episodes" else ""
-            status.update(f"checking {task}: {where.phase}{number}")
+        def say(position: Position) -> None:
+            number = f" {position.episode + 1}" if position.phase == "episodes" else ""
+            status.update(f"checking {task}: {position.phase}{number}")
 
         yield say

@@ -1,4 +1,4 @@
-"""What a study works with: instances of the environment, the time it has, and a place to say what it does."""
+"""What an experiment works with: instances of the environment, the time it has, and a place to say what it does."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from rlctl import env_spec, registry
 from rlctl.check_env.failures import EnvironmentRaised, describe, failure
 from rlctl.check_env.instance import Budget, Instance
 from rlctl.check_env.leaves import leaves_of
+from rlctl.check_env.messages import Failure
 from rlctl.check_env.progress import Progress
-from rlctl.check_env.wire import Message
 from rlctl.errors import TaskError
+
+RenderMode = Literal["rgb_array", "ansi"]
 
 
 class Context:
@@ -26,10 +28,12 @@ class Context:
         self.stage = "import"
         """How far the last attempt to build an instance came: `import` or `constructor`."""
         self.budget = Budget(time.monotonic())
-        """What the study that is running may use."""
+        """What the experiment that is running may use."""
+        self.facts: dict[str, Any] = {}
+        """The facts that earlier experiments of this process have sent."""
         self._instance: Instance | None = None
 
-    def make(self, render_mode: Literal["rgb_array", "ansi"] | None = None) -> Any:
+    def make(self, render_mode: RenderMode | None = None) -> Any:
         """Return a new environment; whatever the environment raises is an `RlctlError`."""
         self.stage = "import"
         # Loaded before it is built, to tell an import error from a constructor's.
@@ -41,28 +45,33 @@ class Context:
         self.progress.leave()
         return env
 
-    def build(self, render_mode: Literal["rgb_array", "ansi"] | None = None) -> Instance:
+    def build(self, render_mode: RenderMode | None = None) -> Instance:
         """Return a new instance; what its constructor raises is an `EnvironmentRaised`."""
         try:
             return self._wrap(self.make(render_mode))
         except BaseException as error:
             raise EnvironmentRaised("build") from error
 
-    def first(self) -> Instance:
+    def build_first(self) -> Instance:
         """Build the instance that this process keeps; raises what the constructor raises."""
         self._instance = self._wrap(self.make())
         return self._instance
 
     @property
     def instance(self) -> Instance:
-        """The instance that this process keeps; built when it is first asked for."""
+        """The instance that this process keeps; built by its first use."""
         if self._instance is None:
             self._instance = self.build()
         return self._instance
 
+    @property
+    def is_built(self) -> bool:
+        """Whether this process keeps an instance."""
+        return self._instance is not None
+
     @contextlib.contextmanager
-    def fresh(self, render_mode: Literal["rgb_array", "ansi"] | None = None) -> Iterator[Instance]:
-        """A new instance for one study, closed after it; what its close raises is another study's matter."""
+    def fresh(self, render_mode: RenderMode | None = None) -> Iterator[Instance]:
+        """A new instance for one experiment, closed after it; what its close raises is not this experiment's matter."""
         instance = self.build(render_mode)
         try:
             yield instance
@@ -71,20 +80,17 @@ class Context:
                 with contextlib.suppress(EnvironmentRaised):
                     instance.close()
 
-    def close(self) -> Iterator[Message]:
-        """Close the instance that this process keeps."""
-        if self._instance is not None:
+    def close(self, instance: Instance | None = None) -> Iterator[Failure]:
+        """Close an instance, by default the one that this process keeps; yield what it raised."""
+        if instance is None:
             self.progress.phase("close")
-            yield from self.closed(self._instance)
-
-    def closed(self, instance: Instance) -> Iterator[Message]:
-        """Close an instance; yield what it raised."""
-        if not hasattr(instance.env, "close"):
+            instance = self._instance
+        if instance is None or not hasattr(instance.env, "close"):
             return
         try:
             instance.close()
         except EnvironmentRaised as error:
-            yield failure(error, self.progress), {}
+            yield failure(error, self.progress)
 
     def _wrap(self, env: Any) -> Instance:
         try:

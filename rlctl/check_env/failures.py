@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import traceback
 from pathlib import Path
-from typing import Any
 
+from rlctl.check_env.messages import Failure
 from rlctl.check_env.missing_files import missing_file
 from rlctl.check_env.progress import Progress
 from rlctl.errors import RlctlError
@@ -21,22 +21,21 @@ class EnvironmentRaised(Exception):
         self.call = call
 
 
-def failure(error: EnvironmentRaised, progress: Progress) -> dict[str, Any]:
-    """Describe what a call into the environment raised, and when, as a message."""
+def failure(error: EnvironmentRaised, progress: Progress) -> Failure:
+    """Describe what a call into the environment raised, and when."""
     where = progress.read()
     cause = error.__cause__ or error
-    return {
-        "type": "failure",
-        "kind": "raised",
-        "call": error.call,
-        "phase": where.phase,
-        "episode": where.episode,
-        "seed": where.seed,
-        "step": where.step,
-        "error": describe(cause),
-        "details": "".join(traceback.format_exception(cause)),
-        "file": missing_file(cause),
-    }
+    return Failure(
+        kind="raised",
+        call=error.call,
+        phase=where.phase,
+        episode=where.episode,
+        seed=where.seed,
+        step=where.step,
+        error=describe(cause),
+        details="".join(traceback.format_exception(cause)),
+        file=missing_file(cause),
+    )
 
 
 def describe(error: BaseException) -> str:

@@ -1,16 +1,15 @@
-"""What a rule is, and what it finds."""
+"""What a rule says, and what it finds. The texts of the rules are data, in rules.yaml beside this module."""
 
 from __future__ import annotations
 
 import dataclasses
 import enum
-import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from rlctl.check_env.evidence import Complaint, Evidence
-from rlctl.check_env.studies import CHECKERS, LIVES
+import yaml
 
 
 class Severity(enum.StrEnum):
@@ -30,83 +29,63 @@ class Severity(enum.StrEnum):
 
 
 @dataclasses.dataclass(frozen=True)
-class Finding:
-    """Something that is wrong, or may be, with one environment."""
-
-    rule: str
-    severity: Severity
-    name: str
-    message: str
-    evidence: Mapping[str, Any]
-    """Numbers and names that JSON can hold: seed, episode, step, value, expected."""
-    fix: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Seen:
-    """What a rule's check yields; the rule adds its id, and severity and fix where they are left out."""
-
-    message: str
-    evidence: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    severity: Severity | None = None
-    fix: str | None = None
-
-
-class NotJudged(Exception):
-    """Raised by a check that has too little to go by; the text says why."""
-
-
-class NotApplicable(Exception):
-    """Raised by a check that has nothing to look at in this kind of environment; the text says why."""
-
-
-Check = Callable[[Evidence], Iterable[Seen]]
-
-
-@dataclasses.dataclass(frozen=True)
 class Rule:
-    """One thing that can be wrong with an environment."""
+    """One thing that can be wrong with an environment, in words."""
 
     id: str
     name: str
     severity: Severity
-    fix: str
+    """Of a finding, unless the check gives it another one."""
     meaning: str
     """What it means and why it matters."""
-    check: Check
-    needs: tuple[str, ...]
-    """The studies whose results it reads."""
+    fix: str
     complaints: tuple[re.Pattern[str], ...]
-    """What the libraries' checkers say about the same thing."""
-    only_complaints: bool
-    """Whether nothing but a complaint can break it."""
+    """What the libraries' own checkers say about the same thing."""
 
-    def finding(self, seen: Seen) -> Finding:
-        """Return what the check saw as a finding."""
-        severity = seen.severity or self.severity
-        return Finding(self.id, severity, self.name, seen.message, seen.evidence, seen.fix or self.fix)
-
-    def owns(self, complaint: Complaint) -> bool:
-        """Say whether a complaint is about this."""
-        return any(pattern.search(complaint.text) for pattern in self.complaints)
+    def owns(self, complaint: str) -> bool:
+        """Say whether a complaint of a library's checker is about this."""
+        return any(pattern.search(complaint) for pattern in self.complaints)
 
 
-def rule(
-    id: str,
-    name: str,
-    severity: Severity,
-    fix: str,
-    *,
-    needs: Iterable[str] = LIVES,
-    complaints: Iterable[str] = (),
-    only_complaints: bool = False,
-) -> Callable[[Check], Rule]:
-    """Make a rule of a check; the check's docstring says what the rule means and why it matters."""
+def _load() -> tuple[dict[str, str], dict[str, Rule]]:
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where PyYAML has it
+    content = yaml.load(Path(__file__).with_name("rules.yaml").read_text(encoding="utf-8"), loader)  # noqa: S506
+    rules = {}
+    for text in content["rules"]:
+        patterns = tuple(re.compile(each, re.IGNORECASE) for each in text.pop("complaints", ()))
+        rules[text["id"]] = Rule(**{**text, "severity": Severity(text["severity"])}, complaints=patterns)
+    return content["families"], rules
 
-    def decorate(check: Check) -> Rule:
-        patterns = tuple(re.compile(pattern, re.IGNORECASE) for pattern in complaints)
-        meaning = inspect.getdoc(check) or ""
-        studies = CHECKERS if only_complaints else tuple(needs)
-        return Rule(id, name, severity, fix, meaning, check, studies, patterns, only_complaints)
 
-    return decorate
+FAMILIES, RULES = _load()
+"""The families' titles by the beginning of their ids, and the rules by id."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """Something that is wrong, or may be, with one environment. Severity and fix are the rule's where left out."""
+
+    rule: str
+    message: str
+    evidence: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Numbers and names that JSON can hold: seed, episode, step, value, expected."""
+    severity: Severity = None  # type: ignore[assignment]  # never None once it is made
+    fix: str = ""
+
+    def __post_init__(self) -> None:
+        rule = RULES[self.rule]
+        object.__setattr__(self, "severity", Severity(self.severity or rule.severity))
+        object.__setattr__(self, "fix", self.fix or rule.fix)
+
+    @property
+    def name(self) -> str:
+        """The rule's name."""
+        return RULES[self.rule].name
+
+
+class NotJudged(Exception):
+    """Raised by a check or an experiment that has too little to go by; the text says why."""
+
+
+class NotApplicable(Exception):
+    """Raised by a check or an experiment that has nothing to look at in this kind of environment; the text says why."""

@@ -1,9 +1,10 @@
-"""One environment, how it is called, and what may be used on it."""
+"""One environment that is not trusted, how it is called, and how much time and memory its episodes may take."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rlctl.check_env.failures import EnvironmentRaised
@@ -13,7 +14,7 @@ from rlctl.check_env.progress import Progress
 
 @dataclasses.dataclass
 class Budget:
-    """What the episodes of a probe may use together."""
+    """What the episodes of an experiment may use together."""
 
     deadline: float
     """On `time.monotonic`'s clock [s]."""
@@ -36,6 +37,13 @@ class Instance:
         self.accepts_seed = accepts_seed
         self.progress = progress
 
+    @property
+    def can_act(self) -> bool:
+        """Whether its action space is one of Gymnasium's, from which actions can be drawn."""
+        from gymnasium import spaces
+
+        return isinstance(self.env.action_space, spaces.Space)
+
     def call(self, name: str, function: Any, *arguments: Any, step: int = 0, **keywords: Any) -> Any:
         """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`."""
         self.progress.enter(name, step)
@@ -45,6 +53,13 @@ class Instance:
             raise EnvironmentRaised(name) from error
         finally:
             self.progress.leave()
+
+    def reset(self, seed: int, episode: int = 0, timer: Callable[..., Any] | None = None) -> Any:
+        """Reset with a seed, where reset takes one, and return what it returns."""
+        self.progress.episode(episode, seed)
+        keywords = {"seed": seed} if self.accepts_seed else {}
+        timed = (timer, self.env.reset) if timer else (self.env.reset,)
+        return self.call("reset", *timed, **keywords)
 
     def close(self) -> None:
         """Close the environment."""

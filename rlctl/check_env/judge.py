@@ -1,15 +1,18 @@
-"""Lets every rule read the evidence, and adds what the libraries' checkers said, nothing twice."""
+"""From records to a verdict: every rule's check is applied, and the libraries' complaints are added."""
 
 from __future__ import annotations
 
 import dataclasses
 import traceback
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Mapping
 
-from rlctl.check_env.evidence import Complaint, Evidence
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Rule, Severity
-from rlctl.check_env.rules import RULES, libraries, observations
+from rlctl.check_env import families
+from rlctl.check_env.complaints import judge_complaints, require_checker
+from rlctl.check_env.experiment import Experiment
+from rlctl.check_env.finding import RULES, Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.leaves import leaf_name
+from rlctl.check_env.messages import Failure
+from rlctl.check_env.records import Records
 from rlctl.errors import UsageError, did_you_mean
 
 LOADING = ("RL0", "RL216")
@@ -29,89 +32,90 @@ class Verdict:
     not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
     """Rule id, and what this kind of environment does not have."""
     crashed: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Rule id or name of a study, and traceback."""
+    """Rule id or name of an experiment, and traceback."""
 
 
-def judge(evidence: Evidence, rules: Sequence[Rule] = RULES) -> Verdict:
-    """Apply the rules; the findings come worst first. Raises `UsageError` for a waiver that is none."""
-    verdict = Verdict(crashed=dict(evidence.crashes))
+def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> Verdict:
+    """Apply the rules; the findings come worst first. Raises `UsageError` for a waiver that cannot be used."""
+    verdict = Verdict(crashed=dict(records.crashes))
     for rule in rules:
-        _apply(rule, evidence, verdict)
-    if evidence.built is not None:
-        _add_complaints(evidence, rules, verdict)
-        _waive(verdict, evidence.built.waivers)
-    for unseen in observations.not_judged(evidence):
-        name, _, reason = unseen.partition(": ")
-        verdict.not_judged[name] = reason
+        _apply(rule, records, verdict)
+    if records.built is not None:
+        verdict.findings += judge_complaints(records, rules, {finding.rule for finding in verdict.findings})
+        _waive(verdict, records.built.waivers)
+        for leaf in records.built.leaves:
+            if not leaf.supported:
+                verdict.not_judged[leaf_name(leaf)] = f"no rule can look into a {leaf.kind} space"
     verdict.findings.sort(key=lambda each: (each.severity.rank, each.rule))
     return verdict
 
 
-def _apply(rule: Rule, evidence: Evidence, verdict: Verdict) -> None:
-    if evidence.built is None and not rule.id.startswith(LOADING):
-        verdict.not_judged[rule.id] = "no instance could be built"
-        return
+def _apply(rule: str, records: Records, verdict: Verdict) -> None:
     try:
-        if rule.only_complaints and not any(problem is None for problem in evidence.checkers.values()):
-            raise NotJudged("no library's checker came to its end")
-        found = [rule.finding(seen) for seen in rule.check(evidence)]
+        found = _findings(rule, records)
     except NotJudged as reason:
-        verdict.not_judged[rule.id] = str(reason)
+        verdict.not_judged[rule] = str(reason)
     except NotApplicable as reason:
-        verdict.not_applicable[rule.id] = str(reason)
+        verdict.not_applicable[rule] = str(reason)
     except Exception:  # a rule's bug must not hide what the other rules found, and must not look like a pass
-        verdict.crashed[rule.id] = traceback.format_exc()
+        verdict.crashed[rule] = traceback.format_exc()
     else:
-        verdict.judged.append(rule.id)
+        verdict.judged.append(rule)
         verdict.findings += found
 
 
+def _findings(rule: str, records: Records) -> list[Finding]:
+    """Return what the experiment that decides a rule and the rule's check have found."""
+    check, experiment = families.CHECKS.get(rule), families.DECIDED_BY.get(rule)
+    found = [each for each in records.findings if each.rule == rule]
+    if found and records.built is None:
+        return found
+    if records.built is None and not rule.startswith(LOADING):
+        raise NotJudged("no instance could be built")
+    if experiment is not None and not found:
+        found = _ended(records, experiment, rule)
+        if not found:
+            _require_complete(records, experiment, rule)
+    if check is not None:
+        found += check.run(records)
+    if check is None and experiment is None:
+        require_checker(records, rule)
+    return found
+
+
+def _ended(records: Records, experiment: Experiment, rule: str) -> list[Finding]:
+    """Return the finding that an experiment that does what no learner would ended the process, or hung."""
+    if not experiment.provokes or rule != experiment.rules[0]:
+        return []
+    return [
+        Finding(rule, f"{experiment.provokes} {describe_end(each)}", each.place, Severity.ERROR)
+        for each in records.failures
+        if each.phase == experiment.name and each.kind in ("died", "hung")
+    ]
+
+
+def describe_end(failure: Failure) -> str:
+    """Return how a call ended the process, or did not come back."""
+    return f"hangs: it {failure.error}" if failure.kind == "hung" else f"ends the process: it {failure.error}"
+
+
+def _require_complete(records: Records, experiment: Experiment, rule: str) -> None:
+    if rule in records.skipped:
+        raise NotJudged(records.skipped[rule])
+    if rule in records.not_applicable:
+        raise NotApplicable(records.not_applicable[rule])
+    if experiment.name not in records.complete and not (records.built is None and experiment.name == "build"):
+        raise NotJudged(records.why_missing(experiment.name))
+
+
 def _waive(verdict: Verdict, waivers: Mapping[str, str]) -> None:
-    known = [rule.id for rule in RULES]
-    for rule_id, reason in waivers.items():
-        if rule_id not in known:
+    for rule, reason in waivers.items():
+        if rule not in RULES:
             raise UsageError(
-                f"rlctl_ignore: no rule {rule_id!r}.{did_you_mean(rule_id, known)} "
+                f"rlctl_ignore: no rule {rule!r}.{did_you_mean(rule, RULES)} "
                 'Write rlctl_ignore = {"RL604": "why this is meant"}.'
             )
         if not reason.strip():
-            raise UsageError(f"rlctl_ignore: {rule_id} is waived without a reason. Say why this is meant.")
+            raise UsageError(f"rlctl_ignore: {rule} is waived without a reason. Say why this is meant.")
     verdict.waived = [each for each in verdict.findings if each.rule in waivers]
     verdict.findings = [each for each in verdict.findings if each.rule not in waivers]
-
-
-def _add_complaints(evidence: Evidence, rules: Sequence[Rule], verdict: Verdict) -> None:
-    """Give each complaint to the rules that own it; one of them may have said the same already."""
-    found = {finding.rule for finding in verdict.findings}
-    said: dict[str, list[Complaint]] = {}
-    owners: dict[str, Rule] = {}
-    for complaint in evidence.complaints:
-        if libraries.is_noise(complaint):
-            continue
-        owning = [rule for rule in RULES if rule.owns(complaint)]
-        if any(rule.id in found for rule in owning):
-            continue
-        owner = owning[0] if owning else libraries.OF_CHECKER[complaint.checker]
-        if owner in rules:
-            owners[owner.id] = owner
-            said.setdefault(owner.id, []).append(complaint)
-    for rule_id, complaints in said.items():
-        verdict.findings += _from_complaints(owners[rule_id], complaints)
-
-
-def _from_complaints(rule: Rule, complaints: list[Complaint]) -> list[Finding]:
-    if rule in libraries.OF_CHECKER.values():  # unrelated complaints of one checker
-        return [_finding(rule, [each]) for each in complaints]
-    return [_finding(rule, complaints)]
-
-
-def _finding(rule: Rule, complaints: list[Complaint]) -> Finding:
-    severity = rule.severity
-    refused = any(each.kind == "error" for each in complaints)
-    if rule in libraries.OF_CHECKER.values() and refused:
-        severity = Severity.ERROR
-    elif severity is Severity.ERROR and not refused:
-        severity = Severity.WARNING  # the library only warns, and the rule itself saw nothing
-    said_by = list(dict.fromkeys(each.checker for each in complaints))
-    evidence: dict[str, Any] = {"said_by": " and ".join(said_by)}
-    return Finding(rule.id, severity, rule.name, complaints[0].text, evidence, rule.fix)

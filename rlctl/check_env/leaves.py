@@ -74,13 +74,3 @@ def pick(value: Any, path: Path) -> Any:
     for key in path:
         value = value[key]
     return value
-
-
-def leaf_to_wire(leaf: Leaf) -> dict[str, Any]:
-    """Return a leaf as plain data, without its bounds, which travel as arrays."""
-    return {"path": list(leaf.path), "kind": leaf.kind, "shape": list(leaf.shape), "dtype": leaf.dtype}
-
-
-def leaf_from_wire(data: dict[str, Any], low: NDArray[Any] | None, high: NDArray[Any] | None) -> Leaf:
-    """Return the leaf that `leaf_to_wire` wrote."""
-    return Leaf(tuple(data["path"]), data["kind"], tuple(data["shape"]), data["dtype"], low, high)

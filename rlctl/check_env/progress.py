@@ -1,4 +1,4 @@
-"""Where a child process is, in memory that its parent sees too: so a hang or a crash can be placed."""
+"""Where a child process is, in memory that its parent reads too: so a hang or a crash can be placed."""
 
 from __future__ import annotations
 
@@ -9,63 +9,53 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env import studies
-
 CALLS = ("", "load", "build", "reset", "step", "close", "sample", "check", "render", "compute_reward")
-PHASES = (
-    "build",
-    *studies.names(),
-    # Parts of studies.
-    "reused",
-    "dirty",
-    "seeds",
-    "alone",
-    "fresh instance",
-    "interleaved",
-    "after close",
-    "close",
-)
-
-_SIZE = 64  # [bytes]
+_NUMBERS = 6
+_PHASE_BYTES = 64
+_SIZE = 8 * _NUMBERS + _PHASE_BYTES
 
 
 @dataclasses.dataclass(frozen=True)
-class Where:
+class Position:
     """A moment of a child process."""
 
     counter: int
     call: str
     """What of the environment is being called; empty between calls."""
     phase: str
+    """The experiment, or the part of one."""
     episode: int
     seed: int
     step: int
     is_first: bool
-    """Whether it is the first call of its kind in the process: what is compiled or loaded late is in it."""
+    """Whether it is the first call of its kind in the process, which may compile or load something."""
 
 
 class Progress:
-    """Written by the child at every call, read by the parent. Without a descriptor it is seen by nobody else."""
+    """Written by the child at every call, read by the parent. Without a descriptor nobody else reads it."""
 
     def __init__(self, descriptor: int | None = None) -> None:
         if descriptor is None:
-            self._numbers: NDArray[np.int64] = np.zeros(_SIZE // 8, np.int64)
+            memory: mmap.mmap | bytearray = bytearray(_SIZE)
         else:
             os.ftruncate(descriptor, _SIZE)
-            self._numbers = np.frombuffer(mmap.mmap(descriptor, _SIZE), np.int64)
+            memory = mmap.mmap(descriptor, _SIZE)
+        self._numbers: NDArray[np.int64] = np.frombuffer(memory, np.int64, _NUMBERS)
+        self._phase: NDArray[np.uint8] = np.frombuffer(memory, np.uint8, _PHASE_BYTES, 8 * _NUMBERS)
         self._called: set[str] = set()
 
     def phase(self, name: str) -> None:
-        """Note what is being tried."""
-        self._numbers[2] = PHASES.index(name)
+        """Note which experiment, or part of one, begins."""
+        text = np.frombuffer(name.encode()[:_PHASE_BYTES].ljust(_PHASE_BYTES, b"\0"), np.uint8)
+        self._phase[:] = text
 
     def episode(self, episode: int, seed: int) -> None:
         """Note which episode begins."""
-        self._numbers[3:6] = episode, seed, 0
+        self._numbers[2:5] = episode, seed, 0
 
     def enter(self, call: str, step: int = 0) -> None:
         """Note that a call into the environment begins."""
-        self._numbers[5:7] = step, call not in self._called
+        self._numbers[4:6] = step, call not in self._called
         self._called.add(call)
         self._numbers[1] = CALLS.index(call)
         self._numbers[0] += 1
@@ -75,7 +65,8 @@ class Progress:
         self._numbers[1] = 0
         self._numbers[0] += 1
 
-    def read(self) -> Where:
+    def read(self) -> Position:
         """Return where the child is."""
-        counter, call, phase, episode, seed, step, is_first = self._numbers[:7].tolist()
-        return Where(counter, CALLS[call], PHASES[phase], episode, seed, step, bool(is_first))
+        counter, call, episode, seed, step, is_first = self._numbers.tolist()
+        phase = self._phase.tobytes().rstrip(b"\0").decode(errors="replace") or "build"
+        return Position(counter, CALLS[call], phase, episode, seed, step, bool(is_first))

@@ -3,17 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
 
-from rlctl.check_env.world_results import Worlds  # noqa: F401 (found by name)
-
-
-def decode(kind: str, content: Mapping[str, Any]) -> Any:
-    """Return the result that a study sent."""
-    import pydantic
-
-    return pydantic.TypeAdapter(globals()[kind]).validate_python(content)
+from rlctl.check_env.world_results import Worlds  # noqa: F401
 
 
 @dataclasses.dataclass(frozen=True)

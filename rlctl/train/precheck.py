@@ -5,15 +5,15 @@ from __future__ import annotations
 import threading
 
 from rlctl.check_env.check import Report, check
+from rlctl.check_env.families import find_rules
 from rlctl.check_env.finding import Severity
-from rlctl.check_env.rules import RULES
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.train.display import Display
 
 BUDGET_S = 2.0
 """Time for playing episodes [s]; importing and building the environment come on top."""
-STUDIES = ("comparisons", "episodes")
+EXPERIMENTS = ("build", "comparisons", "episodes")
 """What one child process can do in that time."""
 
 
@@ -29,12 +29,11 @@ class Precheck:
         self._thread.start()
 
     def _check(self) -> None:
-        rules = [rule for rule in RULES if not rule.needs or set(rule.needs) & set(STUDIES)]
         try:
             self._report = check(
                 self._spec,
-                rules=rules,
-                only=STUDIES,
+                rules=find_rules(EXPERIMENTS),
+                only=EXPERIMENTS,
                 budget_s=BUDGET_S,
                 env_timeout_s=self._env_timeout_s,
                 show_progress=False,
@@ -48,7 +47,7 @@ class Precheck:
         if self._error is not None:
             raise self._error
         report = self._report
-        if report is None or report.evidence.built is None:
+        if report is None or report.records.built is None:
             return  # the workers build it too, and report what is wrong
         task, found = self._spec.task, report.verdict.findings
         for name in report.verdict.crashed:

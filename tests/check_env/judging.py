@@ -7,15 +7,14 @@ from pathlib import Path
 
 import pybullet
 
-from rlctl.check_env import studies
+from rlctl.check_env import child, families
 from rlctl.check_env.bullet_clients import connected
-from rlctl.check_env.child_process import run_part
-from rlctl.check_env.evidence import Evidence
+from rlctl.check_env.finding import RULES
 from rlctl.check_env.judge import judge
+from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
 
 FOLDER = Path(__file__).parent
-PARTS = tuple(studies.PARTS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,37 +27,51 @@ class Case:
     """Every finding: rule and severity."""
     twin: str = "broken_envs.py:Clean"
 
+    @property
+    def rules(self) -> tuple[str, ...]:
+        return tuple(sorted(rule for rule, _ in self.expected))
+
 
 def case(broken: str, *expected: tuple[str, str], twin: str = "broken_envs.py:Clean") -> Case:
     return Case(broken, frozenset(expected), twin)
 
 
-def evidence_of(task, parts=PARTS):
+def records_of(task, *experiments, seconds=families.PROCESS_S):
+    """What some experiments find out, or all; each process begins with nothing that an earlier one left."""
     task = str(FOLDER / task) if ".py:" in task else task
-    evidence = Evidence(task)
+    records = Records(task)
     for client in connected():  # of an environment that was not closed
         pybullet.disconnect(client)
-    for part in parts:
-        # As in a new process: nothing that an earlier part left in the module.
-        for name in [name for name in sys.modules if name.startswith("broken_")]:
-            del sys.modules[name]
-        for header, arrays in run_part(part, EnvSpec(task)):
-            evidence.add(header, arrays)
-    return evidence
+    for name, process in families.PROCESSES.items():
+        wanted = [each.name for each in process.experiments if not experiments or each.name in experiments]
+        for module in [module for module in sys.modules if module.startswith("broken_")]:
+            del sys.modules[module]
+        if name == "probe":
+            wanted.append("build")
+        for message in child.run(name, EnvSpec(task), wanted, seconds) if wanted else ():
+            records.add(message)
+    return records
 
 
-def verdict_of(task, parts=PARTS):
-    verdict = judge(evidence_of(task, parts))
+@functools.cache
+def verdict_of(task, *rules, seconds=families.PROCESS_S):
+    """The verdict by some rules, from the experiments that they need; or by all."""
+    needed = families.find_needs(rules) | {"build"} if rules else ()
+    verdict = judge(records_of(task, *needed, seconds=seconds), rules or tuple(RULES))
     assert verdict.crashed == {}
     return verdict
 
 
-@functools.cache
-def found(task):
-    return {(finding.rule, str(finding.severity)) for finding in verdict_of(task).findings}
+def findings(task, *rules, seconds=families.PROCESS_S):
+    return verdict_of(task, *rules, seconds=seconds).findings
+
+
+def found(task, *rules):
+    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules)}
 
 
 def check_case(case):
-    """The mistake is found, and only that; and nothing of it in the twin."""
-    assert found(case.broken) == case.expected
-    assert not {rule for rule, _ in found(case.twin)} & {rule for rule, _ in case.expected}
+    """The mistake is found by its rules, and nothing by them in the twin. That no other rule finds anything in it is
+    tested in test_all_rules.py."""
+    assert found(case.broken, *case.rules) == case.expected
+    assert found(case.twin, *case.rules) == set()

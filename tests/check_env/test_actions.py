@@ -5,10 +5,8 @@ from pathlib import Path
 import pytest
 
 from rlctl.check_env.check import check
-from rlctl.check_env.rules import RULES
 from rlctl.env_spec import EnvSpec
-from tests.check_env.judging import case, check_case
-from tests.check_env.some_studies import findings, verdict_by
+from tests.check_env.judging import case, check_case, findings, verdict_of
 
 FILE = "broken_actions.py"
 CASES = [
@@ -32,7 +30,7 @@ def test_finds_the_mistake_and_only_that(case):
 
 
 def the_finding(name, rule, study="action effects"):
-    (finding,) = findings(f"{FILE}:{name}", rule, study)
+    (finding,) = findings(f"{FILE}:{name}", rule)
     return finding
 
 
@@ -64,26 +62,25 @@ def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
 
 
 def test_out_of_range_is_placed():
-    finding = the_finding("UnclippedCost", "RL703", "out of range")
+    finding = the_finding("UnclippedCost", "RL703")
     # The corner (+-1, +-1) costs 0.1 * 2 = 0.2, twice the corner 0.1 * 8 = 0.8.
     assert finding.evidence["step"] == 1
     assert finding.evidence["expected"] - finding.evidence["value"] == pytest.approx(0.6)
 
 
 def test_what_is_not_repeatable_is_not_judged():
-    for rule, study in (("RL701", "action effects"), ("RL702", "action effects"), ("RL703", "out of range")):
-        verdict = verdict_by("broken_envs.py:NoisyStep", rule, study)
+    for rule in ("RL701", "RL702", "RL703"):
+        verdict = verdict_of("broken_envs.py:NoisyStep", rule)
         assert verdict.not_judged[rule] == "equal seeds and actions give unequal episodes (RL3)"
 
 
 def test_discrete_actions_have_no_range():
-    verdict = verdict_by(f"{FILE}:Choice", "RL703", "out of range")
+    verdict = verdict_of(f"{FILE}:Choice", "RL703")
     assert verdict.not_applicable == {"RL703": "no continuous action with finite bounds"}
 
 
 def test_a_process_that_a_nan_ends_is_an_error():
-    rules = [rule for rule in RULES if rule.id in ("RL208", "RL704")]
     task = str(Path(__file__).parent / "broken_actions.py") + ":DiesOfNan"
-    (finding,) = check(EnvSpec(task), env_timeout_s=10, rules=rules).verdict.findings
+    (finding,) = check(EnvSpec(task), env_timeout_s=10, rules=["RL208", "RL704"]).verdict.findings
     assert (finding.rule, finding.severity) == ("RL704", "error")
     assert "ended with exit code 9" in finding.message

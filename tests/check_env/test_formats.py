@@ -12,22 +12,26 @@ import pydantic
 import pytest
 import sarif_pydantic
 
+from rlctl.check_env import families
 from rlctl.check_env.check import Report
-from rlctl.check_env.evidence import Evidence
+from rlctl.check_env.finding import FAMILIES, RULES
 from rlctl.check_env.formats import FORMATS, choose, github, plain, sarif, structured
 from rlctl.check_env.judge import Verdict, judge
-from rlctl.check_env.rules import FAMILIES, RULES
-from rlctl.check_env.rules.selection import chosen, find
+from rlctl.check_env.records import Records
+from rlctl.check_env.selection import choose_rules, find_rule
 from rlctl.errors import UsageError
-from tests.check_env.judging import evidence_of
+from tests.check_env.judging import records_of
 
 ROOT = Path(__file__).parent.parent.parent
 HERE = "tests/check_env"
 
 
-def report_of(task, rules=RULES, parts=("probe",), **settings):
-    evidence = evidence_of(task, parts)
-    return Report(task, judge(evidence, rules), evidence, 1.0, 20.0, **settings)
+PROBE = [each.name for each in families.PROCESSES["probe"].experiments]
+
+
+def report_of(task, rules=tuple(RULES), experiments=PROBE, **settings):
+    records = records_of(task, *experiments)
+    return Report(task, judge(records, rules), records, 1.0, 20.0, **settings)
 
 
 def rlctl(*arguments, folder=ROOT, **environment):
@@ -53,7 +57,7 @@ def waiving():
 
 @pytest.fixture(scope="module")
 def crashed():
-    return Report("any", Verdict(crashed={"RL999": "Traceback ..."}), Evidence("any"), 1.0, 20.0)
+    return Report("any", Verdict(crashed={"RL999": "Traceback ..."}), Records("any"), 1.0, 20.0)
 
 
 @pytest.fixture(params=["broken", "unbuilt", "waiving", "crashed"])
@@ -146,7 +150,7 @@ def test_text_has_the_finding_its_numbers_and_its_fix(broken):
 
 
 def test_a_clean_environment_fits_on_a_screen():
-    report = report_of("reach", parts=("probe", "instances"))
+    report = report_of("reach", experiments=[each for each in families.EXPERIMENTS if each not in families.CHECKERS])
     lines = plain.text(report).splitlines()
     assert len(lines) <= 24
     text = "\n".join(lines)
@@ -185,27 +189,27 @@ def test_a_crash_wins(crashed):
 
 
 def test_rules_are_chosen_by_family_and_id():
-    assert {rule.id[:3] for rule in chosen(["RL3"])} == {"RL3"}
-    assert [rule.id for rule in chosen(["rl301,RL501"])] == ["RL301", "RL501"]
-    assert "RL107" not in [rule.id for rule in chosen([], ["RL107"])]
-    assert chosen() == list(RULES)
+    assert {rule[:3] for rule in choose_rules(["RL3"])} == {"RL3"}
+    assert choose_rules(["rl301,RL501"]) == ["RL301", "RL501"]
+    assert "RL107" not in choose_rules([], ["RL107"])
+    assert choose_rules() == list(RULES)
     with pytest.raises(UsageError, match=r"--select RL35: no such rule. Did you mean 'RL3"):
-        chosen(["RL35"])
+        choose_rules(["RL35"])
     with pytest.raises(UsageError, match="leave no rule"):
-        chosen(["RL301"], ["RL3"])
+        choose_rules(["RL301"], ["RL3"])
 
 
 def test_unchosen_rules_cost_nothing_and_say_nothing():
-    report = report_of("broken_envs.py:NanReward", chosen(["RL3"]))
+    report = report_of("broken_envs.py:NanReward", choose_rules(["RL3"]))
     assert report.verdict.findings == []
-    assert {*report.verdict.judged, *report.verdict.not_judged} >= {rule.id for rule in chosen(["RL3"])}
+    assert {*report.verdict.judged, *report.verdict.not_judged} >= set(choose_rules(["RL3"]))
     assert not any(rule.startswith("RL6") for rule in report.verdict.judged)
 
 
 def test_rules_are_found_by_id_in_any_case():
-    assert find("rl304").id == "RL304"
+    assert find_rule("rl304").id == "RL304"
     with pytest.raises(UsageError, match=r"no rule 'RL3'. The family has: RL301, "):
-        find("RL3")
+        find_rule("RL3")
 
 
 def test_formats_that_do_not_go_together():
@@ -222,7 +226,7 @@ def test_formats_that_do_not_go_together():
 def test_command_lists_rules_without_a_task():
     run = rlctl("--list")
     assert run.returncode == 0
-    for rule in RULES:
+    for rule in RULES.values():
         assert f"{rule.id}  {rule.severity}" in run.stdout
     for title in FAMILIES.values():
         assert title in run.stdout

@@ -7,7 +7,7 @@ from pathlib import Path
 import pybullet_data
 import pytest
 
-from tests.check_env.judging import case, check_case, verdict_of
+from tests.check_env.judging import case, check_case, findings
 
 ERROR = "error"
 CASES = [
@@ -20,8 +20,8 @@ CASES = [
     case("broken_loading.py:NoModel", ("RL007", ERROR)),
     case("broken_loading.py:NoModelAtReset", ("RL007", ERROR)),
     case("broken_old_gym.py:Pushed", ("RL008", ERROR)),
-    case("broken_loading.py:OldKeys", ("RL009", "warning")),
-    case("broken_loading.py:NoFrameRate", ("RL010", "warning"), twin="broken_loading.py:FrameRate"),
+    case("broken_loading.py:OldKeys", ("RL009", "info")),
+    case("broken_loading.py:NoFrameRate", ("RL009", "info"), twin="broken_loading.py:FrameRate"),
 ]
 
 
@@ -31,18 +31,18 @@ def test_finds_the_mistake_and_only_that(case):
 
 
 def test_arguments_are_named_and_how_to_give_them():
-    (finding,) = verdict_of("broken_loading.py:NeedsArguments", ("probe",)).findings
+    (finding,) = findings("broken_loading.py:NeedsArguments", "RL006")
     assert "missing 1 required positional argument: 'gain'" in finding.message
     assert "(--set task.gain=...)" in finding.fix
 
 
 def test_a_missing_class_gets_the_closest_name():
-    (finding,) = verdict_of("broken_envs.py:Cleen", ("probe",)).findings
+    (finding,) = findings("broken_envs.py:Cleen", "RL005")
     assert "has no 'Cleen'. Did you mean 'Clean'?" in finding.message
 
 
 def test_a_missing_model_is_named_with_the_search_path_and_a_similar_file():
-    (finding,) = verdict_of("broken_loading.py:NoModel", ("probe",)).findings
+    (finding,) = findings("broken_loading.py:NoModel", "RL007")
     data = Path(pybullet_data.getDataPath())
     assert finding.evidence["file"] == "kuka_iiwa/modell.urdf"
     assert finding.evidence["searched"] == [str(Path.cwd()), str(data)]
@@ -51,7 +51,7 @@ def test_a_missing_model_is_named_with_the_search_path_and_a_similar_file():
 
 
 def test_a_missing_model_of_a_reset_is_named():
-    (finding,) = verdict_of("broken_loading.py:NoModelAtReset", ("probe",)).findings
+    (finding,) = findings("broken_loading.py:NoModelAtReset", "RL007")
     assert finding.message.startswith("reset does not find 'robot.urdf', looked for in ")
     assert finding.evidence["searched"][0] == str(Path.cwd())
 
@@ -60,7 +60,7 @@ def test_an_id_that_only_the_old_gym_knows(monkeypatch):
     old = types.ModuleType("gym")
     old.envs = types.SimpleNamespace(registry=types.SimpleNamespace(env_specs={"Pushed-v0": object()}))
     monkeypatch.setitem(sys.modules, "gym", old)
-    (finding,) = verdict_of("Pushed-v0", ("probe",)).findings
+    (finding,) = findings("Pushed-v0", "RL008")
     assert finding.rule == "RL008"
     assert "registered with the old gym" in finding.message
 
@@ -77,15 +77,12 @@ def test_a_class_of_the_old_gym(monkeypatch, tmp_path):
         "    def reset(self): return np.zeros(2, np.float32)\n"
         "    def step(self, action): return np.zeros(2, np.float32), 0.0, True, {}\n"
     )
-    findings = verdict_of(str(file) + ":Pushed", ("probe",)).findings
-    rules = {finding.rule for finding in findings}
-    assert "RL008" in rules
-    assert "RL003" not in rules
+    assert [finding.rule for finding in findings(f"{file}:Pushed", "RL003", "RL008")] == ["RL008"]
 
 
 def test_an_id_whose_module_imports_what_is_not_there(monkeypatch, tmp_path):
     (tmp_path / "registers_with_gym.py").write_text("import gym\n")
     monkeypatch.syspath_prepend(tmp_path)
-    (finding,) = verdict_of("registers_with_gym:Pushed-v0", ("probe",)).findings
+    (finding,) = findings("registers_with_gym:Pushed-v0", "RL008")
     assert finding.rule == "RL008"
     assert "No module named 'gym'" in finding.message

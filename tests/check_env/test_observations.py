@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.check_env.judge import judge
 from rlctl.check_env.rules import redundancy
-from tests.check_env.judging import case, check_case, evidence_of, found, verdict_of
+from tests.check_env.judging import case, check_case, findings, found, records_of
 
 BROKEN = "broken_observations.py"
 CASES = [
@@ -32,7 +32,8 @@ def test_clean_is_clean(name):
 
 
 def finding_of(name):
-    (finding,) = verdict_of(f"{BROKEN}:{name}", ("probe",)).findings
+    (case,) = [each for each in CASES if each.broken == f"{BROKEN}:{name}"]
+    (finding,) = findings(case.broken, *case.rules)
     return finding
 
 
@@ -64,7 +65,7 @@ def test_copies_among_many_elements_are_found_at_once():
 
 
 def test_scales_matter_as_far_as_nothing_normalises():
-    evidence = evidence_of(f"{BROKEN}:Millimetres", ("probe",))
+    evidence = records_of(f"{BROKEN}:Millimetres")
     severities = []
     for normalizes in (None, False, True):
         findings = judge(dataclasses.replace(evidence, normalizes=normalizes)).findings

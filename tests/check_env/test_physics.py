@@ -3,9 +3,8 @@
 import pytest
 
 from rlctl.check_env.studies.source import calls_without_client
-from tests.check_env.judging import case, check_case, found, verdict_of
+from tests.check_env.judging import case, check_case, findings, found
 
-PARTS = ("probe", "instances")
 RULES = {f"RL{number}" for number in range(801, 809)}
 CART = "broken_physics.py:Cart"
 CASES = [
@@ -34,7 +33,7 @@ def test_worlds_without_a_mistake_are_clean(name):
 
 
 def the_finding(name):
-    return next(each for each in verdict_of(f"broken_physics.py:{name}", PARTS).findings if each.rule in RULES)
+    return next(each for each in findings(f"broken_physics.py:{name}", *sorted(RULES)) if each.rule in RULES)
 
 
 def test_joint_beyond_its_limits_is_placed():

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from rlctl.check_env import judge as judging
+from rlctl.check_env import families, judge
 from rlctl.check_env.check import check
-from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import Severity, rule
-from rlctl.check_env.rules import RULES
+from rlctl.check_env.experiment import Check
+from rlctl.check_env.finding import RULES
+from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, UsageError
 
@@ -106,17 +106,12 @@ def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
     assert run.stdout == "[]\n"
 
 
-def test_a_rule_that_crashes_is_no_pass():
-    @rule("RL999", "crashing", Severity.INFO, "-")
-    def crashing(evidence):
-        """Crashes."""
-        return iter([1 / 0])
-
-    verdict = judging.judge(Evidence("any"), [judging.RULES[0], crashing])
-    assert verdict.not_judged["RL999"] == "no instance could be built"
-    loading = [rule("RL099", "crashing", Severity.INFO, "-")(crashing.check)]
-    verdict = judging.judge(Evidence("any"), loading)
-    assert "ZeroDivisionError" in verdict.crashed["RL099"]
+def test_a_rule_that_crashes_is_no_pass(monkeypatch):
+    for rule in ("RL004", "RL306"):
+        monkeypatch.setitem(families.CHECKS, rule, Check(rule, lambda records: [1 / 0], ()))
+    verdict = judge.judge(Records("any"), ["RL004", "RL306"])
+    assert verdict.not_judged["RL306"] == "no instance could be built"
+    assert "ZeroDivisionError" in verdict.crashed["RL004"]
     assert verdict.judged == []
 
 

@@ -2,13 +2,12 @@
 
 import pytest
 
-from rlctl.check_env.evidence import Evidence
 from rlctl.check_env.finding import NotJudged
+from rlctl.check_env.records import Records
 from rlctl.check_env.results import Leaks
 from rlctl.check_env.rules import resources
 from rlctl.check_env.studies import worker_build
-from tests.check_env.judging import case, check_case
-from tests.check_env.some_studies import findings
+from tests.check_env.judging import case, check_case, findings
 
 FILE = "broken_resources.py"
 CASES = [
@@ -29,36 +28,36 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-def the_finding(name, rule, *studies):
-    (finding,) = findings(f"{FILE}:{name}", rule, *studies)
+def the_finding(name, rule):
+    (finding,) = findings(f"{FILE}:{name}", rule)
     return finding
 
 
 def test_each_reset_leaves_a_client():
-    (finding,) = findings(f"{FILE}:Reconnects", "RL405", "leaks", seconds=8.0)
+    (finding,) = findings(f"{FILE}:Reconnects", "RL405", seconds=8.0)
     assert finding.severity == "error"
     assert finding.evidence["per_reset"] == 1.0
     assert finding.evidence["value"] - finding.evidence["expected"] == finding.evidence["resets"] >= 7
     assert finding.message.startswith("PyBullet clients grow with every reset: from ")
-    assert findings(f"{FILE}:ReconnectsProperly", "RL405", "leaks", seconds=8.0) == []
+    assert findings(f"{FILE}:ReconnectsProperly", "RL405", seconds=8.0) == []
 
 
 def test_memory_is_counted():
-    finding = the_finding("KeepsMemory", "RL405", "leaks")
+    finding = the_finding("KeepsMemory", "RL405")
     # 50,000 numbers of 8 bytes.
     assert finding.evidence["per_reset"] == pytest.approx(400_000, rel=0.1)
     assert finding.evidence["resets"] == 90
 
 
 def of_counts(**counts):
-    evidence = Evidence("any")
+    evidence = Records("any")
     empty = {"clients": [], "bodies": [], "descriptors": [], "threads": [], "memory": [], "measured": []}
-    evidence.results["Leaks"] = Leaks(**{**empty, **counts})
+    evidence.facts["Leaks"] = Leaks(**{**empty, **counts})
     return evidence
 
 
 def found_in(**counts):
-    return [seen.message for seen in resources.leaks.check(of_counts(**counts))]
+    return [seen.message for seen in resources.leaks.run(of_counts(**counts))]
 
 
 def test_what_changes_or_fills_once_is_no_leak():
@@ -84,19 +83,19 @@ def test_too_few_resets_are_not_judged():
 
 
 def test_the_worker_says_what_it_raised():
-    finding = the_finding("StartsProcess", "RL406", "worker build")
+    finding = the_finding("StartsProcess", "RL406")
     assert finding.message.startswith("in a spawned, daemonic worker build raises task ")
     assert "AssertionError: daemonic processes are not allowed to have children" in finding.message
     assert finding.evidence["call"] == "build"
-    finding = the_finding("ExitsInWorker", "RL406", "worker build")
+    finding = the_finding("ExitsInWorker", "RL406")
     assert finding.message == "in a spawned, daemonic worker reset ended with exit code 3"
 
 
 def test_a_worker_that_hangs_is_a_finding(monkeypatch):
     monkeypatch.setattr(worker_build, "HANG_S", 0.3)
-    finding = the_finding("SlowInWorker", "RL406", "worker build")
+    finding = the_finding("SlowInWorker", "RL406")
     assert finding.message == "in a spawned, daemonic worker build did not come back in 0.3 s"
 
 
 def test_the_path_reaches_the_worker():
-    assert findings(f"{FILE}:NeedsPath", "RL406", "worker build") == []
+    assert findings(f"{FILE}:NeedsPath", "RL406") == []

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from rlctl.check_env.rules import reward_incentives
 from rlctl.check_env.rules.tried import discounted, worth_of
 from rlctl.check_env.studies.search import action_of
-from tests.check_env.judging import case, check_case, evidence_of, found, verdict_of
+from tests.check_env.judging import case, check_case, findings, found, records_of
 
 BROKEN = "broken_rewards.py"
 
@@ -57,7 +57,8 @@ def test_goal_that_ends_the_episode_is_no_failure():
 
 
 def finding_of(name):
-    (finding,) = verdict_of(f"{BROKEN}:{name}", ("probe",)).findings
+    (case,) = [each for each in CASES if each.broken == f"{BROKEN}:{name}"]
+    (finding,) = findings(case.broken, *case.rules)
     return finding
 
 
@@ -78,7 +79,7 @@ def test_falling_is_compared_with_going_on():
 
 
 def test_hovering_is_compared_from_where_two_lives_part():
-    life = evidence_of("broken_envs.py:Clean", ("probe",)).role("search")[0]
+    life = records_of("broken_envs.py:Clean").role("search")[0]
     actions = np.zeros((4, 2))
     actions[2:] = 1.0
     finished = dataclasses.replace(life, rewards=np.array([0.0, 0.0, 9.0]), action_values=np.zeros((3, 2)))
@@ -143,7 +144,7 @@ def test_numbers_become_actions_of_every_kind():
 
 
 def test_search_finds_what_chance_does_not():
-    lives = evidence_of("reach", ("probe",)).role("search")
+    lives = records_of("reach").role("search")
     assert any(life.infos["is_success"].values.any() for life in lives if life.actions == "searched")
     assert len({life.seed for life in lives if life.actions == "searched"}) == 1
     assert sum(life.steps for life in lives) <= 6200

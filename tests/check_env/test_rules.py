@@ -8,8 +8,8 @@ from importlib import import_module
 
 import pytest
 
-from rlctl.check_env.rules import RULES
-from tests.check_env.judging import FOLDER, case, check_case, evidence_of, found, verdict_of
+from rlctl.check_env.finding import RULES
+from tests.check_env.judging import FOLDER, case, check_case, findings, found, records_of, verdict_of
 
 CASES = [
     case("broken_envs.py:OldGym", ("RL003", "error"), ("RL201", "error"), ("RL202", "error")),
@@ -80,7 +80,7 @@ def test_clean_is_clean(name):
     verdict = verdict_of(name)
     assert verdict.findings == []
     assert verdict.not_judged == {}
-    assert {*verdict.judged, *verdict.not_applicable} == {rule.id for rule in RULES}
+    assert {*verdict.judged, *verdict.not_applicable} == set(RULES)
 
 
 @pytest.mark.parametrize(
@@ -93,13 +93,13 @@ def test_gymnasiums_own_environments_have_no_errors(task):
 
 
 def test_hindsight_rewards_are_compared():
-    (finding,) = verdict_of("broken_checkers.py:OtherReward", ("probe",)).findings
+    (finding,) = findings("broken_checkers.py:OtherReward", "RL614")
     # Each reward is 0.5 below what compute_reward says.
     assert finding.evidence["value"] - finding.evidence["expected"] == pytest.approx(0.5)
 
 
 def test_out_of_range_is_placed():
-    (finding,) = verdict_of("broken_envs.py:OutOfRange", ("probe",)).findings
+    (finding,) = findings("broken_envs.py:OutOfRange", "RL103")
     assert re.match(
         r"observation\[[01]\] is [\d.]+ at step 30; the space allows \[-5, 5\]; \d+ of \d+ observations are outside",
         finding.message,
@@ -111,21 +111,21 @@ def test_out_of_range_is_placed():
 
 
 def test_exception_is_placed():
-    (finding,) = verdict_of("broken_envs.py:Raises", ("probe",)).findings
+    (finding,) = findings("broken_envs.py:Raises", "RL207")
     assert finding.message.startswith("step 7 raised RuntimeError: joint 3 is gone (broken_envs.py:")
     assert finding.evidence["step"] == 7
     assert finding.evidence["seed"] == 1000
 
 
 def test_names_of_a_tasks_observation_are_used():
-    built = evidence_of("reach", ("probe",)).built
+    built = records_of("reach").built
     # 7 joint positions, 7 velocities, then the hand.
     assert built.element(0, 15) == "hand[1]"
     assert built.max_steps == 120
 
 
 def test_difference_is_named():
-    finding, _ = verdict_of("broken_envs.py:GlobalRandom", ("probe", "instances")).findings
+    (finding,) = findings("broken_envs.py:GlobalRandom", "RL301")
     assert finding.message.startswith("reset twice with one seed: first difference at reset: observation[")
     assert finding.evidence["step"] == 0
     assert finding.evidence["seed"] == 1000
@@ -134,14 +134,14 @@ def test_difference_is_named():
 
 
 def test_what_a_nearer_rule_explains_is_not_judged():
-    verdict = verdict_of("broken_envs.py:NoisyStep", ("probe", "instances"))
+    verdict = verdict_of("broken_envs.py:NoisyStep", "RL303", "RL304", "RL305", "RL401", "RL402")
     assert {"RL303", "RL304", "RL305", "RL401", "RL402"} <= verdict.not_judged.keys()
     assert verdict.not_judged["RL305"] == "the same instance already differs from itself (RL301, RL302)"
     assert not {"RL303", "RL304", "RL305", "RL401", "RL402"} & set(verdict.judged)
 
 
 def test_space_that_no_rule_can_look_into_is_said():
-    verdict = verdict_of("broken_envs.py:TextObservation", ("probe", "instances"))
+    verdict = verdict_of("broken_envs.py:TextObservation", "RL101", "RL102", "RL103", "RL104")
     assert verdict.findings == []
     assert verdict.not_judged["observation['say']"] == "no rule can look into a Text space"
 
@@ -153,13 +153,11 @@ IN_PROCESSES = {"RL004", "RL208", "RL209", "RL211", "RL216", "RL305"}
 def test_every_rule_has_an_environment_that_breaks_it():
     modules = [import_module(f"tests.check_env.{file.stem}") for file in FOLDER.glob("test_*.py")]
     broken = {rule for module in modules for case in getattr(module, "CASES", []) for rule, _ in case.expected}
-    assert broken | IN_PROCESSES == {rule.id for rule in RULES}
+    assert broken | IN_PROCESSES == set(RULES)
 
 
 def test_rules_are_complete():
-    ids = [rule.id for rule in RULES]
-    assert len(ids) == len(set(ids))
-    for rule in RULES:
+    for rule in RULES.values():
         assert re.fullmatch(r"RL\d{3}", rule.id)
         assert rule.meaning
         assert rule.fix

@@ -10,16 +10,14 @@ import time
 
 import pytest
 
-from rlctl.check_env.child_process import run_part
-from rlctl.check_env.evidence import Evidence
 from rlctl.check_env.judge import judge
+from rlctl.check_env.records import Records
 from rlctl.check_env.results import Speed, TimedCall
 from rlctl.check_env.rules import speed as rules
-from rlctl.check_env.rules.selection import chosen
 from rlctl.check_env.sampling import Sampler, Samples, Stopwatch
+from rlctl.check_env.selection import choose_rules
 from rlctl.check_env.studies.speed import kind_of, typical
-from rlctl.env_spec import EnvSpec
-from tests.check_env.judging import FOLDER, case, check_case
+from tests.check_env.judging import case, check_case, records_of
 
 CASES = [
     case("broken_speed.py:SlowStep", ("RL901", "warning")),
@@ -35,22 +33,18 @@ NOTHING = Speed(66e-6, 52e-6, 200, 5, [STEP], [], [], [], False)
 
 @functools.cache
 def measured(task):
-    """What only the studies that this family reads find out."""
-    task = f"{FOLDER}/{task}" if ".py:" in task else task
-    evidence = Evidence(task)
-    for header, arrays in run_part("probe", EnvSpec(task), ["episodes", "speed"]):
-        evidence.add(header, arrays)
-    return evidence
+    """What only the experiments that this family reads find out."""
+    return records_of(task, "episodes", "speed")
 
 
 def with_speed(**changes):
     """`Clean`, whose episodes have 50 steps, with another speed."""
     result = dataclasses.replace(NOTHING, **changes)
-    return dataclasses.replace(measured("broken_envs.py:Clean"), results={"Speed": result})
+    return dataclasses.replace(measured("broken_envs.py:Clean"), facts={"Speed": result})
 
 
 def findings(evidence):
-    verdict = judge(evidence, chosen(["RL9"]))
+    verdict = judge(evidence, choose_rules(["RL9"]))
     assert (verdict.crashed, verdict.not_judged) == ({}, {})
     return verdict.findings
 
@@ -129,7 +123,7 @@ def test_connecting_in_reset_is_named_however_fast_it_is():
 
 def test_a_task_that_says_that_it_reloads_is_only_told_the_price():
     evidence = measured("broken_speed.py:ReloadingTask")
-    assert evidence.results["Speed"].rebuilds
+    assert evidence.facts["Speed"].rebuilds
     (finding,) = findings(evidence)
     assert (finding.rule, finding.severity) == ("RL902", "info")
     assert "pybullet.loadURDF" in finding.message
@@ -161,7 +155,7 @@ def test_line_for_the_report():
         "step 66 us, reset 52 us (1.6% of an episode), 15,000 steps/s: a million steps take 1.1 minutes; "
         "slowest: pybullet.stepSimulation 61% (world.py:10)"
     )
-    assert rules.speed_line(Evidence("any")) == ""
+    assert rules.speed_line(Records("any")) == ""
 
 
 def test_a_step_that_takes_longer_now_and_then_counts_and_a_disturbance_does_not():

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl import output
 from rlctl.check_env.check import Report
-from rlctl.check_env.finding import Finding, Severity
+from rlctl.check_env.finding import FAMILIES, RULES, Finding, Severity
 from rlctl.check_env.formats.ranges import Row, action_rows, observation_rows
-from rlctl.check_env.rules import FAMILIES, RULES
 from rlctl.check_env.rules.speed import speed_line
 
 if TYPE_CHECKING:
@@ -107,17 +106,17 @@ def _short(value: Any) -> str:
 
 
 def _facts(report: Report) -> Iterator[str]:
-    verdict, built = report.verdict, report.evidence.built
+    verdict, built = report.verdict, report.records.built
     for rule, findings in itertools.groupby(verdict.waived, key=lambda each: each.rule):
         reason = built.waivers[rule] if built else ""
         yield f"waived {rule} ({'; '.join(finding.message for finding in findings)}): {reason}"
     if built is not None:
         yield f"observation {built.observation_space}"
-        yield from _table(observation_rows(report.evidence))
+        yield from _table(observation_rows(report.records))
         yield f"action {built.action_space}"
         if len(built.action_leaves) > 1:
-            yield from _table(action_rows(report.evidence))
-        yield f"speed {speed_line(report.evidence) or 'not measured'}"
+            yield from _table(action_rows(report.records))
+        yield f"speed {speed_line(report.records) or 'not measured'}"
     if verdict.crashed:
         yield f"crashed: {', '.join(verdict.crashed)}; what they would find is not known"
     if built is None:
@@ -139,7 +138,7 @@ def _by_family(judged: Iterable[str]) -> str:
 
 def _families(names: list[str]) -> list[str]:
     """Shorten ids: a whole family by its name."""
-    whole = [f for f in FAMILIES if {rule.id for rule in RULES if rule.id.startswith(f)} <= set(names)]
+    whole = [f for f in FAMILIES if {rule for rule in RULES if rule.startswith(f)} <= set(names)]
     return [f"{family} {FAMILIES[family]}" for family in whole] + [n for n in names if not n.startswith(tuple(whole))]
 
 

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.evidence import Built, Evidence
 from rlctl.check_env.leaves import Leaf, leaf_name
+from rlctl.check_env.messages import Built
+from rlctl.check_env.records import Records
 
 ELEMENTS_SHOWN = 8
 """So many numbers without names get a row each; more of them share one."""
@@ -28,21 +29,21 @@ class Row:
     """Smallest and largest value that occurred; None where none was recorded."""
 
 
-def observation_rows(evidence: Evidence) -> list[Row]:
+def observation_rows(records: Records) -> list[Row]:
     """Return the parts of the observation, in order."""
-    built = evidence.built
+    built = records.built
     rows: list[Row] = []
     for index, leaf in enumerate(built.leaves if built else ()):
         if built is not None and leaf.low is not None and leaf.high is not None:
-            seen = _seen([t.observations[index].values for t in evidence.trajectories if index in t.observations], leaf)
+            seen = _seen([t.observations[index].values for t in records.trajectories if index in t.observations], leaf)
             for name, part in _parts(built, leaf):
                 rows.append(_row(name, np.ravel(leaf.low)[part], np.ravel(leaf.high)[part], seen, part))
     return rows
 
 
-def action_rows(evidence: Evidence) -> list[Row]:
+def action_rows(records: Records) -> list[Row]:
     """Return the parts of the action, in order; what was tried is not what will be, so nothing is said as seen."""
-    leaves = evidence.built.action_leaves if evidence.built else []
+    leaves = records.built.action_leaves if records.built else []
     return [
         _row(
             leaf_name(leaf).replace("observation", "action"), np.ravel(leaf.low), np.ravel(leaf.high), None, slice(None)

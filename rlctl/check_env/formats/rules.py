@@ -5,10 +5,9 @@ from __future__ import annotations
 import textwrap
 
 from rlctl import output
-from rlctl.check_env.finding import Severity
+from rlctl.check_env.finding import FAMILIES, RULES, Severity
 from rlctl.check_env.formats.plain import STYLES
-from rlctl.check_env.rules import FAMILIES, RULES
-from rlctl.check_env.rules.selection import find
+from rlctl.check_env.selection import find_rule
 
 
 def show_list() -> None:
@@ -18,19 +17,19 @@ def show_list() -> None:
     out = output.out()
     for family, title in FAMILIES.items():
         out.print(Text(f"{family} {title}", "bold"))
-        for rule in RULES:
+        for rule in RULES.values():
             if rule.id.startswith(family):
                 severity = Text(f"{rule.severity:<8}", STYLES[rule.severity])
                 out.print(Text(f"  {rule.id}  ").append_text(severity).append(rule.name))
-    counts = ", ".join(f"{sum(rule.severity is each for rule in RULES)} {each}s" for each in Severity)
-    out.print(f"{len(RULES)} rules: {counts}. rlctl check-env --explain {RULES[0].id} says more.", markup=False)
+    counts = ", ".join(f"{sum(rule.severity is each for rule in RULES.values())} {each}s" for each in Severity)
+    out.print(f"{len(RULES)} rules: {counts}. rlctl check-env --explain {next(iter(RULES))} says more.", markup=False)
 
 
 def explain(code: str) -> None:
     """Print what a rule means, and what to do about it."""
     from rich.text import Text
 
-    out, rule = output.out(), find(code)
+    out, rule = output.out(), find_rule(code)
     out.print(Text(f"{rule.id}  {rule.name}", "bold"))
     out.print(Text(f"{rule.severity}, {FAMILIES[rule.id[:3]]}", STYLES[rule.severity]))
     for paragraph in rule.meaning.split("\n\n"):

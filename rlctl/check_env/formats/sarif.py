@@ -11,9 +11,8 @@ from typing import Any
 
 from rlctl import __version__
 from rlctl.check_env.check import Report
-from rlctl.check_env.finding import Finding, Rule, Severity
+from rlctl.check_env.finding import FAMILIES, RULES, Finding, Rule, Severity
 from rlctl.check_env.formats.structured import plain
-from rlctl.check_env.rules import FAMILIES, RULES
 
 LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "note"}
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
@@ -23,9 +22,9 @@ def text(report: Report) -> str:
     """Return a report as SARIF."""
     verdict = report.verdict
     known = {finding.rule for finding in (*verdict.findings, *verdict.waived)}
-    rules = [rule for rule in RULES if rule.id in known]
+    rules = [rule for rule in RULES.values() if rule.id in known]
     numbers = {rule.id: number for number, rule in enumerate(rules)}
-    waivers = report.evidence.built.waivers if report.evidence.built else {}
+    waivers = report.records.built.waivers if report.records.built else {}
     results = [_result(report, each, numbers) for each in verdict.findings]
     for each in verdict.waived:
         suppression = {"kind": "inSource", "justification": waivers[each.rule]}

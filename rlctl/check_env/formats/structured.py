@@ -24,7 +24,7 @@ def text(report: Report) -> str:
 
 def content(report: Report) -> dict[str, Any]:
     """Return a report as plain data."""
-    verdict, evidence = report.verdict, report.evidence
+    verdict, evidence = report.verdict, report.records
     return {
         "format": "rlctl check-env 1",
         "rlctl": __version__,
@@ -74,14 +74,14 @@ def plain(value: Any) -> Any:
 
 
 def _environment(report: Report) -> dict[str, Any] | None:
-    built = report.evidence.built
+    built = report.records.built
     if built is None:
         return None
     return {
         "observation_space": built.observation_space,
         "action_space": built.action_space,
-        "observations": [_row(row) for row in observation_rows(report.evidence)],
-        "actions": [_row(row) for row in action_rows(report.evidence)],
+        "observations": [_row(row) for row in observation_rows(report.records)],
+        "actions": [_row(row) for row in action_rows(report.records)],
         "max_steps": built.max_steps,
         "uses_pybullet": built.uses_pybullet,
         "file": built.file,
@@ -91,7 +91,7 @@ def _environment(report: Report) -> dict[str, Any] | None:
 
 def _speed(report: Report) -> Any:
     """What one process does; null where no step could be timed."""
-    speed: Speed | None = report.evidence.results.get(Speed.__name__)
+    speed: Speed | None = report.records.facts.get(Speed.__name__)
     if speed is None or speed.step_s is None:
         return None
     return plain({**dataclasses.asdict(speed), "steps_per_second": 1 / speed.step_s})

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import NotApplicable, Seen, Severity, rule
+from rlctl.check_env.finding import NotApplicable, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.results import ActionEffect, ActionEffects, OutOfRange
 from rlctl.check_env.rules.known import built, result
 

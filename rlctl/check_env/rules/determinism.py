@@ -13,7 +13,8 @@ import numpy as np
 
 from rlctl.check_env.comparison import Difference, first_difference
 from rlctl.check_env.evidence import Evidence, Trajectory
-from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.results import GlobalRandom
 from rlctl.check_env.rules.known import built, lived, one, result
 

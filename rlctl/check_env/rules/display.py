@@ -6,7 +6,8 @@ import re
 from collections.abc import Iterator
 
 from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import NotApplicable, NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotApplicable, NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.results import RenderAttempt, Rendering, Windows
 from rlctl.check_env.rules.interface import where
 from rlctl.check_env.rules.known import NO_DISPLAY, built, lost_display, result

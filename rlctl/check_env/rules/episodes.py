@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rlctl.check_env.evidence import ENDS, Evidence, Trajectory
-from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.results import Attributes
 from rlctl.check_env.rules.known import built, result
 from rlctl.check_env.studies import LIVES
@@ -153,7 +154,7 @@ def limited(evidence: Evidence) -> Iterator[Seen]:
         return  # a bandit, or a game of a few moves
     if any(form.what == "step" for each in episodes for form in each.forms):
         raise NotJudged("step returns one flag for both (RL201)")
-    if list(time_limit.check(evidence)):
+    if list(time_limit.run(evidence)):
         raise NotJudged("a time limit seems to be flagged as terminated (RL501)")
     truncation = result(evidence, Attributes, "attributes").truncation
     if truncation == "computed":

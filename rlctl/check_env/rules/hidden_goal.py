@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.evidence import Evidence, Trajectory
-from rlctl.check_env.finding import NotApplicable, Seen, Severity, rule
+from rlctl.check_env.finding import NotApplicable, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.rules.known import built
 from rlctl.check_env.rules.tried import WITH_SEARCH, rewarded
 

@@ -7,7 +7,8 @@ from typing import Any
 
 from rlctl.check_env import studies
 from rlctl.check_env.evidence import RAISED, Evidence, Failure, Form, Trajectory
-from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.results import Attributes
 from rlctl.check_env.rules.known import built, lived, lost_display, result
 
@@ -147,7 +148,7 @@ def calls_alone(evidence: Evidence, kind: str) -> Iterator[Failure]:
     for failure in evidence.failures:
         if failure.kind != kind or failure.call in ("load", "build") or failure.phase in NOT_ALONE:
             continue
-        if failure.part == "checkers" and seen:
+        if failure.process == "checkers" and seen:
             continue
         if (failure.call, failure.error) not in seen:
             seen.add((failure.call, failure.error))

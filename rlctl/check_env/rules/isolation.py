@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 from rlctl.check_env.comparison import first_difference
 from rlctl.check_env.evidence import Evidence, Failure, Trajectory
-from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.results import SharedSpaces
 from rlctl.check_env.rules.determinism import compared
 from rlctl.check_env.rules.interface import calls_alone, where
@@ -30,7 +31,7 @@ def _failures(evidence: Evidence, phase: str) -> Iterator[Failure]:
     alone = {(failure.call, failure.error) for failure in calls_alone(evidence, "raised")}
     for failure in evidence.failures:
         is_known = (failure.call, failure.error) in alone
-        if failure.part == "instances" and failure.phase == phase and failure.call != "build" and not is_known:
+        if failure.process == "instances" and failure.phase == phase and failure.call != "build" and not is_known:
             yield failure
 
 
@@ -75,7 +76,7 @@ def closing(evidence: Evidence) -> Iterator[Seen]:
     for failure in _failures(evidence, "after close"):
         yield _failed(failure, doing)
         return
-    if list(interleaved.check(evidence)):
+    if list(interleaved.run(evidence)):
         raise NotJudged("the instances already disturb each other while both are open (RL401)")
     yield from _differs(evidence, one(evidence, "after close"), f"{doing}, against one alone")
 
@@ -91,7 +92,7 @@ def second_instance(evidence: Evidence) -> Iterator[Seen]:
     many."""
     built(evidence)
     for failure in evidence.failures:
-        if failure.call in ("load", "build") and failure.part != "probe":
+        if failure.call in ("load", "build") and failure.process != "probe":
             beside = "in one process" if failure.phase in ("fresh instance", "interleaved") else "in a second process"
             yield Seen(f"a second instance {beside} cannot be built: {failure.error}", where(failure))
             return

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from rlctl.check_env.evidence import Evidence, Failure
-from rlctl.check_env.finding import NotApplicable, NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotApplicable, NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.results import ActionEffects, AfterEnd, AfterEndProblem, CloseTwice, NanAction, StepBeforeReset
 from rlctl.check_env.rules.interface import where
 from rlctl.check_env.rules.known import built, lived, result
@@ -149,7 +150,7 @@ def nan_action(evidence: Evidence) -> Iterator[Seen]:
     found = result(evidence, NanAction, "nan action")
     if found.raised is not None:
         return
-    effects = evidence.results.get(ActionEffects.__name__)
+    effects = evidence.facts.get(ActionEffects.__name__)
     if effects is not None and all(each.effect == "none" for each in effects.dimensions):
         raise NotJudged("no action has any effect (RL701)")
     place = {"seed": found.seed, "step": found.step, "expected": "an exception"}

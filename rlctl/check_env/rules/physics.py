@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import NotApplicable, NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotApplicable, NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.rules.known import built, result
 from rlctl.check_env.world_results import Excess, Jump, Moment, TopSpeed, World, WorldBody, WorldLink, Worlds
 

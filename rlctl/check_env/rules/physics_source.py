@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import Seen, Severity, rule
+from rlctl.check_env.finding import Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.rules.known import result
 from rlctl.check_env.rules.physics import watched
 from rlctl.check_env.world_results import Place, Worlds

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.evidence import Built, Evidence, Trajectory
-from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotJudged, Severity
 from rlctl.check_env.leaves import Leaf
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.rules.known import built, lived
 from rlctl.check_env.rules.tried import WITH_SEARCH
 

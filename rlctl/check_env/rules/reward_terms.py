@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.evidence import MOST_INFOS, Evidence, Trajectory
-from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.rules.tried import WITH_SEARCH, at, in_words, termed, terms
 
 WARNING = Severity.WARNING

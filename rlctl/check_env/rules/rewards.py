@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import Seen, Severity, rule
+from rlctl.check_env.finding import Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.rules.known import lived
 from rlctl.check_env.rules.tried import WITH_SEARCH, at, has_succeeded, in_words, rewarded
 

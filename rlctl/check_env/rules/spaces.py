@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import Seen, Severity, rule
+from rlctl.check_env.finding import Severity
 from rlctl.check_env.leaves import Leaf, leaf_name
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.rules.known import built, lived
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO

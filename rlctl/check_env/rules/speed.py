@@ -6,7 +6,8 @@ import statistics
 from collections.abc import Iterator, Sequence
 
 from rlctl.check_env.evidence import Evidence
-from rlctl.check_env.finding import NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.results import Speed, TimedCall
 from rlctl.check_env.rules.known import built, result
 
@@ -153,7 +154,7 @@ def _loads(call: str, calls: Sequence[TimedCall], seconds: float, whole_s: float
 
 def speed_line(evidence: Evidence) -> str:
     """Return what a report says about speed in a line; empty where nothing was timed."""
-    speed, steps = evidence.results.get(Speed.__name__), episode_steps(evidence)
+    speed, steps = evidence.facts.get(Speed.__name__), episode_steps(evidence)
     if not isinstance(speed, Speed) or not speed.step_s or speed.reset_s is None or steps is None:
         return ""
     per_s = float(f"{steps / (speed.reset_s + steps * speed.step_s):.2g}")

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.check_env.evidence import Evidence, Series
-from rlctl.check_env.finding import NotApplicable, NotJudged, Seen, Severity, rule
+from rlctl.check_env.finding import NotApplicable, NotJudged, Severity
+from rlctl.check_env.legacy import Seen, rule
 from rlctl.check_env.rules.known import why_missing
 from rlctl.check_env.rules.tried import SUCCESS, WITH_SEARCH, at, has_succeeded, in_words, reports_success, tried
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rlctl.check_env.context import Context
-    from rlctl.check_env.wire import Message
+    from rlctl.check_env.messages import Message
 
 PARTS = {"probe": 0, "instances": 1, "checkers": 0}
 """The child processes and their hash seeds: that of `instances` is another, so that hash order shows."""

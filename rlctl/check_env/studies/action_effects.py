@@ -14,6 +14,8 @@ from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED, SECOND_SEED
 from rlctl.check_env.failures import EnvironmentRaised, describe
 from rlctl.check_env.leaves import Leaf
+from rlctl.check_env.legacy import result, skip
+from rlctl.check_env.messages import Message
 from rlctl.check_env.results import ActionEffect, ActionEffects, NanAction, OutOfRange
 from rlctl.check_env.studies.action_trials import (
     Dimension,
@@ -25,7 +27,6 @@ from rlctl.check_env.studies.action_trials import (
     dimensions,
     replaced,
 )
-from rlctl.check_env.wire import Message, result, skip
 
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))

@@ -15,8 +15,9 @@ from rlctl.check_env.evidence import FIRST_SEED
 from rlctl.check_env.failures import describe
 from rlctl.check_env.instance import Instance
 from rlctl.check_env.leaves import pick
+from rlctl.check_env.legacy import result
+from rlctl.check_env.messages import Message
 from rlctl.check_env.results import Attributes, SharedSpaces, Windows
-from rlctl.check_env.wire import Message, result
 
 SPACES = ("action_space", "observation_space")
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED
+from rlctl.check_env.legacy import result
+from rlctl.check_env.messages import Message
 from rlctl.check_env.recording import Plan, Recording
 from rlctl.check_env.results import GlobalRandom, GlobalUse
-from rlctl.check_env.wire import Message, result
 
 WATCHED_STEPS = 30
 
@@ -30,7 +31,7 @@ def global_random(context: Context) -> Iterator[Message]:
         recording.step()
         _compare(before, "step", recording.steps, uses)
     if recording.failure is not None:
-        yield recording.failure, {}
+        yield recording.failure
     else:
         yield result(GlobalRandom(list(uses.values())))
 

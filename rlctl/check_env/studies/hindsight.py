@@ -12,8 +12,9 @@ from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED
 from rlctl.check_env.failures import EnvironmentRaised, describe
 from rlctl.check_env.instance import Instance
+from rlctl.check_env.legacy import result
+from rlctl.check_env.messages import Message
 from rlctl.check_env.results import Hindsight
-from rlctl.check_env.wire import Message, result
 
 STEPS = 50
 

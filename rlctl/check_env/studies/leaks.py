@@ -15,8 +15,9 @@ from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED
 from rlctl.check_env.failures import EnvironmentRaised
 from rlctl.check_env.instance import Budget, Instance
+from rlctl.check_env.legacy import result
+from rlctl.check_env.messages import Message
 from rlctl.check_env.results import Leaks
-from rlctl.check_env.wire import Message, result
 
 MOST_RESETS = 100
 WARM_UP = 10

@@ -15,7 +15,7 @@ from typing import Any
 from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import GYMNASIUM, RAISED, SB3
 from rlctl.check_env.failures import describe
-from rlctl.check_env.wire import Message
+from rlctl.check_env.messages import Checked, Complaint, Message
 
 _LIBRARIES = re.compile(r"[/\\](gymnasium|stable_baselines3|rlctl[/\\]check_env)[/\\](?!envs[/\\])")
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
@@ -71,15 +71,11 @@ def _message(name: str, context: Context, load: Callable[[], Callable[[Any], Non
     except Exception as error:
         problem = f"importing it failed: {describe(error)}"
     else:
-        env = context.make()
+        env = context.build().env
         context.progress.enter("check")
         complaints = complaints_of(checker, env)
         context.progress.leave()
-    return {"type": "checked", "checker": name, "problem": problem, "complaints": _named(name, complaints)}, {}
-
-
-def _named(name: str, complaints: Complaints) -> list[dict[str, str]]:
-    return [{"checker": name, **each} for each in complaints]
+    return Checked(name, problem, [Complaint(name, **each) for each in complaints])
 
 
 def complaints_of(checker: Callable[[Any], None], env: Any) -> Complaints:

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED, SECOND_SEED
 from rlctl.check_env.instance import Instance
+from rlctl.check_env.legacy import skip
+from rlctl.check_env.messages import Message
 from rlctl.check_env.recording import Plan, Recording
-from rlctl.check_env.wire import Message, skip
 
 EPISODES = [
     *("random", "zero", "extreme", "random", "random", "random"),
@@ -98,7 +99,7 @@ def instances(context: Context) -> Iterator[Message]:
     first = context.build()
     yield from live(first, "fresh process", FIRST_SEED).run()
     yield from live(first, "second alone", SECOND_SEED).run()
-    yield from context.closed(first)
+    yield from context.close(first)
 
     progress.phase("fresh instance")
     neighbour = context.build()
@@ -106,7 +107,7 @@ def instances(context: Context) -> Iterator[Message]:
     if budget.seconds_left < 0:
         for role in ("interleaved", "after close"):
             yield skip(role, "building and stepping the first two instances took all the time there is for them")
-        yield from context.closed(neighbour)
+        yield from context.close(neighbour)
         return
 
     # From here on each instance has lived the same episodes, in the same order, as `first` had.
@@ -119,12 +120,12 @@ def instances(context: Context) -> Iterator[Message]:
     if last.running:
         last.step()
     progress.phase("close")
-    yield from context.closed(neighbour)
+    yield from context.close(neighbour)
     progress.phase("after close")
     while last.running:
         last.step()
     yield from last.messages()
-    yield from context.closed(survivor)
+    yield from context.close(survivor)
 
 
 def _interleaved(*recordings: Recording) -> Iterator[Message]:

@@ -15,9 +15,10 @@ from rlctl.check_env.evidence import FIRST_SEED
 from rlctl.check_env.failures import EnvironmentRaised, describe
 from rlctl.check_env.instance import Instance
 from rlctl.check_env.leaves import Leaf, leaf_name, pick
+from rlctl.check_env.legacy import result, skip
+from rlctl.check_env.messages import Message
 from rlctl.check_env.recording import Plan, Recording
 from rlctl.check_env.results import AfterEnd, AfterEndProblem, CloseTwice, StepBeforeReset
-from rlctl.check_env.wire import Message, result, skip
 
 LONGEST_EPISODE = 2_000
 """An episode that does not end within so many random steps is left [steps]."""

@@ -11,8 +11,9 @@ from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED
 from rlctl.check_env.failures import EnvironmentRaised, describe
 from rlctl.check_env.instance import Instance
+from rlctl.check_env.legacy import result
+from rlctl.check_env.messages import Message
 from rlctl.check_env.results import RenderAttempt, Rendering
-from rlctl.check_env.wire import Message, result
 
 Mode = Literal["rgb_array", "ansi"]
 MODES: tuple[Mode, ...] = get_args(Mode)

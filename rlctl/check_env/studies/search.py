@@ -20,8 +20,9 @@ from rlctl.check_env.actions import zero_action
 from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED
 from rlctl.check_env.leaves import Leaf, Path, leaves_of
+from rlctl.check_env.legacy import skip
+from rlctl.check_env.messages import Message, Trajectory
 from rlctl.check_env.recording import Plan, Recording
-from rlctl.check_env.wire import Message, skip
 
 ROLE = "search"
 MOST_STEPS = 6_000
@@ -157,13 +158,13 @@ class _Search:
         plan = Plan(ROLE, self.episode, self._seed, kind, max_steps=len(sequence), max_s=longest_s, given=given)
         recording = Recording(self.instance, plan, self.budget)
         messages = recording.run()
-        header, arrays = messages[0]
-        self.tried.append(_Tried(sequence, arrays["rewards"], _succeeded(messages[0]), header["ended"] == "terminated"))
+        life = recording.trajectory
+        self.tried.append(_Tried(sequence, life.rewards, _succeeded(life), life.ended == "terminated"))
         self.episode += 1
         self._steps += recording.steps
         self._longest = max(self._longest, recording.steps)
         self._failures += recording.failure is not None
-        if header["ended"] in ("truncated", "both"):
+        if life.ended in ("truncated", "both"):
             self._length = min(self._length, recording.steps)
         yield from messages
 
@@ -183,12 +184,8 @@ class _Search:
         return not self.why_stopped and self._steps < part * MOST_STEPS and self.episode < part * MOST_EPISODES
 
 
-def _succeeded(message: Message) -> bool:
-    header, arrays = message
-    for index, name in enumerate(header["infos"]):
-        if name == "is_success":
-            return bool((arrays[f"info/{index}/values"] > 0).any())
-    return False
+def _succeeded(life: Trajectory) -> bool:
+    return "is_success" in life.infos and bool((life.infos["is_success"].values > 0).any())
 
 
 def action_of(space: Any, numbers: NDArray[np.float64]) -> Any:

@@ -15,9 +15,10 @@ from typing import Any
 from rlctl.check_env.actions import actions
 from rlctl.check_env.context import Context
 from rlctl.check_env.instance import Instance
+from rlctl.check_env.legacy import result
+from rlctl.check_env.messages import Message
 from rlctl.check_env.results import Speed
 from rlctl.check_env.sampling import Sampler, Samples, Stopwatch
-from rlctl.check_env.wire import Message, result
 
 FIRST_SPEED_SEED = 5000
 TIMED_STEPS = 200

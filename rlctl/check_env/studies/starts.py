@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED
+from rlctl.check_env.legacy import skip
+from rlctl.check_env.messages import Message
 from rlctl.check_env.recording import Plan, Recording
-from rlctl.check_env.wire import Message, skip
 
 ROLE = "starts"
 STARTS = 30

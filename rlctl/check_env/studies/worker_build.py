@@ -15,8 +15,9 @@ from typing import Any
 from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED
 from rlctl.check_env.failures import describe
+from rlctl.check_env.legacy import result
+from rlctl.check_env.messages import Message
 from rlctl.check_env.results import WorkerBuild
-from rlctl.check_env.wire import Message, result
 
 HANG_S = 10.0
 """A call in the worker that takes longer hangs: each took less than a second or two in this process, or its time

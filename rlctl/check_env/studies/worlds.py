@@ -19,6 +19,8 @@ from rlctl.check_env.context import Context
 from rlctl.check_env.evidence import FIRST_SEED
 from rlctl.check_env.failures import EnvironmentRaised, failure
 from rlctl.check_env.instance import Budget, Instance
+from rlctl.check_env.legacy import result
+from rlctl.check_env.messages import Message
 from rlctl.check_env.studies import source, world_summaries
 from rlctl.check_env.studies.tampering import Touch, jumps, touches, weight_matters
 from rlctl.check_env.studies.world_life import Life, look
@@ -31,7 +33,6 @@ from rlctl.check_env.studies.world_reading import (
     read_gravity,
     read_world,
 )
-from rlctl.check_env.wire import Message, result
 from rlctl.check_env.world_results import Jump, Moment, World, WorldBody, WorldLink, Worlds
 
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))
@@ -66,7 +67,7 @@ def worlds(context: Context) -> Iterator[Message]:
             try:
                 watcher.episode(episode, kind, steps, context.budget)
             except EnvironmentRaised as error:
-                yield failure(error, context.progress), {}
+                yield failure(error, context.progress)
                 if not watcher.resets:
                     return
         if watcher.notes and context.budget.seconds_left > 0:

@@ -1,0 +1,98 @@
+"""What runs in a child process of check-env: its experiments, sent to the parent message by message."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+import traceback
+from collections.abc import Collection, Iterator, Sequence
+from multiprocessing.connection import Connection
+from typing import Any
+
+from rlctl import env_spec
+from rlctl.check_env import families
+from rlctl.check_env.context import Context
+from rlctl.check_env.experiment import Experiment
+from rlctl.check_env.failures import EnvironmentRaised, failure
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
+from rlctl.check_env.instance import Budget
+from rlctl.check_env.messages import Crash, End, Fact, Failure, Finished, Message, Mistake, Skipped
+from rlctl.check_env.progress import Progress
+from rlctl.check_env.wire import encode
+from rlctl.errors import RecipeError, UsageError
+
+
+def main(
+    connection: Connection, process: str, spec: dict[str, Any], experiments: list[str], seconds: float, memory: int
+) -> None:
+    """Run some experiments of one process and send what they yield. `memory`: the descriptor of the progress."""
+    for message in run(process, env_spec.EnvSpec(**spec), experiments, seconds, Progress(memory)):
+        connection.send_bytes(encode(message))
+    connection.send_bytes(encode(End()))
+
+
+def run(
+    process: str,
+    spec: env_spec.EnvSpec,
+    names: Collection[str] | None = None,
+    seconds: float = families.PROCESS_S,
+    progress: Progress | None = None,
+) -> Iterator[Message]:
+    """Yield the messages of one process; all its experiments by default, within so many seconds together."""
+    context = Context(spec, progress)
+    chosen = [each for each in families.PROCESSES[process].experiments if names is None or each.name in names]
+    try:
+        for message in _run_all(context, chosen, seconds):
+            yield dataclasses.replace(message, process=process) if isinstance(message, Failure) else message
+    except UsageError as error:
+        yield Mistake(str(error), isinstance(error, RecipeError))
+
+
+def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> Iterator[Message]:
+    """Run the experiments; each has its share of the time that those before it have left."""
+    end = time.monotonic() + seconds
+    shares = sum(each.share for each in chosen)
+    for each in chosen:
+        started = time.monotonic()
+        if each.name == "build":
+            yield from _run(each, context)
+            if not context.is_built:
+                return
+            end += time.monotonic() - started  # importing and building comes on top
+        elif context.is_built and not context.instance.can_act:
+            yield Skipped(each.name, "its action space is not a Gymnasium space")
+        elif started > end:
+            yield Skipped(each.name, f"the experiments before it took the {seconds:g} s there are")
+        else:
+            context.budget = Budget(started + (end - started) * each.share / shares)
+            yield from _run(each, context)
+        shares -= each.share
+    yield from context.close()
+
+
+def _run(experiment: Experiment, context: Context) -> Iterator[Message]:
+    started = time.monotonic()
+    context.progress.phase(experiment.name)
+    is_complete = False
+    found: set[str] = set()
+    try:
+        for message in experiment.run(context):
+            if isinstance(message, Fact):
+                context.facts[message.name] = message.value
+            elif isinstance(message, Finding):
+                found.add(message.rule)
+            yield message
+        is_complete = True
+    except (NotJudged, NotApplicable) as reason:
+        for rule in experiment.rules or (experiment.name,):
+            if rule not in found:
+                yield Skipped(rule, str(reason), applies=isinstance(reason, NotJudged))
+        is_complete = True
+    except EnvironmentRaised as error:
+        yield failure(error, context.progress)
+    except UsageError:
+        raise
+    except Exception:
+        # The environment's own exceptions were caught where it was called, so this one is ours.
+        yield Crash(experiment.name, traceback.format_exc())
+    yield Finished(experiment.name, time.monotonic() - started, is_complete)

@@ -1,0 +1,65 @@
+"""What a family is made of: experiments, which run in a child process, and checks of what was recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING
+
+from rlctl.check_env.finding import RULES, Finding
+
+if TYPE_CHECKING:
+    from rlctl.check_env.context import Context
+    from rlctl.check_env.messages import Message
+    from rlctl.check_env.records import Records
+
+RECORDING = ("comparisons", "episodes", "instances")
+"""The experiments that record episodes for all rules: with random and other actions, alone and beside another."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """One thing to do with an environment in a child process."""
+
+    name: str
+    run: Callable[[Context], Iterator[Message]]
+    """Yields what it finds, each as soon as it is known, so that what comes before a crash is not lost."""
+    rules: tuple[str, ...]
+    """Those it decides: they are judged if it comes to its end. Empty for one that only records."""
+    share: float
+    """Its part of the time there is, relative to the other experiments of the same process."""
+    provokes: str
+    """What it does that no learner would do, in words for a message. If that ends the process or hangs, it is an error
+    of the first of its rules, and otherwise no failure of the environment."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """How the parent process judges a rule from what was recorded."""
+
+    rule: str
+    run: Callable[[Records], Iterable[Finding]]
+    needs: tuple[str, ...]
+    """The experiments that record what it reads."""
+
+
+def experiment(
+    name: str, *rules: str, share: float = 1.0, provokes: str = ""
+) -> Callable[[Callable[[Context], Iterator[Message]]], Experiment]:
+    """Make an experiment of a function. It decides `rules`; see the package `families` for how."""
+
+    def decorate(run: Callable[[Context], Iterator[Message]]) -> Experiment:
+        assert all(rule in RULES for rule in rules)
+        return Experiment(name, run, rules, share, provokes)
+
+    return decorate
+
+
+def check(rule: str, *needs: str) -> Callable[[Callable[[Records], Iterable[Finding]]], Check]:
+    """Make the check of a rule of a function; by default it reads the recorded episodes."""
+
+    def decorate(run: Callable[[Records], Iterable[Finding]]) -> Check:
+        assert rule in RULES
+        return Check(rule, run, needs or RECORDING)
+
+    return decorate

@@ -1,0 +1,150 @@
+"""The families of rules. A family is a file (or two): its experiments and its rules side by side.
+
+**An experiment** does something with an environment in a child process and yields what it finds:
+
+    @experiment("attributes", "RL214", "RL404", share=0.5)
+    def look_at_attributes(context: Context) -> Iterator[Message]:
+        with context.fresh() as instance:
+            instance.reset(FIRST_SEED)
+            yield Finding("RL214", "metadata is a list, not a dict", {"value": "list"})
+
+It decides the rules that it names: they are judged when it comes to its end. `raise NotJudged(why)` or
+`NotApplicable(why)` says so of all its rules without a finding, `yield Skipped("RL404", why)` of one of them. It calls
+the environment through `Instance.call`, `Instance.reset` and `Episode` only, so that what the environment raises is an
+`EnvironmentRaised`, which need not be caught, and a hang or a crash can be placed. `context.budget` is the time there
+is. One that does what no learner would (`provokes="a second close"`) may crash the environment; that is then an error
+of its first rule, found by nobody else.
+
+**A check** judges one rule in the parent process, from recorded episodes, which many rules share:
+
+    @check("RL502", "episodes")
+    def find_both_flags(records: Records) -> Iterator[Finding]:
+        for each in records.episodes: ...
+
+It names the experiments that it needs (by default those that record the common episodes, `RECORDING`) and raises
+`NotJudged` or `NotApplicable`. A rule may have both, and then has the findings of both. What a check needs of an
+experiment besides episodes is a `Fact`: `yield Fact("truncation", "never")`, then `records.require_fact("truncation",
+"attributes")`; a later experiment of the same process reads `context.facts`. A recording experiment yields what
+`Recording.run()` returns.
+
+**Texts** (name, severity, meaning, fix, what the libraries' checkers say about it) are in `rules.yaml`, not here. A
+finding gives its own severity or fix only where they differ from the rule's. Every check and experiment of a module in
+`MODULES` counts; the order of experiments is that of `PROCESSES`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Iterable
+
+from rlctl.check_env.experiment import Check, Experiment
+from rlctl.check_env.families import loading
+from rlctl.check_env.finding import RULES
+from rlctl.check_env.legacy import old_experiment
+from rlctl.check_env.rules import (
+    actions,
+    determinism,
+    display,
+    episodes,
+    hidden_goal,
+    hindsight,
+    interface,
+    isolation,
+    misuse,
+    observations,
+    physics,
+    physics_source,
+    redundancy,
+    resources,
+    reward_incentives,
+    reward_terms,
+    rewards,
+    spaces,
+    speed,
+    success,
+)
+
+PROCESS_S = 18.0
+"""How long the experiments of one process may take together [s]; importing and building comes on top."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Process:
+    """A child process and what runs in it, in this order: what may crash the environment comes last."""
+
+    experiments: tuple[Experiment, ...]
+    hash_seed: int = 0
+
+
+PROCESSES = {
+    "probe": Process(
+        (
+            loading.build,
+            old_experiment("comparisons"),
+            old_experiment("global random"),
+            old_experiment("speed"),
+            old_experiment("episodes"),
+            old_experiment("starts"),
+            old_experiment("search"),
+            old_experiment("hindsight"),
+            old_experiment("leaks"),
+            old_experiment("after the end"),
+        )
+    ),
+    "instances": Process(
+        (
+            old_experiment("instances"),
+            old_experiment("worlds"),
+            old_experiment("action effects"),
+            old_experiment("attributes"),
+            old_experiment("worker build"),
+            old_experiment("out of range"),
+            old_experiment("step before reset"),
+            old_experiment("close twice"),
+            old_experiment("rendering"),
+            old_experiment("nan action"),
+        ),
+        hash_seed=1,  # another one, so that hash order shows
+    ),
+    "checkers": Process((old_experiment("gymnasium checker"), old_experiment("sb3 checker"))),
+}
+"""The child processes; the last one loads torch, and waits for a place."""
+
+CHECKERS = ("gymnasium checker", "sb3 checker")
+
+MODULES = (
+    *(loading, observations, spaces, redundancy, hidden_goal, interface, misuse, display, determinism, isolation),
+    *(resources, episodes, rewards, reward_incentives, reward_terms, success, hindsight, actions),
+    *(physics, physics_source, speed),
+)
+
+CHECKS = {each.rule: each for module in MODULES for each in vars(module).values() if isinstance(each, Check)}
+"""The check of a rule, for those that have one."""
+
+EXPERIMENTS = {each.name: each for process in PROCESSES.values() for each in process.experiments}
+
+DECIDED_BY = {rule: each for each in EXPERIMENTS.values() for rule in each.rules}
+"""The experiment that decides a rule, for those that one does."""
+
+
+def find_needs(rules: Iterable[str]) -> set[str]:
+    """Return the names of the experiments that some rules need."""
+    needed: set[str] = set()
+    for rule in rules:
+        if rule in CHECKS:
+            needed.update(CHECKS[rule].needs)
+        if rule in DECIDED_BY:
+            needed.add(DECIDED_BY[rule].name)
+        if rule not in CHECKS and rule not in DECIDED_BY:
+            needed.update(CHECKERS)  # only the libraries' checkers say anything about it
+    return needed
+
+
+def find_rules(experiments: Collection[str]) -> list[str]:
+    """Return the ids of the rules that some experiments can say something about."""
+    return [
+        rule
+        for rule in RULES
+        if (rule in CHECKS and set(CHECKS[rule].needs) & set(experiments))
+        or (rule in DECIDED_BY and DECIDED_BY[rule].name in experiments)
+    ]

@@ -1,0 +1,134 @@
+"""RL0: from the name on the command line to an environment."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rlctl import registry
+from rlctl.check_env.built import describe_built
+from rlctl.check_env.context import Context
+from rlctl.check_env.experiment import RECORDING, check, experiment
+from rlctl.check_env.finding import Finding
+from rlctl.check_env.messages import Built, Failure, Message
+from rlctl.check_env.missing_files import missing_file
+from rlctl.check_env.no_display import lost_display
+from rlctl.check_env.records import Records
+from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
+
+OLD_KEYS = {
+    "render.modes": "render_modes",
+    "video.frames_per_second": "render_fps",
+    "video.frames_per_sec": "render_fps",
+}
+
+
+@experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL009", share=0.0)
+def build(context: Context) -> Iterator[Message]:
+    """Build the first instance, which the process keeps. Raises `UsageError` for a name that does not exist."""
+    try:
+        instance = context.build_first()
+    except (NoSuchClassError, OldGymError) as error:
+        yield _explain(context, error)
+        return
+    except UsageError:
+        raise
+    except RlctlError as error:
+        yield _explain(context, error)
+        return
+    built = describe_built(instance)
+    yield built
+    yield from _base_class(built)
+    yield from _metadata(built.metadata)
+
+
+def _explain(context: Context, error: RlctlError) -> Finding:
+    """Return the finding for an exception of the import or the constructor."""
+    cause = error.__cause__
+    details = {"traceback": error.details} if error.details else {}
+    if isinstance(error, NoSuchClassError):
+        return Finding("RL005", str(error), details)
+    if isinstance(error, OldGymError) or _imports_old_gym(cause):
+        return Finding("RL008", str(error), details)
+    if (file := missing_file(cause)) is not None:
+        return _not_found("the constructor", file, error.details)
+    if context.stage == "import":
+        return Finding("RL001", str(error), details)
+    if isinstance(cause, TypeError) and (missing := _missing_arguments(str(cause))):
+        settings = " ".join(f"--set task.{name}=..." for name in missing)
+        fix = f"Give them ({settings}), or give them default values."
+        return Finding("RL006", str(error), details, fix=fix)
+    if isinstance(error, TaskError) and error.details is None and not _is_task(context.spec.task):
+        return Finding(
+            "RL003", str(error)
+        )  # what a constructor raises comes with its traceback; this is the registry's
+    return Finding("RL002", str(error), details)
+
+
+def _imports_old_gym(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "gym":
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _is_task(name: str) -> bool:
+    return inspect.isclass(loaded := registry.load(name)) and registry.is_task(loaded)
+
+
+def _missing_arguments(message: str) -> list[str]:
+    found = re.search(r"missing \d+ required .*?arguments?: (.*)", message)
+    return re.findall(r"'(\w+)'", found.group(1)) if found else []
+
+
+def _base_class(built: Built) -> Iterator[Finding]:
+    if built.is_old_gym:
+        yield Finding("RL008", "the class inherits from gym.Env, not from gymnasium.Env")
+    elif not built.is_env:
+        yield Finding("RL003", "the class does not inherit from gymnasium.Env")
+    for name, leaves in (("observation", built.leaves), ("action", built.action_leaves)):
+        if "NoneType" in {leaf.kind for leaf in leaves}:
+            yield Finding("RL003", f"there is no {name}_space")
+
+
+def _metadata(metadata: Mapping[str, Any]) -> Iterator[Finding]:
+    for key in metadata:
+        if key in OLD_KEYS:
+            message = f"metadata has {key!r}, which is now {OLD_KEYS[key]!r}"
+            yield Finding("RL009", message, {"value": key, "expected": OLD_KEYS[key]})
+    if metadata.get("render_modes") and not any("fps" in key or "frames_per_sec" in key for key in metadata):
+        message = f"metadata has render_modes {metadata['render_modes']} and no render_fps"
+        yield Finding("RL009", message, {"expected": "render_fps"})
+
+
+@check("RL004", "build")
+def find_end_while_loading(records: Records) -> Iterator[Finding]:
+    if records.built is None:
+        for failure in records.failures:
+            if failure.process == "probe" and failure.call in ("load", "build") and not lost_display(failure):
+                evidence = {"last_output": failure.details} if failure.details else {}
+                yield Finding("RL004", _while_loading(failure), evidence)
+
+
+def _while_loading(failure: Failure) -> str:
+    doing = "the import" if failure.call == "load" else "the constructor"
+    return f"{doing} {failure.error}" if failure.kind == "hung" else f"the process {failure.error} in {doing}"
+
+
+@check("RL007", "build", *RECORDING)
+def find_missing_files(records: Records) -> Iterator[Finding]:
+    files = set()
+    for failure in records.failures if records.built is not None else ():
+        if failure.file is not None and failure.file["file"] not in files:
+            files.add(failure.file["file"])
+            yield _not_found(failure.call, failure.file, failure.details)
+
+
+def _not_found(call: str, file: Mapping[str, Any], details: str | None) -> Finding:
+    where = f", looked for in {' and '.join(file['searched'])}" if file["searched"] else ""
+    similar = f"; there is {file['similar']}" if file["similar"] else ""
+    evidence = {**file, "traceback": details} if details else dict(file)
+    return Finding("RL007", f"{call} does not find {file['file']!r}{where}{similar}", evidence)

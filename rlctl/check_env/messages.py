@@ -1,0 +1,237 @@
+"""What the experiments of a child process send: recorded episodes, failures, findings, and what could not be judged."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.check_env.finding import Finding
+from rlctl.check_env.leaves import Leaf, leaf_name
+
+FIRST_SEED = 1000
+SECOND_SEED = 1001
+
+GYMNASIUM, SB3 = "Gymnasium", "Stable-Baselines3"
+RAISED = "the environment raised "
+"""How a complaint of a library's checker begins that is the environment's own exception."""
+
+MOST_INFOS = 100
+"""So many numbers of info are recorded per episode, by name."""
+ENDS = ("terminated", "truncated", "both")
+
+
+@dataclasses.dataclass(frozen=True)
+class Built:
+    """The environment that was built: its spaces and what it says about itself."""
+
+    leaves: list[Leaf]
+    """The observation space, taken apart into arrays."""
+    action_leaves: list[Leaf]
+    observation_space: str
+    action_space: str
+    names: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """Size per observation name in the order of a flat observation; empty where names are not known."""
+    max_steps: int | None = None
+    """The time limit it declares [steps]."""
+    nondeterministic: bool = False
+    """Whether its Gymnasium registration says that equal seeds may give unequal episodes."""
+    accepts_seed: bool = True
+    is_env: bool = True
+    """Whether it inherits from `gymnasium.Env`."""
+    is_old_gym: bool = False
+    """Whether it inherits from the old gym."""
+    metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    uses_pybullet: bool = False
+    """Whether a PyBullet client was connected once it was built."""
+    waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Per rule that its class waives, the reason."""
+    file: str | None = None
+    """Where its class is written."""
+    line: int | None = None
+
+    def element(self, leaf: int, index: int) -> str:
+        """Name one number of an observation by the place of its array and its flat index."""
+        where = leaf_name(self.leaves[leaf])
+        if len(self.leaves) == 1 and sum(self.names.values()) == int(np.prod(self.leaves[0].shape)):
+            offset = index
+            for name, size in self.names.items():
+                if offset < size:
+                    return f"{name}[{offset}]" if size > 1 else name
+                offset -= size
+        if not self.leaves[leaf].shape:
+            return where
+        position = np.unravel_index(index, self.leaves[leaf].shape)
+        return f"{where}[{', '.join(str(int(i)) for i in position)}]"
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """The values of one leaf of the observation: those that have the leaf's shape."""
+
+    steps: NDArray[np.int64]
+    """Which observation each row is; 0 is the one of `reset`. Shape (n,)."""
+    values: NDArray[Any]
+    """Shape (n, *leaf.shape)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Form:
+    """A type that something had: where it came first, and how often."""
+
+    what: str
+    """`observation`, `memory`, `keys`, `reward`, `terminated`, `truncated`, `info`, `reset` or `step`."""
+    type: str
+    step: int
+    count: int
+    leaf: int | None = None
+    dtype: str | None = None
+    shape: tuple[int, ...] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """One episode of T steps, or the part of it that was played."""
+
+    role: str
+    """What it was recorded for: `episodes`, or the name of a comparison."""
+    episode: int
+    seed: int
+    actions: str
+    """How actions were chosen: `random`, `zero` or `extreme`."""
+    ended: str
+    """`terminated`, `truncated`, `both`, `raised`, or what cut it: `steps`, `time`, `memory`."""
+    observations: dict[int, Series]
+    """Per leaf."""
+    rewards: NDArray[np.float64]
+    """Shape (T,); NaN where it was no number."""
+    reward_is_number: NDArray[np.bool_]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    action_values: NDArray[np.float64]
+    """Numbers of each action, in the order of the action space's leaves. Shape (T, A)."""
+    infos: Mapping[str, Series]
+    """Numbers in info, by name; those in a dictionary of info as `reward_terms/distance`. Values have shape (n,)."""
+    forms: list[Form]
+    step_s: float
+    """Time in `step`, summed [s]."""
+    reset_s: float
+
+    @property
+    def steps(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def has_ended(self) -> bool:
+        return self.ended in ENDS
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """Seed, episode and kind of actions, for a finding's evidence."""
+        return {"seed": self.seed, "episode": self.episode, "actions": self.actions}
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """A call into the environment that raised, never came back, or ended the process."""
+
+    kind: str
+    """`raised`, `hung` or `died`."""
+    call: str
+    """`load`, `build`, `reset`, `step`, `close`, `sample`, `check`, `render` or `compute_reward`."""
+    phase: str
+    """The experiment, or the part of one."""
+    episode: int
+    seed: int
+    step: int
+    error: str
+    details: str | None = None
+    """A traceback, or the last lines that a dying process printed."""
+    file: Mapping[str, Any] | None = None
+    """A file that was not found: its name, the folders that were searched, and a similar file."""
+    process: str = ""
+    """Which child process: `probe`, `instances` or `checkers`."""
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """Where it was, as a finding's evidence."""
+        place = {"call": self.call, "seed": self.seed, "episode": self.episode, "step": self.step}
+        if self.details:
+            place["traceback" if self.kind == "raised" else "last_output"] = self.details
+        return place
+
+
+@dataclasses.dataclass(frozen=True)
+class Complaint:
+    """What a library's own checker said."""
+
+    checker: str
+    """`Gymnasium` or `Stable-Baselines3`."""
+    kind: str
+    """`error` (it refused the environment) or `warning`."""
+    text: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Checked:
+    """A library's checker was tried."""
+
+    checker: str
+    problem: str | None
+    """Why it could not run."""
+    complaints: list[Complaint]
+
+
+@dataclasses.dataclass(frozen=True)
+class Fact:
+    """Something that a check of the parent, or a later experiment of the same process, needs to know."""
+
+    name: str
+    value: Any
+    """What JSON can hold, or a dataclass of this package."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Skipped:
+    """An experiment, a role of one, or a rule that cannot be judged, and why."""
+
+    name: str
+    reason: str
+    applies: bool = True
+    """False where this kind of environment does not have what the rule is about."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Finished:
+    """An experiment has come to its end, by itself or by what the environment raised."""
+
+    experiment: str
+    seconds: float
+    is_complete: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Crash:
+    """An experiment has a bug."""
+
+    experiment: str
+    traceback: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Mistake:
+    """The user named a task or a parameter that does not exist."""
+
+    message: str
+    is_recipe: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class End:
+    """The process has done all it was asked for."""
+
+
+Message = Built | Trajectory | Failure | Checked | Finding | Fact | Skipped | Finished | Crash | Mistake | End

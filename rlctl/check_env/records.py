@@ -1,0 +1,126 @@
+"""Everything that is known about one environment: what the child processes have sent. No environment code runs here."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from rlctl.check_env.finding import Finding, NotJudged
+from rlctl.check_env.messages import (
+    Built,
+    Checked,
+    Complaint,
+    Crash,
+    Fact,
+    Failure,
+    Finished,
+    Message,
+    Skipped,
+    Trajectory,
+)
+
+BESIDE_OTHERS = ("interleaved", "after close", "after the end")
+"""Roles of episodes that say little about the environment as a learner uses it: rules of their own judge them."""
+
+
+@dataclasses.dataclass
+class Records:
+    """Everything known about one environment; what the checks of the parent process read."""
+
+    task: str
+    built: Built | None = None
+    trajectories: list[Trajectory] = dataclasses.field(default_factory=list)
+    failures: list[Failure] = dataclasses.field(default_factory=list)
+    findings: list[Finding] = dataclasses.field(default_factory=list)
+    """Those of the experiments."""
+    complaints: list[Complaint] = dataclasses.field(default_factory=list)
+    checkers: dict[str, str | None] = dataclasses.field(default_factory=dict)
+    """Per library's checker that was tried: None, or why it could not run."""
+    facts: dict[str, Any] = dataclasses.field(default_factory=dict)
+    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Experiments, roles and rules that were left out, and why."""
+    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Rules that an experiment found nothing to look at for, and why."""
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Per experiment that was run, how long it took."""
+    complete: set[str] = dataclasses.field(default_factory=set)
+    """Experiments that came to their end."""
+    crashes: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Per experiment that crashed by itself, its traceback."""
+    normalizes: bool | None = None
+    """Whether the packaged recipe normalises observations; None without a recipe."""
+    printed_lines: int = 0
+    """Lines that the environment of the first process wrote to stdout."""
+    printed_first: str = ""
+
+    def add(self, message: Message) -> None:
+        """Take in one message of a child process."""
+        match message:
+            case Built():
+                self.built = message
+            case Trajectory():
+                self.trajectories.append(message)
+            case Failure():
+                self.failures.append(message)
+            case Finding():
+                self.findings.append(message)
+            case Fact():
+                self.facts[message.name] = message.value
+            case Skipped():
+                (self.skipped if message.applies else self.not_applicable)[message.name] = message.reason
+            case Finished():
+                self.seconds[message.experiment] = message.seconds
+                if message.is_complete:
+                    self.complete.add(message.experiment)
+            case Crash():
+                self.crashes[message.experiment] = message.traceback
+            case Checked():
+                self.checkers[message.checker] = message.problem
+                self.complaints += message.complaints
+
+    def role(self, role: str) -> list[Trajectory]:
+        """Return what was recorded for one purpose."""
+        return [each for each in self.trajectories if each.role == role]
+
+    @property
+    def episodes(self) -> list[Trajectory]:
+        """Return the whole episodes of the first process."""
+        return self.role("episodes")
+
+    def require_built(self) -> Built:
+        """Return the environment that was built; raises `NotJudged` if there is none."""
+        if self.built is None:
+            raise NotJudged("no instance could be built")
+        return self.built
+
+    def require_alone(self) -> list[Trajectory]:
+        """Return all episodes of instances that were alone in their process; raises `NotJudged` if there is none.
+
+        What a neighbour does to an instance is the matter of other rules.
+        """
+        found = [each for each in self.trajectories if each.role not in BESIDE_OTHERS]
+        if not any(each.steps or each.observations for each in found):
+            raise NotJudged("no episode was recorded")
+        return found
+
+    def require_role(self, role: str) -> Trajectory:
+        """Return the episode of a comparison; raises `NotJudged` if there is none."""
+        found = self.role(role)
+        if not found:
+            raise NotJudged(self.skipped.get(role, f"the comparison {role!r} could not be made"))
+        return found[0]
+
+    def require_fact(self, name: str, experiment: str) -> Any:
+        """Return what an experiment found out; raises `NotJudged` with the reason where it did not."""
+        if name not in self.facts:
+            raise NotJudged(self.why_missing(experiment))
+        return self.facts[name]
+
+    def why_missing(self, experiment: str) -> str:
+        """Return why an experiment has not come to its end."""
+        if experiment in self.skipped:
+            return self.skipped[experiment]
+        failed = [failure for failure in self.failures if failure.phase == experiment]
+        if failed:
+            return f"the environment failed in {failed[0].call} during this experiment: {failed[0].error}"
+        return f"the process ended before the experiment {experiment!r}"

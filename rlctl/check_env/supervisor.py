@@ -1,0 +1,220 @@
+"""Starts the child processes, two at a time, and passes on what they send; deaths and hangs become failures."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.connection import Connection, wait
+
+from rlctl.check_env import families
+from rlctl.check_env.messages import Built, End, Failure, Finished, Message, Mistake, Skipped
+from rlctl.check_env.progress import Position, Progress
+from rlctl.check_env.wire import decode
+from rlctl.env_spec import EnvSpec
+from rlctl.rollout.child_process import ChildProcess, LineReader
+from rlctl.rollout.shared_arrays import anonymous_file
+
+AT_ONCE = 2
+"""The libraries' checkers load torch, which takes as much memory as everything else: they wait for a place."""
+TOTAL_S = 26.0
+"""What is left of this is for the libraries' checkers, the last to start [s]."""
+LEAST_CHECKERS_S = 8.0
+"""They get this much in any case: loading torch is part of it [s]."""
+BUILD_TIMEOUT_S = 60.0
+"""How long importing and building may take, unless a step may take longer."""
+FIRST_CALL_TIMEOUT_S = 30.0
+"""How long the first reset and the first step of a process may take, where much is compiled or loaded [s]."""
+CHECKER_CALLS = 40
+"""A library's checker is one call to us; it makes at most so many calls into the environment."""
+IDLE_TIMEOUT_S = 300.0
+"""How long a child may do nothing with the environment: loading torch on a busy machine, at the worst."""
+_POLL_S = 0.1
+_KEPT_LINES = 8
+_PYBULLETS = ("pybullet build time", "argv[")
+"""Lines that PyBullet prints when it is imported and when it connects."""
+
+
+class Child:
+    """A process of the check, watched."""
+
+    def __init__(self, name: str, spec: EnvSpec, experiments: Sequence[str], seconds: float) -> None:
+        self.name = name
+        self.experiments = list(experiments)
+        """Those that it has not finished."""
+        self.printed = 0
+        """Lines that were written to stdout."""
+        self.first_line = ""
+        self.last_lines: deque[str] = deque(maxlen=_KEPT_LINES)
+        self.ends_at = time.monotonic() + seconds
+        self._memory = anonymous_file()
+        self._progress = Progress(self._memory)
+        self._changed = (-1, time.monotonic())
+        self._readers = LineReader(self._count), LineReader(self._keep)
+        arguments = {
+            "process": name,
+            "spec": dataclasses.asdict(spec),
+            "experiments": self.experiments,
+            "seconds": seconds,
+            "memory": self._memory,
+        }
+        self.process = ChildProcess(
+            "rlctl.check_env.child:main",
+            arguments,
+            stdout=self._readers[0].descriptor,
+            stderr=self._readers[1].descriptor,
+            descriptors=[self._memory],
+            environment={"PYTHONHASHSEED": str(families.PROCESSES[name].hash_seed)},
+        )
+        for reader in self._readers:
+            reader.close_descriptor()
+
+    def _count(self, line: str) -> None:
+        if line and not line.startswith(_PYBULLETS):
+            self.printed += 1
+            self.first_line = self.first_line or line
+            self.last_lines.append(line)
+
+    def _keep(self, line: str) -> None:
+        if line and not line.startswith(_PYBULLETS):
+            self.last_lines.append(line)
+
+    @property
+    def position(self) -> Position:
+        """Where it is."""
+        return self._progress.read()
+
+    def hangs(self, env_timeout_s: float) -> str | None:
+        """Say so if the call that the child is in takes longer than it may."""
+        position = self.position
+        if position.counter != self._changed[0]:
+            self._changed = (position.counter, time.monotonic())
+        limit_s = _limit_s(position, env_timeout_s)
+        return f"did not come back in {limit_s:g} s" if time.monotonic() - self._changed[1] > limit_s else None
+
+    @property
+    def is_over_time(self) -> bool:
+        """Whether it is a library's checker that takes too long: only such a one cannot be asked to stop."""
+        return self.name == "checkers" and time.monotonic() > self.ends_at
+
+    def fail(self, kind: str, error: str) -> Failure:
+        """Return the failure that ends it."""
+        at, details = self.position, "\n".join(self.last_lines)
+        call = at.call or "between calls"
+        return Failure(kind, call, at.phase, at.episode, at.seed, at.step, error, details or None, process=self.name)
+
+    def describe_end(self) -> str:
+        """Wait for its end, after its connection closed, and for the last it has printed; return how it ended."""
+        how = self.process.describe_end()
+        self._wait_for_lines()
+        return how
+
+    def _wait_for_lines(self) -> None:
+        for reader in self._readers:
+            reader.wait()
+
+    def close(self, grace_s: float = 0.0) -> None:
+        """End it, and what it has started. A second call does nothing."""
+        if self._memory < 0:
+            return
+        self.process.close(grace_s)
+        self._wait_for_lines()
+        os.close(self._memory)
+        self._memory = -1
+
+
+def _limit_s(position: Position, env_timeout_s: float) -> float:
+    call = position.call
+    if position.is_first and call in ("reset", "step"):
+        return max(FIRST_CALL_TIMEOUT_S, env_timeout_s)
+    if call in ("load", "build"):
+        return max(BUILD_TIMEOUT_S, env_timeout_s)
+    if call == "check":
+        return CHECKER_CALLS * env_timeout_s
+    return env_timeout_s if call else IDLE_TIMEOUT_S
+
+
+class Supervisor:
+    """The child processes of one check."""
+
+    def __init__(
+        self, spec: EnvSpec, budget_s: float, env_timeout_s: float, receive: Callable[[Message], None]
+    ) -> None:
+        self._spec = spec
+        self._budget_s = budget_s
+        self._env_timeout_s = env_timeout_s
+        self._receive = receive
+        self._started = time.monotonic()
+        self._waiting: dict[str, list[str]] = {}
+        self._active: dict[Connection, Child] = {}
+        self._has_built = False
+        self.children: list[Child] = []
+        """Those that were started, the first process first."""
+
+    def run(self, experiments: Mapping[str, Sequence[str]], on_poll: Callable[[Position], None]) -> None:
+        """Run each process with some experiments, and come back when all are done, dead or ended."""
+        self._waiting = {process: list(names) for process, names in experiments.items()}
+        self._start()
+        while self._active:
+            for ready in wait(list(self._active), timeout=_POLL_S):
+                self._read(self._active[ready])  # type: ignore[index]
+            for child in list(self._active.values()):
+                if child.process.connection in self._active:  # not ended because of another
+                    self._check(child)
+            self._start()
+            if self._active:
+                on_poll(next(iter(self._active.values())).position)
+
+    def close(self) -> None:
+        """End what still runs."""
+        for child in self.children:
+            child.close()
+
+    def _start(self) -> None:
+        while self._waiting and len(self._active) < AT_ONCE:
+            name = next(iter(self._waiting))
+            seconds = self._budget_s
+            if name == "checkers":
+                seconds = max(LEAST_CHECKERS_S, TOTAL_S - (time.monotonic() - self._started))
+            child = Child(name, self._spec, self._waiting.pop(name), seconds)
+            self.children.append(child)
+            self._active[child.process.connection] = child
+
+    def _read(self, child: Child) -> None:
+        try:
+            message = decode(child.process.connection.recv_bytes())
+        except (EOFError, OSError):
+            self._end(child, child.fail("died", child.describe_end()))
+            return
+        if isinstance(message, End):
+            self._end(child, grace_s=1.0)
+            if child.name == "probe" and not self._has_built:
+                self._waiting.clear()  # what cannot be built here cannot be built there
+            return
+        if isinstance(message, Built):
+            self._has_built = True
+        if isinstance(message, Mistake):
+            self._waiting.clear()
+        if isinstance(message, Finished):
+            child.experiments = [each for each in child.experiments if each != message.experiment]
+        self._receive(message)
+
+    def _check(self, child: Child) -> None:
+        if child.is_over_time:
+            for name in child.experiments:
+                self._receive(Skipped(name, "the libraries' checkers took longer than the time there is for them"))
+            self._end(child)
+        elif why := child.hangs(self._env_timeout_s):
+            self._end(child, child.fail("hung", why))
+            # The checkers would hang in the same call, for much longer.
+            self._waiting.pop("checkers", None)
+            for other in [each for each in self._active.values() if each.name == "checkers"]:
+                self._end(other)
+
+    def _end(self, child: Child, failure: Failure | None = None, grace_s: float = 0.0) -> None:
+        if failure is not None:
+            self._receive(failure)
+        del self._active[child.process.connection]
+        child.close(grace_s)

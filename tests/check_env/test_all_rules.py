@@ -1,0 +1,18 @@
+"""Every case of the other files by all rules: no rule but the expected finds anything. Minutes; hence slow."""
+
+from importlib import import_module
+
+import pytest
+
+from tests.check_env.judging import FOLDER, found
+
+MODULES = [import_module(f"tests.check_env.{file.stem}") for file in sorted(FOLDER.glob("test_*.py"))]
+CASES = [case for module in MODULES for case in getattr(module, "CASES", [])]
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    assert found(case.broken) == case.expected
+    assert not {rule for rule, _ in found(case.twin)} & set(case.rules)
