@@ -1,0 +1,237 @@
+"""The pages: links lead somewhere, commands exist with their options, and code runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shlex
+import tomllib
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import typer
+
+from rlctl.env_spec import EnvSpec
+from rlctl.run import recipe, yaml_text
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/**/*.md")])
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+CODE = re.compile(r"`([^`\n]+)`")
+NAMED_FILE = re.compile(r"`([\w.-]+)`:\n\n```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def of_pages(test):
+    return pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))(test)
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """A block of code in a page."""
+
+    page: Path
+    language: str
+    text: str
+    line: int
+
+    def __str__(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+
+def find_blocks(language: str) -> list[Block]:
+    found = []
+    for page in PAGES:
+        text = page.read_text()
+        for match in FENCE.finditer(text):
+            if match[1] == language:
+                found.append(Block(page, language, match[2], text.count("\n", 0, match.start()) + 1))
+    return found
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings of a page, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@of_pages
+def test_links_lead_somewhere(page):
+    for link in LINK.findall(FENCE.sub("", page.read_text())):
+        if link.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), f"{page.name}: {link}"
+        assert not anchor or anchor in anchors(target), f"{page.name}: {link}"
+
+
+def commands(page: Path) -> list[str]:
+    """Return the rlctl commands of a page: lines of its unmarked blocks, and inline code."""
+    text = page.read_text()
+    lines = [line for match in FENCE.finditer(text) if match[1] == "" for line in match[2].splitlines()]
+    found = [line.removeprefix("$ ") for line in lines] + CODE.findall(FENCE.sub("", text))
+    return [re.split(r"\s+[#|] ", line)[0] for line in found if line.startswith("rlctl ")]
+
+
+def parse(words: list[str], command: Any = None) -> None:
+    """Read a command line as rlctl does, and run nothing; raises what it raises for what does not exist."""
+    from rlctl.cli import app
+
+    command = command or typer.main.get_command(app)
+    if not hasattr(command, "commands"):
+        command.make_context(command.name, list(words))
+    elif words and words[0].startswith("-"):
+        assert words[0] in {option for each in command.params for option in each.opts} | {"--help"}
+    elif words:
+        parse(words[1:], command.commands[words[0]])
+
+
+@of_pages
+def test_commands_exist_with_their_options(page):
+    for command in commands(page):
+        try:
+            parse(shlex.split(command)[1:])
+        except Exception as error:
+            if "Missing parameter" not in str(error):  # a text may name a command without its arguments
+                raise AssertionError(f"{command}: {error}") from error
+
+
+def test_a_wrong_command_would_be_noticed():
+    with pytest.raises(Exception, match="No such option"):
+        parse(["train", "reach", "--speed", "3"])
+    with pytest.raises(KeyError):
+        parse(["tasks", "remove"])
+
+
+@of_pages
+def test_make_targets_exist(page):
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert set(re.findall(r"^(?:\| `)?make ([\w-]+)", page.read_text(), re.MULTILINE)) <= targets
+
+
+@pytest.mark.parametrize("block", find_blocks("python"), ids=str)
+def test_python_is_python(block):
+    compile(block.text, str(block), "exec")
+
+
+@pytest.mark.parametrize("block", find_blocks("yaml"), ids=str)
+def test_recipes_are_recipes(block):
+    recipe.validate(yaml_text.load(block.text, str(block)), str(block))
+
+
+def test_other_files_can_be_read():
+    for block in find_blocks("toml"):
+        tomllib.loads(block.text)
+    for block in find_blocks("xml"):
+        ElementTree.fromstring(block.text)
+    assert set(re.findall(r"^```(\w+)$", "".join(page.read_text() for page in PAGES), re.MULTILINE)) <= {
+        "python", "yaml", "toml", "xml", "cpp",
+    }  # fmt: skip
+
+
+def write_files(page: str, folder: Path) -> str:
+    """Write the files that a page shows under their names; return the task that they define."""
+    for name, _, text in NAMED_FILE.findall((ROOT / page).read_text()):
+        (folder / name).write_text(text)
+    (file,) = folder.glob("*.py")
+    (cls,) = re.findall(r"^class (\w+)\(Task\)", file.read_text(), re.MULTILINE)
+    return f"{file}:{cls}"
+
+
+TASK_PAGES = ["README.md", "docs/task.md"]
+
+
+@pytest.mark.parametrize("page", TASK_PAGES)
+def test_tasks_of_the_pages_run(page, tmp_path):
+    env = EnvSpec(write_files(page, tmp_path)).make()
+    try:
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        for _ in range(20):
+            _, _, terminated, truncated, info = env.step(env.action_space.sample())
+            if terminated or truncated:
+                env.reset(seed=1)
+        assert "is_success" in info
+    finally:
+        env.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", TASK_PAGES)
+def test_tasks_of_the_pages_are_sound_and_train(page, tmp_path, rlctl):
+    task = write_files(page, tmp_path)
+    checked = rlctl("check-env", task, "--strict", timeout=300)
+    assert checked.returncode == 0, checked.stdout
+    done = rlctl("train", task, "-n", "5000", "--set", "eval.episodes=4", timeout=300)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_worked_robot_learns(tmp_path, rlctl):
+    task = write_files("docs/task.md", tmp_path)
+    assert rlctl("train", task, timeout=1000).returncode == 0
+    assert rlctl("eval", "Balance", "--min-success", "0.95", timeout=300).returncode == 0
+
+
+@pytest.mark.slow
+def test_python_that_uses_a_run(tmp_path, rlctl, monkeypatch):
+    small = ["--set", "eval.episodes=2", "--set", "algo_kwargs.n_steps=16", "--set", "algo_kwargs.batch_size=32"]
+    assert rlctl("train", "reach", "-n", "64", "--n-envs", "4", *small, timeout=300).returncode == 0
+    monkeypatch.chdir(tmp_path)
+    blocks = [block for block in find_blocks("python") if "runs/latest" in block.text]
+    assert blocks
+    for block in blocks:
+        exec(compile(block.text, str(block), "exec"), {})
+
+
+def test_python_that_needs_no_run():
+    named = {text for page in PAGES for _, _, text in NAMED_FILE.findall(page.read_text())}
+    blocks = [each for each in find_blocks("python") if each.text not in named and "runs/latest" not in each.text]
+    assert blocks
+    for block in blocks:
+        exec(compile(block.text, str(block), "exec"), {})
+
+
+def section(page: str, heading: str) -> str:
+    """Return a section of a page, up to the next heading of its level."""
+    return re.split(r"^## ", (ROOT / page).read_text().partition(f"\n## {heading}\n")[2], flags=re.MULTILINE)[0]
+
+
+def first_column(text: str) -> set[str]:
+    """Return the names in the first column of the tables of a text."""
+    cells = re.findall(r"^\| ([^|]*`[^|]*) \|", text, re.MULTILINE)
+    return {re.match(r"\w+", code)[0] for cell in cells for code in CODE.findall(cell)}
+
+
+def test_the_page_on_tasks_has_all_that_a_task_has():
+    from rlctl.task import Body, Task, events, rewards
+
+    definition = {name for name in Task.__annotations__ if name != "sim"}
+    assert first_column(section("docs/task.md", "The definition")) == definition
+    methods = {name for name in vars(Task) if not name.startswith("_") and callable(getattr(Task, name))}
+    assert first_column(section("docs/task.md", "The methods")) == methods - {"parameters"}
+    bodies = first_column(section("docs/task.md", "Bodies"))
+    body = EnvSpec("reach").make().unwrapped.sim.body("arm")
+    assert [name for name in bodies if not hasattr(body, name)] == []
+    assert isinstance(body, Body)
+    shown = set(CODE.findall(section("docs/task.md", "Rewards")))
+    functions = {name for name in vars(rewards) if getattr(vars(rewards)[name], "__module__", "") == rewards.__name__}
+    assert {name for name in functions if name.islower()} <= shown
+    shown = set(CODE.findall(section("docs/task.md", "Events: randomisation, pushes, noise, delay")))
+    assert {name for name in events.__all__ if name.islower() and name != "acts_at"} <= shown
+
+
+def test_the_page_on_runs_has_every_file(tmp_path):
+    from rlctl.run.directory import RunDirectory
+
+    run, table = RunDirectory(tmp_path), (ROOT / "docs/run.md").read_text().partition("\n## ")[0]
+    for name in ("recipe_file", "status_file", "metrics_file", "evals_file", "best_policy", "last_policy", "onnx_file"):
+        assert f"`{getattr(run, name).relative_to(tmp_path)}`" in table
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 200
