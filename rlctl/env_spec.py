@@ -7,7 +7,9 @@ import inspect
 import math
 import os
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from annotated_types import Ge, Le
 
 from rlctl import named_task
 from rlctl.errors import RecipeError, TaskError, did_you_mean, short_repr
@@ -23,20 +25,31 @@ LARGEST_SPACE = 10_000_000
 
 @dataclasses.dataclass(frozen=True)
 class EnvSpec:
-    """Everything an environment is made from; plain data, so it travels to a worker as JSON."""
+    """Everything an environment is made from; plain data.
+
+    Embedded wherever a file or a message names an environment: policies, episodes, messages to workers.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}  # in the models that embed it
 
     task: str
+    """As the user wrote it; see `rlctl.registry`."""
     parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Keyword arguments of the task's constructor."""
     reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Weights that differ from the task's."""
     randomize: bool = False
+    """Whether all events of the task act."""
     events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    frame_stack: int = 1
-    stage: int = 0
-    """Stage of the curriculum that these are of, from 1, for who reads it; 0 where there is none."""
-    level: float = 1.0
+    """Events that act, with the parameters that differ from the task's."""
+    frame_stack: Annotated[int, Ge(1)] = 1
+    """How many of the last observations make one."""
+    stage: Annotated[int, Ge(0)] = 0
+    """Stage of the curriculum, from 1; 0 where there is none."""
+    level: Annotated[float, Ge(0), Le(1)] = 1.0
     """How far the ranges of events that widen have done so, in [0, 1]."""
     named_by: str = dataclasses.field(default="", compare=False)
-    """The kind of file that names the task, for people; empty where a person did. A file may name environments only."""
+    """The kind of file that names the task; empty where a person did. A file may name environments only."""
 
     def constructor(self) -> Callable[..., Any]:
         """Import what makes the environment; raises `ArtifactError` if a file names it and it is no environment."""

@@ -45,6 +45,7 @@ def policy(tmp_path_factory):
     """A policy file for the environment above, with the weights it was born with."""
     from gymnasium.spaces import Box
 
+    from rlctl.env_spec import EnvSpec
     from rlctl.run.env_info import EnvInfo, space_to_json
     from rlctl.run.policy import PolicyInfo, save_policy
     from rlctl.run.torch_policy import build_network
@@ -53,7 +54,7 @@ def policy(tmp_path_factory):
         observation_space=space_to_json(Box(-9, 9, (2,))),
         action_space=space_to_json(Box(-1, 1, (1,))),
     )
-    info = PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, task="printing.py:Printing")
+    info = PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec("printing.py:Printing"))
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
     save_policy(path, info, {f"policy/{k}": v.numpy() for k, v in build_network(info).state_dict().items()})
     return path
@@ -92,10 +93,10 @@ def test_no_arguments_show_the_help(rlctl):
         (["eval", "--episodes", "0"], 2, "Invalid value for '--episodes': Input should be greater than or equal to 1"),
         (["train", "reech"], 2, "error: no task 'reech'. Did you mean 'reach'? Installed: "),
         (["train"], 2, "error: give a task to train, or --resume RUN to go on with a run; one of the two"),
-        (["train", "reach", "--algo", "pppo"], 2, "error: recipe: algo: should be 'ppo', 'a2c', "),
-        (["train", "reach", "--set", "n_env=3"], 2, "error: recipe: no key 'n_env'. Did you mean 'n_envs'?"),
-        (["train", "reach", "--set", "algo_kwargs.learning_rate=3"], 2, "error: recipe: algo_kwargs.learning_rate: 3 "),
-        (["train", "reach", "-n", "0"], 2, "error: recipe: total_timesteps: should be greater than or equal to 1, "),
+        (["train", "reach", "--algo", "pppo"], 2, "error: command line: algo: expected ppo or a2c or "),
+        (["train", "reach", "--set", "n_env=3"], 2, "error: command line: no key 'n_env'. Did you mean 'n_envs'?"),
+        (["train", "reach", "--set", "algo_kwargs.learning_rate=3"], 2, "error: command line: algo_kwargs.learning_rate: "),
+        (["train", "reach", "-n", "0"], 2, "error: command line: total_timesteps: expected a whole number in [1, 1e12], "),
         (["eval", "--set", "seed=1"], 2, "error: --set seed: only task.* can be set here."),
         (["export"], 2, "error: say what to export to: rlctl export --onnx"),
         (["train", "broken.py:Env"], 3, "error: task 'broken.py:Env': import failed: RuntimeError: no robot (broken."),

@@ -96,7 +96,8 @@ def run(tmp_path_factory):
 def test_a_policy_that_names_a_function_runs_nothing(run, tmp_path):
     info, _ = read_policy(run.best_policy)
     mark = tmp_path / "ran"
-    evil = {**json.loads(info.model_dump_json()), "task": "os:system", "task_parameters": {"command": f"touch {mark}"}}
+    spec = {"task": "os:system", "parameters": {"command": f"touch {mark}"}, "named_by": ""}
+    evil = {**json.loads(info.model_dump_json()), "spec": spec}
     path = tmp_path / "evil.safetensors"
     text, tensors = json.dumps(evil), load_file(run.best_policy)
     path.write_bytes(save(tensors, metadata={"rlctl": text, "sha256": compute_digest(text, tensors)}))
@@ -109,10 +110,11 @@ def test_a_policy_that_names_a_function_runs_nothing(run, tmp_path):
 
 def test_an_episode_that_names_a_function_runs_nothing(tmp_path):
     mark, path = tmp_path / "ran", tmp_path / "000000.npz"
-    info = EpisodeInfo(task="os:system", task_parameters={"command": f"touch {mark}"}, seed=1, total_reward=0.0)
+    spec = EnvSpec("os:system", {"command": f"touch {mark}"})
+    info = EpisodeInfo(spec=spec, seed=1, total_reward=0.0)
     save_episode(path, RecordedEpisode(info, np.zeros((1, 1)), np.zeros((2, 1)), np.zeros(1), np.zeros((1, 0))))
     with pytest.raises(ArtifactError, match=r"^a recorded episode names 'os:system' as its task"):
-        load_episode(path).info.env_spec().make()
+        load_episode(path).info.spec.make()
     assert not mark.exists()
 
 

@@ -30,7 +30,7 @@ class EvalRequest:
     checkpoint: str = "best"
     episodes: int = 100
     seed: int = 0
-    task_parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     stage: str | None = None
     """Stage of the curriculum, from 1, or `all`; None: the last."""
     deterministic: bool = True
@@ -110,9 +110,11 @@ def run_evaluations(request: EvalRequest, gates: Gates) -> list[Evaluation]:
 
 def _specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
     if request.stage is None:
-        return [info.env_spec(request.task, request.task_parameters)]
-    if request.task is not None and request.task != info.task:
-        raise UsageError(f"--stage: stages are those of {info.task}, which the policy was trained on; leave out --task")
+        return [info.derive_spec(request.task, request.parameters)]
+    if request.task is not None and request.task != info.spec.task:
+        raise UsageError(
+            f"--stage: stages are those of {info.spec.task}, which the policy was trained on; leave out --task"
+        )
     if not info.stages:
         raise UsageError(f"--stage {request.stage}: this policy was trained without stages; leave out --stage")
     if request.stage == "all":
@@ -124,7 +126,7 @@ def _specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
             f"--stage {request.stage}: this policy was trained in {len(info.stages)} stages; "
             f"give a number from 1 to {len(info.stages)}, or all"
         )
-    return [info.stage_spec(number, request.task_parameters) for number in numbers]
+    return [info.derive_stage(number, request.parameters) for number in numbers]
 
 
 def _evaluate(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:

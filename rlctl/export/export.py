@@ -40,7 +40,7 @@ def _export(policy_file: Path, target: Path) -> ExportReport:
 
     info, tensors = read_policy(policy_file)
     # The environments are built while torch is imported.
-    with Workers(info.env_spec(), N_ENVS) as workers:
+    with Workers(info.spec, N_ENVS) as workers:
         from rlctl.export.actor import build
         from rlctl.run.torch_policy import TorchPolicy, pin_threads
 
@@ -81,12 +81,12 @@ def _verified(
     exported = OnnxPolicy.load(part)
     seen = verify(policy, exported, workers)
     if not seen.passed:
-        raise AnswerIsNo(_why_not(policy_file, target, policy.info.task, seen))
+        raise AnswerIsNo(_why_not(policy_file, target, policy.info.spec.task, seen))
     info = policy.info
     return ExportReport(
         path=target,
         policy=policy_file,
-        task=info.task,
+        task=info.spec.task,
         algo=info.algo,
         training_steps=info.training_steps,
         size=part.stat().st_size,

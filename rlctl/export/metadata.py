@@ -16,13 +16,13 @@ def metadata(info: PolicyInfo) -> dict[str, str]:
     """
     env = info.env
     plain = {
-        "task": info.task,
+        "task": info.spec.task,
         "algorithm": info.algo,
         "training_steps": str(info.training_steps),
         "observation_names": ",".join(env.observation_sizes),
         "observation_sizes": ",".join(str(size) for size in env.observation_sizes.values()),
         "observation_units": ",".join(env.observation_units.get(name, "") for name in env.observation_sizes),
-        "frame_stack": str(info.frame_stack),
+        "frame_stack": str(info.spec.frame_stack),
         "action_meaning": env.action_meaning,
         **_bounds(info),
         "control_dt": "" if env.control_dt is None else f"{env.control_dt!r} s",
@@ -46,6 +46,6 @@ def _bounds(info: PolicyInfo) -> dict[str, str]:
 def describe(info: PolicyInfo) -> str:
     """Return a sentence on the graph, for those who open the file in a viewer."""
     return (
-        f"{info.algo} policy for {info.task} after {info.training_steps} steps: raw observations in, deterministic "
-        "action out; normalisation and the action's bounds are inside"
+        f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps: raw observations in, "
+        "deterministic action out; normalisation and the action's bounds are inside"
     )

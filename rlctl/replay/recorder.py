@@ -117,8 +117,8 @@ def check_actions(episode: RecordedEpisode, shape: tuple[int, ...], path: Path |
     """Raise `ArtifactError` if the actions of an episode do not have the shape that its task has now."""
     given = episode.actions.shape[1:]
     if given != shape:
-        name = path or f"episode of {episode.info.task}"
-        raise ArtifactError(f"{name}: its actions have shape {given}, those of {episode.info.task} have {shape}")
+        name = path or f"episode of {episode.info.spec.task}"
+        raise ArtifactError(f"{name}: its actions have shape {given}, those of {episode.info.spec.task} have {shape}")
 
 
 def current_versions(task: str) -> dict[str, str]:
@@ -214,8 +214,8 @@ class EpisodeRecorder:
         steps, terms = self.step, len(self._terms)
         if not self.over:
             self._add_log("the recorded actions end here", "WARN")
-        info = EpisodeInfo.of(
-            spec,
+        info = EpisodeInfo(
+            spec=spec,
             seed=self.seed,
             policy=policy,
             success=self._successes[-1] if steps else None,

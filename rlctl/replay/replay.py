@@ -31,7 +31,7 @@ class ReplayRequest:
     seed: int = 0
     checkpoint: str = "best"
     task: str | None = None
-    task_parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     verify: Path | None = None
     gui: bool = False
     output: Path | None = None
@@ -67,7 +67,7 @@ def _check_request(request: ReplayRequest) -> None:
     if request.gui and target is not None:
         raise UsageError("--gui shows a window and writes nothing: leave out --output")
     recorded = request.verify is not None or _is_episode(source)
-    if recorded and (request.task is not None or request.task_parameters or request.episodes != 1):
+    if recorded and (request.task is not None or request.parameters or request.episodes != 1):
         raise UsageError("a recorded episode is replayed as it was: leave out --task, --set and --episodes")
     if target is None:
         return
@@ -82,7 +82,7 @@ def _check_request(request: ReplayRequest) -> None:
 def _verify(path: Path) -> ReplayResult:
     episode = load_episode(path)
     rollout, verification = verify_episode(episode, path)
-    return ReplayResult(episode.info.task, episode.info.policy, [_summarize(rollout)], verification)
+    return ReplayResult(episode.info.spec.task, episode.info.policy, [_summarize(rollout)], verification)
 
 
 def _record_episode(path: Path, where: Path | None) -> ReplayResult:
@@ -90,17 +90,17 @@ def _record_episode(path: Path, where: Path | None) -> ReplayResult:
     recording = path.with_suffix(".rrd")
     if where is not None:
         recording = where if where.suffix == ".rrd" else where / recording.name
-    rollout = record_episode(episode, recording, title=f"{episode.info.task} / episode {path.stem}")
-    return ReplayResult(episode.info.task, episode.info.policy, [_summarize(rollout, recording, path)])
+    rollout = record_episode(episode, recording, title=f"{episode.info.spec.task} / episode {path.stem}")
+    return ReplayResult(episode.info.spec.task, episode.info.policy, [_summarize(rollout, recording, path)])
 
 
 def _show_episode(path: Path) -> ReplayResult:
     episode = load_episode(path)
-    info, spec = episode.info, episode.info.env_spec()
+    info, spec = episode.info, episode.info.spec
     with open_window(spec) as env:
         actions = recorded_actions(episode, env, path)
         rollouts = show_episodes(env, spec, [info.seed], lambda: actions)
-    return ReplayResult(info.task, info.policy, [_summarize(rollout) for rollout in rollouts])
+    return ReplayResult(spec.task, info.policy, [_summarize(rollout) for rollout in rollouts])
 
 
 class _Actor:
@@ -116,7 +116,7 @@ class _Actor:
             pin_threads()
         self._policy: Policy = load_policy(self._file)
         info = self._policy.info
-        self._spec: EnvSpec = info.env_spec(request.task, request.task_parameters)
+        self._spec: EnvSpec = info.derive_spec(request.task, request.parameters)
         self._name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
 
     def show(self) -> ReplayResult:

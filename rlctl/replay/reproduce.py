@@ -37,7 +37,7 @@ def record_episode(
     """
     from rlctl.replay.rrd import write_rrd
 
-    info, spec = episode.info, episode.info.env_spec()
+    info, spec = episode.info, episode.info.spec
     if info.failure:
         replay_failed(episode)
     with drawable_env(spec, warn) as env:
@@ -56,7 +56,7 @@ def replay_failed(episode: RecordedEpisode) -> None:
 
     Raises the `TaskError` that it failed with if it fails again.
     """
-    with Workers(episode.info.env_spec(), 1) as workers:
+    with Workers(episode.info.spec, 1) as workers:
         check_actions(episode, workers.arrays.action.shape[1:])
         workers.arrays.next_seed[:] = -1
         workers.reset({0: episode.info.seed})
@@ -71,7 +71,7 @@ def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verif
 
     Raises `UsageError` for an episode of which only the actions are known, because it failed.
     """
-    info, spec = episode.info, episode.info.env_spec()
+    info, spec = episode.info, episode.info.spec
     if info.failure:
         raise UsageError(
             f"{path}: the episode failed ({info.failure}), so there is nothing to compare; "
@@ -82,6 +82,6 @@ def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verif
         rollout = play_episode(env, spec, info.seed, recorded_actions(episode, env, path), policy=info.policy)
     finally:
         env.close()
-    now = current_versions(info.task)
+    now = current_versions(spec.task)
     other = {name: (version, now.get(name)) for name, version in info.versions.items() if now.get(name) != version}
     return rollout, Verification(path, find_difference(episode, rollout), other)

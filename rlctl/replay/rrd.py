@@ -38,7 +38,9 @@ def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: 
     """
     info = rollout.episode.info
     stream = rr.RecordingStream(
-        f"rlctl_{registry.make_slug(info.task)}", recording_id=_recording_id(rollout.episode), send_properties=False
+        f"rlctl_{registry.make_slug(info.spec.task)}",
+        recording_id=_recording_id(rollout.episode),
+        send_properties=False,
     )
     stream.set_log_time_enabled(False)
 
@@ -59,7 +61,7 @@ def _recording_id(episode: RecordedEpisode) -> str:
     content = hashlib.sha256(episode.info.model_dump_json().encode())
     content.update(episode.actions.tobytes())
     content.update(episode.rewards.tobytes())
-    return f"{registry.make_slug(episode.info.task)}-{episode.info.seed}-{content.hexdigest()[:12]}"
+    return f"{registry.make_slug(episode.info.spec.task)}-{episode.info.seed}-{content.hexdigest()[:12]}"
 
 
 def _send(stream: rr.RecordingStream, rollout: Rollout, title: str, warn: Warn, several: bool) -> rrb.Blueprint:
@@ -79,8 +81,8 @@ def _send(stream: rr.RecordingStream, rollout: Rollout, title: str, warn: Warn, 
 def _properties(rollout: Rollout) -> rr.AnyValues:
     info = rollout.episode.info
     values: dict[str, Any] = {
-        "task": info.task,
-        "task_parameters": json.dumps(info.task_parameters),
+        "task": info.spec.task,
+        "parameters": json.dumps(dict(info.spec.parameters)),
         "seed": info.seed,
         "length": rollout.length,
         "total_reward": info.total_reward,

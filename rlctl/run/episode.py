@@ -1,4 +1,4 @@
-"""Recorded episodes: `.npz` files with everything needed to live one again, bit for bit."""
+"""Recorded episodes: `.npz` files with everything needed to reproduce one, bit for bit."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import pydantic
 from numpy.typing import NDArray
 from pydantic import Field
 
-from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.named_task import EPISODE
 from rlctl.run import files, untrusted
+from rlctl.run.named_spec import EpisodeSpec
 
 FORMAT = 1
 Observations = NDArray[Any] | dict[str, NDArray[Any]]
@@ -26,16 +25,8 @@ class EpisodeInfo(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid")
 
     format: int = FORMAT
-    task: str
-    task_parameters: dict[str, Any] = {}
-    reward_weights: dict[str, float] = {}
-    randomize: bool = False
-    events: dict[str, dict[str, Any]] = {}
-    frame_stack: int = Field(1, ge=1)
-    stage: int = 0
-    """Stage of the curriculum, from 1; 0 where there is none."""
-    level: float = Field(1.0, ge=0, le=1)
-    """How far the ranges of events that widen had done so, in [0, 1]."""
+    spec: EpisodeSpec
+    """What the environment was made from."""
     seed: int = Field(ge=0)
     policy: str = ""
     """What chose the actions, for people: a file name and a training step."""
@@ -43,37 +34,8 @@ class EpisodeInfo(pydantic.BaseModel):
     total_reward: float
     term_names: list[str] = []
     failure: str = ""
-    """What ended an episode that its environment did not survive: only its actions are known."""
+    """What ended an episode that its environment did not finish: only its actions are known."""
     versions: dict[str, str] = {}
-
-    @classmethod
-    def of(cls, spec: EnvSpec, **rest: Any) -> EpisodeInfo:
-        """Describe an episode that is lived in `spec`; `rest` are the other fields."""
-        return cls(
-            task=spec.task,
-            task_parameters=dict(spec.parameters),
-            reward_weights=dict(spec.reward_weights),
-            randomize=spec.randomize,
-            events={name: dict(changes) for name, changes in spec.events.items()},
-            frame_stack=spec.frame_stack,
-            stage=spec.stage,
-            level=spec.level,
-            **rest,
-        )
-
-    def env_spec(self) -> EnvSpec:
-        """Return what the episode was lived in."""
-        return EnvSpec(
-            self.task,
-            self.task_parameters,
-            self.reward_weights,
-            self.randomize,
-            self.events,
-            self.frame_stack,
-            self.stage,
-            self.level,
-            named_by=EPISODE,
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,23 +98,23 @@ def _mismatch(episode: RecordedEpisode) -> str | None:
     """Say which array is not what an episode of as many steps as it has rewards would have; None if all are."""
     observations, rewards = episode.observations, episode.rewards
     if rewards.ndim != 1 or rewards.dtype != np.float64:
-        return f"rewards are {_told(rewards)}, not a row of float64"
+        return f"rewards are {_describe_array(rewards)}, not a row of float64"
     steps, names = len(rewards), len(episode.info.term_names)
     if episode.terms.shape != (steps, names) or episode.terms.dtype != np.float64:
-        return f"reward terms are {_told(episode.terms)}, not float64 of shape {(steps, names)}"
+        return f"reward terms are {_describe_array(episode.terms)}, not float64 of shape {(steps, names)}"
     parts = observations if isinstance(observations, dict) else {"": observations}
     # Of an episode that failed there are its actions alone, however many.
     acted, observed = (None, 0) if episode.info.failure and not steps else (steps, steps + 1)
     for name, values, count in (("actions", episode.actions, acted), *((k, v, observed) for k, v in parts.items())):
         label = name if name == "actions" else f"observations {name}".strip()
         if values.ndim == 0 or (count is not None and len(values) != count):
-            return f"{label} are {_told(values)}, not {count} of them"
+            return f"{label} are {_describe_array(values)}, not {count} of them"
         if values.dtype.kind not in "biuf":
-            return f"{label} are {_told(values)}, not numbers"
+            return f"{label} are {_describe_array(values)}, not numbers"
     if not np.isfinite(episode.actions).all():
         return "actions are not all finite"
     return None
 
 
-def _told(values: NDArray[Any]) -> str:
+def _describe_array(values: NDArray[Any]) -> str:
     return f"{values.dtype} of shape {values.shape}"

@@ -28,7 +28,7 @@ from rlctl.errors import ArtifactError, short_repr
 from rlctl.named_task import POLICY
 from rlctl.run import files, untrusted
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.stages import StageContent
+from rlctl.run.named_spec import PolicySpec
 
 FORMAT = 1
 ROWS = 64
@@ -64,50 +64,27 @@ class PolicyInfo(pydantic.BaseModel):
     normalized_keys: list[str] = []
     """Which entries of a dict observation are normalised."""
     env: EnvInfo
-    task: str
-    task_parameters: dict[str, Any] = {}
-    reward_weights: dict[str, float] = {}
-    randomize: bool = False
-    events: dict[str, dict[str, Any]] = {}
-    frame_stack: int = Field(1, ge=1)
-    stages: list[StageContent] = []
-    """Stages of the curriculum; the fields above are those of the last."""
+    """What the environment is."""
+    spec: PolicySpec
+    """What the environment is made from; of a curriculum in its last stage."""
+    stages: list[PolicySpec] = []
+    """Stages of the curriculum."""
     training_steps: int = 0
     evaluation: Score | None = None
     """Of the best policy of a run: why it is the best."""
     versions: dict[str, str] = {}
 
-    def env_spec(self, task: str | None = None, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
-        """Return what this policy was trained for, or another task, with parameters put over its own.
+    def derive_spec(self, task: str | None = None, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
+        """Return what this policy was trained for, or another task, with parameters put over its own."""
+        if task is not None and task != self.spec.task:
+            return EnvSpec(task, parameters or {}, frame_stack=self.spec.frame_stack)
+        merged = {**self.spec.parameters, **(parameters or {})}
+        return dataclasses.replace(self.spec, parameters=merged, named_by=POLICY if task is None else "")
 
-        A policy trained in stages is for the last of them; `stage_spec` returns the others.
-        """
-        if task is not None and task != self.task:
-            return EnvSpec(task, parameters or {}, frame_stack=self.frame_stack)
-        merged = {**self.task_parameters, **(parameters or {})}
-        return EnvSpec(
-            self.task,
-            merged,
-            self.reward_weights,
-            self.randomize,
-            self.events,
-            self.frame_stack,
-            stage=len(self.stages),
-            level=self.stages[-1].level if self.stages else 1.0,
-            named_by=POLICY if task is None else "",
-        )
-
-    def stage_spec(self, number: int, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
+    def derive_stage(self, number: int, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
         """Return a stage of this policy's curriculum, from 1 to `len(stages)`, with parameters put over its own."""
-        content = self.stages[number - 1]
-        return dataclasses.replace(
-            self.env_spec(),
-            parameters={**content.task_parameters, **(parameters or {})},
-            reward_weights=content.reward_weights,
-            events=content.events,
-            stage=number,
-            level=content.level,
-        )
+        stage = self.stages[number - 1]
+        return dataclasses.replace(stage, parameters={**stage.parameters, **(parameters or {})})
 
     def check_fits(self, env: EnvInfo, file: Path) -> None:
         """Raise `ArtifactError` if the policy in `file` was made for other spaces than `env` has."""

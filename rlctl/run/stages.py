@@ -8,7 +8,6 @@ from typing import Any
 import pydantic
 from pydantic import Field
 
-from rlctl.env_spec import EnvSpec
 from rlctl.run.quantities import Number, Whole
 
 _STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
@@ -66,27 +65,6 @@ class Stage(pydantic.BaseModel):
             changes += [f"{event}.{name} {value}" for name, value in parameters.items()] or [event]
         changes += [f"level {self.level:g}"] if self.level != 1 else []
         return ", ".join(changes) or "the recipe's own task"
-
-
-class StageContent(pydantic.BaseModel):
-    """All that the environments of a stage are made from, beside what all stages share; kept in policy files."""
-
-    model_config = pydantic.ConfigDict(extra="forbid")
-
-    task_parameters: dict[str, Any] = {}
-    reward_weights: dict[str, float] = {}
-    events: dict[str, dict[str, Any]] = {}
-    level: float = Field(1.0, ge=0, le=1)
-
-    @classmethod
-    def of(cls, spec: EnvSpec) -> StageContent:
-        """Return the part of an environment that stages change."""
-        return cls(
-            task_parameters=dict(spec.parameters),
-            reward_weights=dict(spec.reward_weights),
-            events={name: dict(changes) for name, changes in spec.events.items()},
-            level=spec.level,
-        )
 
 
 def check_promotions(stages: Sequence[Stage]) -> None:

@@ -15,7 +15,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
 from rlctl.rollout.workers import EpisodeResult, Workers
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.stages import Stage, StageContent, format_title
+from rlctl.run.stages import Stage, format_title
 from rlctl.train.display import percent
 from rlctl.train.hindsight import HindsightBuffer
 from rlctl.train.progress import Progress
@@ -58,9 +58,9 @@ class Curriculum:
         """Return the columns of the stage for tables: nothing without stages."""
         return {"stage": self.number} if self.stages else {}
 
-    def contents(self) -> list[StageContent]:
-        """Return what a policy file keeps of the stages."""
-        return [StageContent.of(spec) for spec in self._specs] if self.stages else []
+    def specs(self) -> list[EnvSpec]:
+        """Return what the environments of each stage are made from; nothing without stages."""
+        return list(self._specs) if self.stages else []
 
     def count(self, ended: Sequence[EpisodeResult]) -> None:
         """Take note of training episodes of the present stage, in the order in which they ended."""

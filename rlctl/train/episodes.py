@@ -47,8 +47,8 @@ class EpisodeKeeper:
         """Write `error.actions`, of an episode in which an environment failed; return the file."""
         policy = "training" if evaluated_at is None else f"{_POLICY}{evaluated_at}"
         failure = str(error).partition("\n")[0]
-        info = EpisodeInfo.of(
-            spec, seed=error.seed, policy=policy, total_reward=0.0, versions=collect_versions(), failure=failure
+        info = EpisodeInfo(
+            spec=spec, seed=error.seed, policy=policy, total_reward=0.0, versions=collect_versions(), failure=failure
         )
         nothing = np.zeros(0)
         # Of a reset that failed there is no action to take the shape from.
@@ -64,8 +64,8 @@ class EpisodeKeeper:
         trajectory = episode.trajectory
         assert trajectory is not None  # evaluations record
         spec = self.spec
-        info = EpisodeInfo.of(
-            spec,
+        info = EpisodeInfo(
+            spec=spec,
             seed=episode.seed,
             policy=f"{_POLICY}{steps}",
             success=episode.result.success,

@@ -279,7 +279,7 @@ class TrainingLoop(BaseCallback):
 
     def _pack(self) -> Packed:
         goal = self.curriculum
-        return pack(self.model, self.recipe.algo, goal.goal_spec, goal.goal, goal.contents())
+        return pack(self.model, self.recipe.algo, goal.goal_spec, goal.goal, goal.specs())
 
     def _is_better(self, success: float | None, mean: float) -> bool:
         best = self.progress

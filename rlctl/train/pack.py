@@ -13,12 +13,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 from rlctl.env_spec import EnvSpec
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo, collect_versions
-from rlctl.run.stages import StageContent
 from rlctl.run.torch_policy import describe_network, policy_name
 
 
 def pack(
-    model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo, stages: Sequence[StageContent] = ()
+    model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo, stages: Sequence[EnvSpec] = ()
 ) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
     """Return description and tensors of a model's policy, with the normalisation it has now.
 
@@ -37,12 +36,7 @@ def pack(
         clip_observation=normalizer.clip_obs if normalizer is not None and statistics else None,
         normalized_keys=list(statistics),
         env=env,
-        task=spec.task,
-        task_parameters=dict(spec.parameters),
-        reward_weights=dict(spec.reward_weights),
-        randomize=spec.randomize,
-        events={name: dict(changes) for name, changes in spec.events.items()},
-        frame_stack=spec.frame_stack,
+        spec=spec,
         stages=list(stages),
         training_steps=model.num_timesteps,
         versions=collect_versions(),

@@ -53,10 +53,10 @@ def test_training_records_beside_its_episodes(run):
 
 
 def test_task_and_parameters_can_be_others(run, tmp_path):
-    request = ReplayRequest(str(run.run.path), task_parameters={"tolerance": 0.9}, output=tmp_path)
+    request = ReplayRequest(str(run.run.path), parameters={"tolerance": 0.9}, output=tmp_path)
     (episode,) = run_replay(request).episodes
     assert episode.success is True
-    assert load_episode(episode.episode).info.task_parameters == {"tolerance": 0.9}
+    assert load_episode(episode.episode).info.spec.parameters == {"tolerance": 0.9}
     # A single recording needs no list (1: hidden).
     assert layout(episode.recording, "PanelBlueprint:state", "/blueprint_panel") == [1]
 
@@ -175,7 +175,8 @@ def test_policy_for_another_task(run, tmp_path):
 
 def test_environment_that_fails(replay, tmp_path):
     rollout, _ = play("Pixels")
-    info = rollout.episode.info.model_copy(update={"task_parameters": {"fault": "step"}})
+    spec = dataclasses.replace(rollout.episode.info.spec, parameters={"fault": "step"})
+    info = rollout.episode.info.model_copy(update={"spec": spec})
     save_episode(tmp_path / "x.npz", dataclasses.replace(rollout.episode, info=info))
     done = replay("x.npz")
     assert done.returncode == 3

@@ -7,15 +7,12 @@ import pytest
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
+from rlctl.named_task import EPISODE
 from rlctl.run import files
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 
 INFO = EpisodeInfo(
-    task="reach",
-    task_parameters={"tolerance": 0.02},
-    events={"mass": {"factor": [0.9, 1.1]}},
-    randomize=True,
-    frame_stack=2,
+    spec=EnvSpec("reach", {"tolerance": 0.02}, randomize=True, events={"mass": {"factor": [0.9, 1.1]}}, frame_stack=2),
     seed=2**31 - 1,
     success=False,
     total_reward=-1.0 / 3.0,
@@ -58,10 +55,11 @@ def test_round_trip(path, observations):
         np.testing.assert_array_equal(read.observations, observations)
 
 
-def test_it_knows_what_it_was_lived_in():
-    assert INFO.env_spec() == EnvSpec(
-        "reach", {"tolerance": 0.02}, randomize=True, events={"mass": {"factor": [0.9, 1.1]}}, frame_stack=2
-    )
+def test_the_file_does_not_say_who_names_its_task(path):
+    save_episode(path, episode(np.zeros((4, 2))))
+    assert "named_by" not in str(files.read_npz(path)["info"])
+    rewrite(path, json.dumps({**json.loads(INFO.model_dump_json()), "spec": {"task": "reach", "named_by": ""}}))
+    assert load_episode(path).info.spec.named_by == EPISODE
 
 
 def rewrite(path, info):
@@ -76,7 +74,9 @@ def test_a_newer_format(path):
         load_episode(path)
 
 
-@pytest.mark.parametrize("info", ["{", "[]", "{}", json.dumps({"task": "reach", "seed": "x", "total_reward": 0})])
+@pytest.mark.parametrize(
+    "info", ["{", "[]", "{}", json.dumps({"spec": {"task": "reach"}, "seed": "x", "total_reward": 0})]
+)
 def test_a_damaged_description(path, info):
     rewrite(path, info)
     with pytest.raises(ArtifactError, match=r"000000.npz: its description is damaged: "):

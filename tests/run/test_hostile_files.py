@@ -9,12 +9,13 @@ import zipfile
 import numpy as np
 import pytest
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files
 from rlctl.run.directory import RunDirectory, find_policy
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 
-INFO = EpisodeInfo(task="reach", seed=1, total_reward=0.0, term_names=["distance"])
+INFO = EpisodeInfo(spec=EnvSpec("reach"), seed=1, total_reward=0.0, term_names=["distance"])
 
 
 class Bait:
@@ -158,11 +159,13 @@ def test_an_episode_whose_parts_do_not_fit(changes, told, episode):
 @pytest.mark.parametrize("value", [None, -1, "x", [], {}, 10**30, 1e308])
 def test_any_value_at_any_place_of_an_episode(value, episode):
     arrays, told = files.read_npz(episode), []
-    for key in json.loads(str(arrays["info"])):
-        info = {**json.loads(str(arrays["info"])), key: value}
+    whole = json.loads(str(arrays["info"]))
+    changed = [{**whole, key: value} for key in whole]
+    changed += [{**whole, "spec": {**whole["spec"], key: value}} for key in whole["spec"]]
+    for info in changed:
         files.write_npz(episode, {**arrays, "info": np.array(json.dumps(info))})
         try:
-            load_episode(episode).info.env_spec()
+            load_episode(episode)
         except ArtifactError as error:
             told.append(str(error))
     assert told  # most values are refused, some are possible

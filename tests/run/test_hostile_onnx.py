@@ -7,6 +7,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.run import onnx_file
 from rlctl.run.env_info import EnvInfo
@@ -14,7 +15,8 @@ from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import PolicyInfo
 
 BOX = {"type": "Box", "low": "-1.0", "high": "1.0", "shape": [4], "dtype": "float32"}
-INFO = PolicyInfo(algo="ppo", policy="MlpPolicy", env=EnvInfo(observation_space=BOX, action_space=BOX), task="reach")
+ENV = EnvInfo(observation_space=BOX, action_space=BOX)
+INFO = PolicyInfo(algo="ppo", policy="MlpPolicy", env=ENV, spec=EnvSpec("reach"))
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import pytest
 from gymnasium import spaces
 from safetensors.numpy import load_file, save
 
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.policy import PolicyInfo, compute_digest, load_policy, save_policy
@@ -21,7 +22,7 @@ BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 def good(tmp_path_factory):
     env = EnvInfo(observation_space=space_to_json(BOX), action_space=space_to_json(spaces.Box(-1.0, 1.0, (2,))))
     info = PolicyInfo(
-        algo="ppo", policy="MlpPolicy", env=env, task="my_env.py:MyEnv", policy_kwargs={"net_arch": [8]},
+        algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec("my_env.py:MyEnv"), policy_kwargs={"net_arch": [8]},
         clip_observation=10.0, normalized_keys=[""],
     )  # fmt: skip
     tensors = {f"policy/{key}": value.numpy() for key, value in build_network(info).state_dict().items()}
@@ -168,12 +169,13 @@ def test_tensors_that_cannot_be(tensors, told, changed):
 def test_any_value_at_any_place(value, changed, described):
     """Refused in a line, or of no consequence; whatever it is, no other exception."""
     good, told = 0, []
-    for key in [*described, *(f"env.{name}" for name in described["env"])]:
-        section, _, name = key.rpartition(".")
-        mutated = {**described, key: value} if not section else {**described, "env": {**described["env"], name: value}}
-        path = changed(mutated)
+    mutated = [{**described, key: value} for key in described]
+    for part in ("env", "spec"):
+        mutated += [{**described, part: {**described[part], key: value}} for key in described[part]]
+    for description in mutated:
+        path = changed(description)
         try:
-            load_policy(path).info.env_spec()
+            load_policy(path)
             good += 1
         except RlctlError as error:
             told.append((error.exit_code, len(str(error).splitlines())))

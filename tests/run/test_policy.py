@@ -9,6 +9,7 @@ from gymnasium import spaces
 from safetensors.numpy import load_file, save
 
 import rlctl
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.policy import ROWS, BatchActor, PolicyInfo, compute_digest, read_policy, save_policy
@@ -32,7 +33,7 @@ def _one_thread():
 
 def describe(algo="ppo", policy="MlpPolicy", observation=BOX, action=ACTIONS, **options):
     env = EnvInfo(observation_space=space_to_json(observation), action_space=space_to_json(action))
-    return PolicyInfo(algo=algo, policy=policy, env=env, task="my_env.py:MyEnv", training_steps=7, **options)
+    return PolicyInfo(algo=algo, policy=policy, env=env, spec=EnvSpec("my_env.py:MyEnv"), training_steps=7, **options)
 
 
 def tensors_of(info):

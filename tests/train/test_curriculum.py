@@ -112,7 +112,7 @@ def test_evaluation_is_always_in_the_last_stage(staged):
     assert column(staged.run.evals_file, "stage") == [2, 2]  # what the policy is trained in from this step on
     for file in staged.run.episodes.glob("*.npz"):
         info = load_episode(file).info
-        assert (info.stage, info.task_parameters, info.env_spec().stage) == (2, HARD, 2)
+        assert (info.spec.stage, info.spec.parameters) == (2, HARD)
 
 
 def test_checkpoints_know_the_stage_and_addresses_go_on(staged):
@@ -134,8 +134,8 @@ def test_tensorboard_has_the_stage(staged):
 
 def test_policy_file_has_all_stages(staged):
     info = load_policy(staged.run.best_policy).info
-    assert info.env_spec().parameters == HARD
-    assert [info.stage_spec(number).parameters for number in (1, 2)] == [EASY, HARD]
+    assert info.derive_spec().parameters == HARD
+    assert [info.derive_stage(number).parameters for number in (1, 2)] == [EASY, HARD]
 
 
 @pytest.mark.parametrize(("stage", "rates"), [(None, [0.0]), ("1", [1.0]), ("2", [0.0]), ("all", [1.0, 0.0])])
@@ -295,10 +295,10 @@ def test_reach_in_stages_of_its_class(write_module, tmp_path):
     assert result.run.recipe().stages[0].task == {"tolerance": 0.2}
     for file in result.run.episodes.glob("*.npz"):
         episode = load_episode(file)
-        assert (episode.info.stage, episode.info.task_parameters) == (2, {"tolerance": 0.05})
+        assert (episode.info.spec.stage, episode.info.spec.parameters) == (2, {"tolerance": 0.05})
         assert verify_episode(episode, file)[1].difference is None
     info = load_policy(result.run.last_policy).info
-    assert [info.stage_spec(number).level for number in (1, 2)] == [0.1, info.env_spec().level] == [0.1, 1.0]
+    assert [info.derive_stage(number).level for number in (1, 2)] == [0.1, info.spec.level] == [0.1, 1.0]
     near, exact = run_evaluations(EvalRequest(str(result.run.path), episodes=2, stage="all"), Gates())
     # The same policy and goals, and the mass makes no great difference; `reached` is measured by the tolerance.
     assert near.terms["reached"] > exact.terms["reached"]

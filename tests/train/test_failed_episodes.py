@@ -77,7 +77,7 @@ def test_it_is_of_the_stage_it_was_in(fail):
     rule = {"promote": {"success": 0.5, "window": 2}}
     settings = {**TINY, "stages": [{"task": {"last": False}, **rule}, {"task": {"last": True}}]}
     error, run = fail("FaultyStages", settings, fault="raise")
-    assert load_episode(run.episode_file(0)).info.task_parameters["last"] is True
+    assert load_episode(run.episode_file(0)).info.spec.parameters["last"] is True
     assert "the gripper fell off" in lived_again(run.episode_file(0))
     assert error.exit_code == 3
 
