@@ -95,8 +95,16 @@ def test_no_arguments_show_the_help(rlctl):
         (["train"], 2, "error: give a task to train, or --resume RUN to go on with a run; one of the two"),
         (["train", "reach", "--algo", "pppo"], 2, "error: command line: algo: expected ppo or a2c or "),
         (["train", "reach", "--set", "n_env=3"], 2, "error: command line: no key 'n_env'. Did you mean 'n_envs'?"),
-        (["train", "reach", "--set", "algo_kwargs.learning_rate=3"], 2, "error: command line: algo_kwargs.learning_rate: "),
-        (["train", "reach", "-n", "0"], 2, "error: command line: total_timesteps: expected a whole number in [1, 1e12], "),
+        (
+            ["train", "reach", "--set", "algo_kwargs.learning_rate=3"],
+            2,
+            "error: command line: algo_kwargs.learning_rate: ",
+        ),
+        (
+            ["train", "reach", "-n", "0"],
+            2,
+            "error: command line: total_timesteps: expected a whole number in [1, 1e12], ",
+        ),
         (["eval", "--set", "seed=1"], 2, "error: --set seed: only task.* can be set here."),
         (["export"], 2, "error: say what to export to: rlctl export --onnx"),
         (["train", "broken.py:Env"], 3, "error: task 'broken.py:Env': import failed: RuntimeError: no robot (broken."),
