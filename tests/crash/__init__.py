@@ -9,7 +9,7 @@ What is promised, for every checkpoint that was announced as saved, after any ki
 (e) no process and no lock is left behind.
 
 Faults are put where SQLite's tests put them: at the Nth operation on the disk, for every N until a run passes without
-one. `faulty_os.py` is the disk, `fork_server.py` makes a training cheap enough to be killed a thousand times,
-`trials.py` asks it for trainings, `contract.py` judges what is left. A part of each kind runs with all other tests;
+one. `faulty_os.py` is the disk, `trials.py` runs trainings in forked processes, cheap enough to be killed a thousand
+times, `contract.py` judges what is left. A part of each kind runs with all other tests;
 `make test-crash` runs everything.
 """

@@ -1,4 +1,4 @@
-"""A server of trials for each process of tests, and the runs that nothing interrupted."""
+"""What runs trials, a core for each process of tests, and the runs that nothing interrupted."""
 
 import collections
 import itertools
@@ -6,11 +6,11 @@ import os
 
 import pytest
 
-from tests.crash.trials import ARGUMENTS, ForkServer
+from tests.crash.trials import ARGUMENTS, Trials
 
 pytest.register_assert_rewrite("tests.crash.contract", "tests.train.comparing")
 
-PARTS = 61
+PARTS = 101
 """A test that repeats itself is in so many parts, of which the first runs with all other tests."""
 
 
@@ -21,22 +21,20 @@ def parts(function):
 
 
 @pytest.fixture(scope="session")
-def server():
+def trials():
     number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     cores = sorted(os.sched_getaffinity(0))
-    server = ForkServer(cores[number % len(cores)])
-    yield server
-    server.close()
+    return Trials(cores[number % len(cores)])
 
 
 @pytest.fixture(scope="session")
-def whole(server, tmp_path_factory):
+def whole(trials, tmp_path_factory):
     """How an algorithm's training ends that nothing interrupts, by name."""
     ended = {}
 
     def get(name):
         if name not in ended:
-            ended[name] = server.run(ARGUMENTS[name], tmp_path_factory.mktemp(name))
+            ended[name] = trials.run(ARGUMENTS[name], tmp_path_factory.mktemp(name))
             assert ended[name].code == 0, ended[name].stderr
         return ended[name]
 

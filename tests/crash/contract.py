@@ -5,11 +5,11 @@ from pathlib import Path
 
 from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import read_policy
-from tests.crash.trials import Ended, ForkServer, only_run, resume
+from tests.crash.trials import Ended, Trials, only_run, resume
 from tests.train.comparing import assert_same_run
 
 
-def assert_nothing_lost(server: ForkServer, arguments, ended: Ended, whole: RunDirectory, announced=0) -> None:
+def assert_nothing_lost(trials: Trials, arguments, ended: Ended, whole: RunDirectory, announced=0) -> None:
     """Resume what a fault has ended, without faults, and compare it to a training that had none.
 
     `announced` is the step of the last checkpoint that was announced before the command that the fault has ended.
@@ -19,10 +19,10 @@ def assert_nothing_lost(server: ForkServer, arguments, ended: Ended, whole: RunD
     run = only_run(ended.folder)
     if run is None:  # ended before there was a run: the next one is a new one
         assert announced == 0
-        again = server.run(arguments, ended.folder)
+        again = trials.run(arguments, ended.folder)
     else:
         assert_best_is_best(run)
-        again = server.run(resume(run), ended.folder)
+        again = trials.run(resume(run), ended.folder)
     assert again.code == 0, again.stderr
     assert_quiet(again)
     if "nothing to do" not in again.stdout + again.stderr:

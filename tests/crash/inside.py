@@ -1,22 +1,25 @@
 """What a trial does in its own process before and while it trains: the plan's faults, and a log of what was done."""
 
 import functools
+import json
 import os
+import subprocess
 import sys
 from pathlib import Path
 
-from tests.crash import meddling, spare_workers
+from rlctl.rollout.process_start import set_default_start
+from tests.crash import meddling
 from tests.crash.faulty_os import FaultyOs, FaultyShutil
 
 
-def run(arguments, folder, plan):
-    """Run the command line as a plan has it; return its exit code. `folder` gets a file `log`."""
-    log = _opened(folder / "log")
+def run(arguments, plan):
+    """Run the command line as a plan has it; return its exit code. The current folder gets a file `log`."""
+    log = _opened(Path("log"))
     if plan.get("cores", 1) == 1:
         # One core, one worker: a trial is a matter of less than a second.
-        os.sched_setaffinity(0, {int(os.environ["CRASH_CORE"])})
-    if not plan.get("real_workers"):
-        spare_workers.take_over(3)
+        os.sched_setaffinity(0, {plan["core"]})
+    if plan.get("real_workers"):
+        set_default_start(subprocess.Popen)
     from rlctl.run import files
     from rlctl.train import saving
 
@@ -56,3 +59,7 @@ def _announce(saver, log):
         return saved
 
     saver.checkpoint = checkpoint
+
+
+if __name__ == "__main__":
+    sys.exit(run(*json.loads(sys.argv[1])))

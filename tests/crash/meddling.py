@@ -7,6 +7,8 @@ import os
 import shutil
 import time
 
+from rlctl.run.directory import RunDirectory
+
 
 def begin(what, after=0, until=None):
     """Do what `what` names when the checkpoint of step `after` is saved, and undo it at the boundary of `until`."""
@@ -19,12 +21,12 @@ def begin(what, after=0, until=None):
 
     @functools.wraps(original)
     def checkpoint(saver, pack, progress, **options):
-        step = saver._checkpoints._model.num_timesteps
+        step = pack()[0].training_steps
         if until is not None and step >= until:
             _broken.clear()
         saved = original(saver, pack, progress, **options)
         if step == after:
-            MEDDLING[what](saver._run)
+            MEDDLING[what](RunDirectory(saver.metrics.path.parent))
         return saved
 
     saving.Saver.checkpoint = checkpoint

@@ -7,25 +7,24 @@ import psutil
 
 import rlctl.rollout.workers
 import rlctl.run.files
-import rlctl.train.evaluation
 import rlctl.train.loop
-import rlctl.train.request
 import rlctl.train.status
 import rlctl.train.vec_env
+from rlctl.rollout import process_start
 
 PHASES = {
-    "workers start": (rlctl.rollout.workers.Workers, "_start", 1),
-    "workers build": (rlctl.rollout.workers.Workers, "_wait_until_built", 1),
+    "workers start": (process_start, "default_start", 1),
+    "workers build": (rlctl.rollout.workers.Workers, "info", 1),
     "run folder": (rlctl.train.status, "write_start", 1),
     "first rollout": (rlctl.train.vec_env.WorkerVecEnv, "step_wait", 2),
     "boundary": (rlctl.train.loop.TrainingLoop, "boundary", 1),
-    "evaluation": (rlctl.train.evaluation._Watched, "act", 3),
-    "first checkpoint": (rlctl.run.files, "_take_place", 1),
-    "checkpoint": (rlctl.run.files, "_take_place", 2),
-    "evaluated checkpoint": (rlctl.run.files, "_take_place", 3),
-    "final evaluation": (rlctl.train.evaluation._Watched, "act", 13),
+    "evaluation": (rlctl.rollout.workers.Workers, "step", 19),  # two rollouts of 8 steps are before it
+    "first checkpoint": (rlctl.run.files, "os.rename", 1),
+    "checkpoint": (rlctl.run.files, "os.rename", 2),
+    "evaluated checkpoint": (rlctl.run.files, "os.rename", 3),
+    "final evaluation": (rlctl.rollout.workers.Workers, "step", 37),  # 8 more, and an evaluation of 10
     "the end": (rlctl.train.loop.TrainingLoop, "finish", 1),
-    "last checkpoint": (rlctl.run.files, "_take_place", 4),
+    "last checkpoint": (rlctl.run.files, "os.rename", 4),
     "done": (rlctl.train.status, "write_end", 1),
 }
 """Phase -> the function that is in it, and which call of it."""
@@ -36,7 +35,10 @@ def send(number, phase, everybody=False, again=False):
 
     To all is what a service manager does, as the machine or the job of a cluster ends.
     """
-    owner, name, call = PHASES[phase]
+    owner, path, call = PHASES[phase]
+    *parts, name = path.split(".")
+    for part in parts:
+        owner = getattr(owner, part)
     original, counter = getattr(owner, name), itertools.count(1)
 
     def called(*arguments, **options):
@@ -45,6 +47,6 @@ def send(number, phase, everybody=False, again=False):
                 for each in psutil.Process().children(recursive=True) if everybody else ():
                     each.send_signal(number)
                 os.kill(os.getpid(), number)
-        return original(*arguments, **options)
+        return original.fget(*arguments) if isinstance(original, property) else original(*arguments, **options)
 
-    setattr(owner, name, called)
+    setattr(owner, name, property(called) if isinstance(original, property) else called)

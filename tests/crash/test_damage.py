@@ -20,7 +20,7 @@ COUNT = 150
 
 
 @pytest.fixture(scope="session")
-def killed(server, whole, tmp_path_factory):
+def killed(trials, whole, tmp_path_factory):
     """A run that was killed after its third checkpoint or a later one, by name."""
     ended = {}
 
@@ -28,7 +28,7 @@ def killed(server, whole, tmp_path_factory):
         if name not in ended:
             at = operation_after(whole(name), {"ppo, kept": 64, "sac, kept": 40}[name])
             disk = {"fault": "kill", "at": at}
-            ended[name] = server.run(ARGUMENTS[name], tmp_path_factory.mktemp(f"killed {name}"), disk=disk)
+            ended[name] = trials.run(ARGUMENTS[name], tmp_path_factory.mktemp(f"killed {name}"), disk=disk)
         return only_run(ended[name].folder)
 
     return get
@@ -36,7 +36,7 @@ def killed(server, whole, tmp_path_factory):
 
 @parts
 @pytest.mark.parametrize("name", ["ppo, kept", "sac, kept"])
-def test_damage_is_noticed_or_harmless(server, whole, killed, folders, name, part):
+def test_damage_is_noticed_or_harmless(trials, whole, killed, folders, name, part):
     before, undamaged = only_run(whole(name).folder), killed(name)
     for damage in all_damage(undamaged.path, COUNT)[part::PARTS]:
         folder = next(folders)
@@ -44,7 +44,7 @@ def test_damage_is_noticed_or_harmless(server, whole, killed, folders, name, par
         damage.do(run.path)
         assert_policies_tell(run, undamaged, damage)
         assert_episodes_tell(run, undamaged, damage)
-        ended = server.run(resume(run), folder)
+        ended = trials.run(resume(run), folder)
         assert_quiet(ended)
         noticed = names_it(ended.stderr, damage)
         if ended.code != 0:

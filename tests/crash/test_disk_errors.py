@@ -18,10 +18,10 @@ def errors(part, operations, each=3):
 
 @parts
 @pytest.mark.parametrize("name", ["ppo", "sac"])
-def test_an_error_once_costs_nothing(server, whole, folders, name, part):
+def test_an_error_once_costs_nothing(trials, whole, folders, name, part):
     before = whole(name)
     for at, error in errors(part, before.operations):
-        ended = server.run(ARGUMENTS[name], next(folders), disk={"fault": error, "at": at})
+        ended = trials.run(ARGUMENTS[name], next(folders), disk={"fault": error, "at": at})
         assert_quiet(ended)
         run = only_run(ended.folder)
         if ended.announced == 0:  # nothing had been done yet, and nothing is done
@@ -34,10 +34,10 @@ def test_an_error_once_costs_nothing(server, whole, folders, name, part):
 
 @parts
 @pytest.mark.parametrize("name", ["ppo", "sac"])
-def test_short_writes_cost_nothing(server, whole, folders, name, part):
+def test_short_writes_cost_nothing(trials, whole, folders, name, part):
     before = whole(name)
     for at in range(part or PARTS, before.operations + 1, PARTS):
-        ended = server.run(ARGUMENTS[name], next(folders), disk={"fault": "short", "at": at, "lasting": at % 2 == 0})
+        ended = trials.run(ARGUMENTS[name], next(folders), disk={"fault": "short", "at": at, "lasting": at % 2 == 0})
         assert_quiet(ended)
         assert ended.code == 0, ended.stderr
         assert "warning" not in ended.stderr
@@ -46,14 +46,14 @@ def test_short_writes_cost_nothing(server, whole, folders, name, part):
 
 @parts
 @pytest.mark.parametrize("name", ["ppo", "sac"])
-def test_a_disk_that_has_failed_for_good(server, whole, folders, name, part):
+def test_a_disk_that_has_failed_for_good(trials, whole, folders, name, part):
     before = whole(name)
     final = before.announced
     for at, error in errors(part, before.operations, each=1):
         disk = {"fault": error, "at": at, "lasting": True}
-        ended = server.run(ARGUMENTS[name], next(folders), disk=disk)
+        ended = trials.run(ARGUMENTS[name], next(folders), disk=disk)
         assert_quiet(ended)
         assert ended.code == 5 or (ended.code == 0 and ended.announced == final), ended.stderr
         if any(line.startswith("fault ") for line in ended.log):
             assert ERRORS[error] in ended.stderr
-        assert_nothing_lost(server, ARGUMENTS[name], ended, only_run(before.folder))
+        assert_nothing_lost(trials, ARGUMENTS[name], ended, only_run(before.folder))

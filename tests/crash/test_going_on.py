@@ -21,12 +21,12 @@ LONGER = {
 
 
 @pytest.mark.parametrize("name", LONGER)
-def test_a_finished_run_made_longer_is_a_longer_run(server, folders, name):
+def test_a_finished_run_made_longer_is_a_longer_run(trials, folders, name):
     arguments, short, long = LONGER[name]
-    whole = server.run([*arguments, "-n", str(long)], next(folders))
-    first = server.run([*arguments, "-n", str(short)], next(folders))
+    whole = trials.run([*arguments, "-n", str(long)], next(folders))
+    first = trials.run([*arguments, "-n", str(short)], next(folders))
     run = only_run(first.folder)
-    longer = server.run([*resume(run), "-n", str(long)], first.folder)
+    longer = trials.run([*resume(run), "-n", str(long)], first.folder)
     assert [ended.code for ended in (whole, first, longer)] == [0, 0, 0]
     assert f"going on at step {short}, as if it had never stopped" in longer.stderr
     assert_same_end(run, only_run(whole.folder))
@@ -37,27 +37,27 @@ def contents(run):
 
 
 @pytest.mark.parametrize("more", [[], ["--stop-success", "0.98"]], ids=["all steps", "good enough"])
-def test_a_finished_run_has_nothing_to_do(server, folders, more):
-    ended = server.run([*ARGUMENTS["ppo"], *more, "-n", "320" if more else "48"], next(folders))
+def test_a_finished_run_has_nothing_to_do(trials, folders, more):
+    ended = trials.run([*ARGUMENTS["ppo"], *more, "-n", "320" if more else "48"], next(folders))
     assert ended.code == 0, ended.stderr
     run = only_run(ended.folder)
     assert run.status()["steps"] == (64 if more else 48)  # the second evaluation in a row, or the last step
     before = contents(run)
-    again = server.run(resume(run), ended.folder)
+    again = trials.run(resume(run), ended.folder)
     assert_quiet(again)
     assert again.code == 0
     assert "this run is finished already: nothing to do; -n makes it longer" in again.stdout
     assert contents(run) == before
 
 
-def test_killed_before_its_first_checkpoint(server, whole, folders):
+def test_killed_before_its_first_checkpoint(trials, whole, folders):
     before = whole("ppo")
     first = next(number for number, line in enumerate(before.log) if "000000000" in line)
     at = int(before.log[first].split()[1])
-    ended = server.run(ARGUMENTS["ppo"], next(folders), disk={"fault": "kill", "at": at})
+    ended = trials.run(ARGUMENTS["ppo"], next(folders), disk={"fault": "kill", "at": at})
     run = only_run(ended.folder)
     assert run.checkpoints() == []
-    again = server.run(resume(run), ended.folder)
+    again = trials.run(resume(run), ended.folder)
     assert again.code == 0, again.stderr
     assert "no checkpoint yet: the training begins at its first step" in again.stderr
     assert_same_end(run, only_run(before.folder))
@@ -74,24 +74,24 @@ class Line(envs.Line):
 """
 
 
-def test_an_environment_that_is_mended(server, folders):
+def test_an_environment_that_is_mended(trials, folders):
     folder = next(folders)
     folder.mkdir()
     file = folder / "mine.py"
     file.write_text(MENDABLE)
     arguments = ["train", f"{file}:Line", *ARGUMENTS["ppo, kept"][2:]]
-    ended = server.run(arguments, folder)
+    ended = trials.run(arguments, folder)
     assert ended.code == 3
     assert_quiet(dataclasses.replace(ended, stderr=ended.stderr.replace("Traceback", "")))
     run = only_run(folder)
     assert [int(each.name) for each in run.checkpoints()] == [32, 48, 64]
     file.write_text(MENDABLE.replace("broken = True", "broken = False"))
-    refused = server.run(resume(run), folder)
+    refused = trials.run(resume(run), folder)
     assert refused.code == 2
     assert "mine.py is not what it was when the run began. What was learnt may not fit any more; " in refused.stderr
-    forced = server.run([*resume(run), "--force"], folder)
+    forced = trials.run([*resume(run), "--force"], folder)
     assert forced.code == 0, forced.stderr
     assert "going on at step 64, not bit-exact: " in forced.stderr
-    whole = server.run(arguments, next(folders))
+    whole = trials.run(arguments, next(folders))
     assert whole.code == 0, whole.stderr
     assert_same_end(run, only_run(whole.folder))  # what was mended had not happened yet

@@ -17,17 +17,17 @@ def every(part, operations):
 @parts
 @pytest.mark.parametrize("fault", ["kill", "half", "power"])
 @pytest.mark.parametrize("name", ["ppo", "sac"])
-def test_killed_at_an_operation(server, whole, folders, name, fault, part):
+def test_killed_at_an_operation(trials, whole, folders, name, fault, part):
     before = whole(name)
     for at in every(part, before.operations):
-        ended = server.run(ARGUMENTS[name], next(folders), disk={"fault": fault, "at": at})
+        ended = trials.run(ARGUMENTS[name], next(folders), disk={"fault": fault, "at": at})
         assert ended.code == (-signal.SIGKILL if at <= before.operations else 0), ended.stderr
-        assert_nothing_lost(server, ARGUMENTS[name], ended, only_run(before.folder))
+        assert_nothing_lost(trials, ARGUMENTS[name], ended, only_run(before.folder))
         assert_tidy(only_run(ended.folder))
 
 
 @pytest.fixture(scope="session")
-def half_done(server, whole, tmp_path_factory):
+def half_done(trials, whole, tmp_path_factory):
     """A run that was killed in the middle of a checkpoint, by name and the step of the one before."""
     ended = {}
 
@@ -36,7 +36,7 @@ def half_done(server, whole, tmp_path_factory):
         if key not in ended:
             at = operation_after(whole(name), saved) + 12
             folder = tmp_path_factory.mktemp(f"half of {name}")
-            ended[key] = server.run(ARGUMENTS[name], folder, disk={"fault": "half", "at": at})
+            ended[key] = trials.run(ARGUMENTS[name], folder, disk={"fault": "half", "at": at})
             assert ended[key].announced == saved
         return ended[key]
 
@@ -45,14 +45,14 @@ def half_done(server, whole, tmp_path_factory):
 
 @parts
 @pytest.mark.parametrize(("name", "saved"), [("ppo", 0), ("ppo", 16), ("sac", 16)])
-def test_killed_again_while_resuming(server, whole, half_done, folders, name, saved, part):
+def test_killed_again_while_resuming(trials, whole, half_done, folders, name, saved, part):
     before = half_done(name, saved)
     first = next(folders)
-    operations = server.run(resume(copied(only_run(before.folder), first)), first).operations
+    operations = trials.run(resume(copied(only_run(before.folder), first)), first).operations
     assert operations > 20
     for at in every(part, operations):
         folder = next(folders)
         run = copied(only_run(before.folder), folder)
-        ended = server.run(resume(run), folder, disk={"fault": "half", "at": at})
+        ended = trials.run(resume(run), folder, disk={"fault": "half", "at": at})
         assert ended.code == (-signal.SIGKILL if at <= operations else 0), ended.stderr
-        assert_nothing_lost(server, ARGUMENTS[name], ended, only_run(whole(name).folder), before.announced)
+        assert_nothing_lost(trials, ARGUMENTS[name], ended, only_run(whole(name).folder), before.announced)

@@ -15,11 +15,11 @@ AFTER = 48
 
 
 @pytest.fixture
-def meddle(server, folders):
+def meddle(trials, folders):
     """Train while something happens after a step; return how it ended, its run, and the warnings."""
 
     def run(what, name=NAME, **plan):
-        ended = server.run(ARGUMENTS[name], next(folders), meddle={"what": what, "after": AFTER, **plan})
+        ended = trials.run(ARGUMENTS[name], next(folders), meddle={"what": what, "after": AFTER, **plan})
         assert_quiet(ended)
         assert ended.code == 0, ended.stderr
         warnings = [line for line in ended.stderr.splitlines() if line.startswith(("warning", "saved again"))]
@@ -44,7 +44,7 @@ def assert_same_learnt(run, whole):
 
 
 @pytest.mark.parametrize("what", ["run removed", "all runs removed"])
-def test_a_run_that_is_removed_is_there_again(server, whole, meddle, what):
+def test_a_run_that_is_removed_is_there_again(trials, whole, meddle, what):
     ended, run, warnings = meddle(what)
     assert warnings == [
         f"warning: {relative(run, ended)} was removed while training: made anew, without what was in it"
@@ -56,20 +56,20 @@ def test_a_run_that_is_removed_is_there_again(server, whole, meddle, what):
     assert [int(folder.name) for folder in run.checkpoints()] == [64, 80]
     assert list(run.tensorboard.iterdir())
     assert_tidy(run)
-    usable(server, run, ended.folder)
+    usable(trials, run, ended.folder)
 
 
 def relative(run, ended):
     return run.path.relative_to(ended.folder)
 
 
-def usable(server, run, folder):
+def usable(trials, run, folder):
     for arguments, told in (
         (["eval", str(run.path), "--episodes", "2"], "success rate"),
         (["export", str(run.path), "--onnx"], "verified"),
         ([*resume(run), "-n", "96"], ": 96 steps in "),
     ):
-        ended = server.run(arguments, folder)
+        ended = trials.run(arguments, folder)
         assert ended.code == 0, ended.stderr
         assert told in ended.stdout + ended.stderr
 
@@ -100,11 +100,11 @@ def test_what_is_removed_is_written_again(whole, meddle, what, told):
         ("sac, kept", "segments removed", 32),
     ],
 )
-def test_the_next_checkpoint_is_whole(server, whole, meddle, name, what, after):
+def test_the_next_checkpoint_is_whole(trials, whole, meddle, name, what, after):
     ended, run, warnings = meddle(what, name, after=after)
     assert warnings == []
     assert_same_end(run, only_run(whole(name).folder))
-    again = server.run([*resume(run), "-n", "96"], ended.folder)
+    again = trials.run([*resume(run), "-n", "96"], ended.folder)
     assert again.code == 0, again.stderr
     saved, _ = checkpoint.read_newest(only_run(whole(name).folder))
     assert f"going on at step {saved.state.step}, as if" in again.stderr
@@ -148,11 +148,11 @@ def test_a_disk_that_takes_nothing_for_a_while(whole, meddle, what, told):
     assert_same_end(run, only_run(whole(NAME).folder))
 
 
-def test_latest_is_not_ours_any_more(server, whole, meddle):
+def test_latest_is_not_ours_any_more(trials, whole, meddle):
     ended, run, _ = meddle("latest replaced", after=16)
     assert_same_end(run, only_run(whole(NAME).folder))
     assert (ended.folder / "runs" / "latest" / "mine").exists()
-    assert server.run(["train", "--resume", "latest"], ended.folder).code == 0
+    assert trials.run(["train", "--resume", "latest"], ended.folder).code == 0
 
 
 @pytest.mark.parametrize("what", CLOCKS)
@@ -162,17 +162,17 @@ def test_a_clock_that_jumps_changes_nothing(whole, meddle, what):
     assert_same_end(run, only_run(whole(NAME).folder))
 
 
-def test_latest_after_the_clock_was_set_back(server, folders):
+def test_latest_after_the_clock_was_set_back(trials, folders):
     folder = next(folders)
     short = [*ARGUMENTS[NAME], "-n", "16"]
-    first = server.run(short, folder)
-    second = server.run([*short, "--seed", "1"], folder, meddle={"what": "clock back"})
+    first = trials.run(short, folder)
+    second = trials.run([*short, "--seed", "1"], folder, meddle={"what": "clock back"})
     assert (first.code, second.code) == (0, 0)
     older, newer = sorted((folder / "runs" / "Line").iterdir(), reverse=True)
     assert (older.name[-2:], newer.name[-2:]) == ("s0", "s1")
-    again = server.run(["train", "--resume", "latest", "-n", "32"], folder)
+    again = trials.run(["train", "--resume", "latest", "-n", "32"], folder)
     assert again.code == 0, again.stderr
     assert newer.name in again.stdout
     shutil.rmtree(newer)  # the link leads nowhere, and the time in the names decides
-    again = server.run(["train", "--resume", "latest", "-n", "32"], folder)
+    again = trials.run(["train", "--resume", "latest", "-n", "32"], folder)
     assert older.name in again.stdout

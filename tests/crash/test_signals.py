@@ -14,7 +14,7 @@ import pytest
 
 from tests.crash.contract import assert_nothing_lost, assert_quiet
 from tests.crash.phases import PHASES
-from tests.crash.trials import ARGUMENTS, ROOT, only_run
+from tests.crash.trials import ARGUMENTS, end_orphans, members, only_run
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 BEFORE = ("workers start", "workers build", "run folder")
@@ -33,9 +33,9 @@ def cases(some):
 
 @pytest.mark.parametrize(("phase", "number"), cases(SOME))
 @pytest.mark.parametrize("everybody", [False, True], ids=["alone", "everybody"])
-def test_a_signal_in_a_phase(server, whole, tmp_path, phase, number, everybody):
+def test_a_signal_in_a_phase(trials, whole, tmp_path, phase, number, everybody):
     before = whole("ppo")
-    ended = server.run(
+    ended = trials.run(
         ARGUMENTS["ppo"],
         tmp_path,
         real_workers=everybody,
@@ -50,19 +50,19 @@ def test_a_signal_in_a_phase(server, whole, tmp_path, phase, number, everybody):
         if phase not in BEFORE:
             assert "checkpoint saved. Go on with: rlctl train --resume runs/Line/" in ended.stderr
             assert ended.announced > 0
-    assert_nothing_lost(server, ARGUMENTS["ppo"], ended, only_run(before.folder))
+    assert_nothing_lost(trials, ARGUMENTS["ppo"], ended, only_run(before.folder))
 
 
 @pytest.mark.parametrize(("phase", "number"), cases({("checkpoint", signal.SIGTERM)}))
-def test_a_second_signal_ends_it_at_once(server, whole, tmp_path, phase, number):
-    ended = server.run(
+def test_a_second_signal_ends_it_at_once(trials, whole, tmp_path, phase, number):
+    ended = trials.run(
         ARGUMENTS["ppo"],
         tmp_path,
         signal={"number": int(number), "phase": phase, "again": True},
     )
     assert_quiet(ended)
     assert ended.code == (0 if phase == "done" else CODES[number]), ended.stderr
-    assert_nothing_lost(server, ARGUMENTS["ppo"], ended, only_run(whole("ppo").folder))
+    assert_nothing_lost(trials, ARGUMENTS["ppo"], ended, only_run(whole("ppo").folder))
 
 
 START = 12  # moments, evenly over the first seconds of a process
@@ -93,26 +93,7 @@ def test_a_signal_while_the_process_starts(tmp_path, number, part):
     assert process.returncode in (CODES[number], -number), stderr
     if process.returncode == CODES[number]:
         assert "Traceback" not in stderr
-    assert left_of(process.pid) == []
-
-
-def left_of(session):
-    """Return the commands of the processes of a session that do not end within some seconds."""
-    deadline = time.monotonic() + 10.0
-    while time.monotonic() < deadline and members(session):
-        time.sleep(0.05)
-    return [each.cmdline() for each in members(session)]
-
-
-def members(session):
-    found = []
-    for each in psutil.process_iter(["status"]):
-        try:
-            if os.getsid(each.pid) == session and each.info["status"] != psutil.STATUS_ZOMBIE:
-                found.append(each)
-        except ProcessLookupError:
-            continue
-    return found
+    assert end_orphans(process.pid) == []
 
 
 def test_a_closed_terminal(tmp_path):
@@ -120,7 +101,7 @@ def test_a_closed_terminal(tmp_path):
     if process == 0:
         os.chdir(tmp_path)
         command = [sys.executable, "-m", "rlctl", *ARGUMENTS["ppo"], "-n", "1_000_000"]
-        os.execvpe(command[0], command, {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'plugins'}"})
+        os.execv(command[0], command)
     deadline = time.monotonic() + 60.0
     while not list(tmp_path.glob("runs/Line/*/metrics.csv")):
         assert time.monotonic() < deadline
@@ -128,7 +109,7 @@ def test_a_closed_terminal(tmp_path):
     os.close(terminal)
     _, status = os.waitpid(process, 0)
     assert os.waitstatus_to_exitcode(status) == CODES[signal.SIGHUP]
-    assert left_of(process) == []
+    assert end_orphans(process) == []
     told = json.loads((only_run(tmp_path).status_file).read_text())
     assert told["status"] == "interrupted"
     assert "checkpoint saved" in told["error"]

@@ -1,4 +1,4 @@
-"""Trainings to be killed: what they are, and a client of the server that runs them."""
+"""Trainings to be killed: what they are, and how they are run."""
 
 import dataclasses
 import json
@@ -7,12 +7,14 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
-from rlctl.run.directory import RunDirectory
-from tests.train.conftest import ENVS
+import psutil
 
-ROOT = Path(__file__).parents[2]
+from rlctl.run.directory import RunDirectory
+from tests import fork_server
+from tests.train.conftest import ENVS
 
 
 def _line(*settings, algo, steps, evaluate):
@@ -81,38 +83,68 @@ class Ended:
         return int(found[1].replace(",", "")) if found else 0
 
 
-class ForkServer:
-    """Runs trials one after the other."""
+class Trials:
+    """Runs trials one after the other, on one core."""
 
     def __init__(self, core: int) -> None:
-        # Nothing of the machine's may differ between trials, and the terminal is none.
-        environment = {
-            **os.environ,
-            "PYTHONPATH": f"{ROOT}:{ROOT / 'plugins'}",
-            "CRASH_CORE": str(core),
-            "TERM": "dumb",
-        }
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.crash.fork_server"],
-            cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+        self._core = core
 
-    def run(self, arguments, folder: Path, **plan) -> Ended:
-        """Run a command line in a folder, with what `inside.run` takes as a plan; return how it ended."""
+    def run(self, arguments, folder: Path, *, send=(), **plan) -> Ended:
+        """Run a command line in a folder, with what `inside.run` takes as a plan; return how it ended.
+
+        `send` are signals, [when, number] each; `when` is in seconds, or the name of a file that is waited for.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         for name in ("log", "stdout", "stderr"):
             (folder / name).unlink(missing_ok=True)
-        request = {"arguments": arguments, "folder": str(folder), "plan": plan}
-        self._process.stdin.write(json.dumps(request) + "\n")
-        self._process.stdin.flush()
-        answer = json.loads(self._process.stdout.readline())
+        job = json.dumps([arguments, {"core": self._core, **plan}])
+        began = time.monotonic()
+        with (folder / "stdout").open("wb") as stdout, (folder / "stderr").open("wb") as stderr:
+            process = fork_server.for_commands().start(
+                [sys.executable, "-m", "tests.crash.inside", job],
+                cwd=folder, stdin=subprocess.DEVNULL, stdout=stdout.fileno(), stderr=stderr.fileno(),
+                env={**os.environ, "TERM": "dumb"}, start_new_session=True,
+            )  # fmt: skip
+        _send_signals(process, folder, send)
+        code = process.wait()
+        seconds = time.monotonic() - began
         texts = [_text(folder / name) for name in ("stdout", "stderr", "log")]
-        log = texts[2].splitlines()
-        return Ended(arguments, plan, folder, answer["code"], answer["seconds"], answer["orphans"], *texts[:2], log)
+        return Ended(
+            arguments, plan, folder, code, seconds, end_orphans(process.pid), *texts[:2], texts[2].splitlines()
+        )
 
-    def close(self) -> None:
-        self._process.stdin.close()
-        self._process.wait(timeout=30)
+
+def _send_signals(process, folder, send):
+    began = time.monotonic()
+    for when, number in send:
+        while not (folder / when).exists() if isinstance(when, str) else time.monotonic() < began + when:
+            if process.poll() is not None:
+                return
+            time.sleep(0.001)
+        process.send_signal(number)
+
+
+def members(session: int) -> list[psutil.Process]:
+    """Return the processes of a session that have not ended."""
+    found = []
+    for pid in psutil.pids():
+        try:
+            if os.getsid(pid) == session and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+                found.append(psutil.Process(pid))
+        except (ProcessLookupError, psutil.NoSuchProcess):
+            continue
+    return found
+
+
+def end_orphans(session: int, patience_s: float = 10.0) -> list[str]:
+    """Wait for the end of a session's processes; kill those that do not end, and return their commands."""
+    deadline = time.monotonic() + patience_s
+    while (left := members(session)) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    commands = [f"{each.pid} {' '.join(each.cmdline())[:80]}" for each in left]
+    for each in left:
+        each.kill()
+    return commands
 
 
 def operation_after(whole: Ended, step: int) -> int:
