@@ -76,7 +76,9 @@ class EnvSpec:
     def _make_task_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
         from rlctl.task.env import TaskEnv
         from rlctl.task.events import EventSettings
+        from rlctl.task.task import check_parameters
 
+        check_parameters(constructor)
         parameters = _task_parameters(constructor, self.parameters)
         env: TaskEnv = call_plugin(
             self.task,

@@ -16,7 +16,7 @@ from rlctl.errors import RecipeError, TaskError, did_you_mean
 from rlctl.task.events import EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
 from rlctl.task.sim import Sim
-from rlctl.task.task import Task, has_compute_reward, has_success
+from rlctl.task.task import Task, check_methods, check_parameters, has_compute_reward, has_success
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
@@ -36,8 +36,12 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         reward_weights: Mapping[str, float] | None = None,
         events: EventSettings | None = None,
     ) -> None:
+        check_parameters(type(task))
+        check_methods(type(task))
         self.task = task
         self.name = type(task).__name__
+        if not hasattr(task, "action_space"):
+            raise TaskError(f"{self.name} does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example")
         # Of the instance: gymnasium.Env shares one dict between all environments.
         self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / task.control_dt)}
         if render_mode not in (None, "human", "rgb_array"):

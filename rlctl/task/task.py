@@ -113,6 +113,28 @@ class Task:
         return max(1, round(self.episode_s / self.control_dt))
 
 
+def check_parameters(task: type[Task]) -> None:
+    """Raise `TaskError` for a class with annotated values that is not a dataclass."""
+    for cls in task.__mro__[: task.__mro__.index(Task)]:
+        hints = {key: hint for key, hint in cls.__dict__.get("__annotations__", {}).items() if key in cls.__dict__}
+        parameters = [key for key, hint in hints.items() if "ClassVar" not in str(hint)]
+        if parameters and "__dataclass_fields__" not in cls.__dict__:
+            raise TaskError(
+                f"{cls.__name__} has parameters ({', '.join(parameters)}) and is not a dataclass: "
+                "write @dataclass in the line above its class"
+            )
+
+
+def check_methods(task: type[Task]) -> None:
+    """Raise `TaskError` for a class without a method that every task needs."""
+    missing = [f"{method}()" for method in _REQUIRED if getattr(task, method) is getattr(Task, method)]
+    if missing:
+        raise TaskError(f"{task.__name__} does not define {', '.join(missing)}; a task needs {', '.join(_REQUIRED)}")
+
+
+_REQUIRED = ("build", "act", "observe", "rewards")
+
+
 def has_success(task: Task) -> bool:
     """Say whether the task defines success."""
     return type(task).is_success is not Task.is_success

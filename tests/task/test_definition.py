@@ -1,0 +1,95 @@
+"""A class that is no whole task is named as what it is."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import TaskError
+from rlctl.task import Box, Task
+from rlctl.task.env import TaskEnv
+
+
+class Whole(Task):
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+    reward_weights = {"one": 1.0}
+
+    def build(self, sim):
+        pass
+
+    def act(self, action):
+        pass
+
+    def observe(self):
+        return {"zero": np.zeros(1)}
+
+    def rewards(self, action):
+        return {"one": 1.0}
+
+
+class ForgottenDataclass(Whole):
+    tolerance: float = 0.1
+    hint: int  # no value, so no parameter that was meant
+
+
+@dataclass
+class Parameters(Whole):
+    tolerance: float = 0.1
+
+
+class ForgottenBelow(Parameters):
+    height: float = 0.3
+
+
+class SpaceFromParameters(Whole):
+    def __init__(self):
+        self.action_space = Box(-1.0, 1.0, (2,), np.float32)
+
+
+def missing(*names: str) -> type[Task]:
+    """Return a task without some of its attributes."""
+    content = {name: value for name, value in vars(Whole).items() if name not in (*names, "__dict__", "__weakref__")}
+    return type("MyArm", (Task,), content)
+
+
+@pytest.mark.parametrize(
+    ("cls", "message"),
+    [
+        (missing("build"), "MyArm does not define build(); a task needs build, act, observe, rewards"),
+        (
+            missing("act", "rewards"),
+            "MyArm does not define act(), rewards(); a task needs build, act, observe, rewards",
+        ),
+        (
+            missing("action_space"),
+            "MyArm does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example",
+        ),
+        (
+            ForgottenDataclass,
+            "ForgottenDataclass has parameters (tolerance) and is not a dataclass: "
+            "write @dataclass in the line above its class",
+        ),
+        (
+            ForgottenBelow,
+            "ForgottenBelow has parameters (height) and is not a dataclass: "
+            "write @dataclass in the line above its class",
+        ),
+    ],
+)
+def test_what_is_missing_is_named(cls, message):
+    with pytest.raises(TaskError) as raised:
+        TaskEnv(cls())
+    assert str(raised.value) == message
+
+
+@pytest.mark.parametrize("cls", [Whole, Parameters, SpaceFromParameters])
+def test_whole_tasks_are_built(cls):
+    TaskEnv(cls()).close()
+
+
+def test_a_parameter_of_a_class_that_forgot_it(write_module, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_module("arm.py", "from rlctl.task import Task\n\n\nclass Arm(Task):\n    tolerance: float = 0.1\n")
+    with pytest.raises(TaskError, match=r"^Arm has parameters \(tolerance\) and is not a dataclass"):
+        EnvSpec("arm.py:Arm", {"tolerance": 0.2}).make()
