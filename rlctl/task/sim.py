@@ -90,7 +90,10 @@ class Sim(Constraints):
         if not path.is_absolute() and not path.exists():
             path = Path(pybullet_data.getDataPath()) / file
         if not path.exists():
-            raise TaskError(f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data")
+            raise TaskError(
+                f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data; "
+                f"for a file beside your module: Path(__file__).with_name({path.name!r})"
+            )
         if path.suffix == ".urdf" and inertia == "file":
             flags |= pybullet.URDF_USE_INERTIA_FROM_FILE
         if self_collision:
