@@ -24,8 +24,9 @@ def test_a_model_file_that_is_not_there(sim):
     with pytest.raises(TaskError) as caught:
         sim.load("robot", "robot/missing.urdf")
     assert str(caught.value).startswith("model file 'robot/missing.urdf' not found: neither under /")
-    assert str(caught.value).endswith("for a file beside your module: Path(__file__).with_name('missing.urdf')")
-    assert str(caught.value).endswith(" nor in pybullet_data")
+    assert str(caught.value).endswith(
+        " nor in pybullet_data; for a file beside your module: Path(__file__).with_name('missing.urdf')"
+    )
 
 
 def test_a_model_file_that_is_none(sim, tmp_path):
