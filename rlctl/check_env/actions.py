@@ -13,11 +13,13 @@ if TYPE_CHECKING:
 
 HOLD_STEPS = 10
 """How long an extreme action is held."""
+RARE = 0.1
+"""How often a rare action is not zero."""
 
 
 def actions(space: spaces.Space[Any], kind: str, seed: int) -> Iterator[Any]:
-    """Yield actions without end: `random`, `zero`, `repeated` (a random one, always the same), or `extreme` (corners of
-    the space, each held for a while)."""
+    """Yield actions without end: `random`, `zero`, `repeated` (a random one, always the same), `rare` (zero but now and
+    then), or `extreme` (corners of the space, each held for a while)."""
     # A copy: the environment's own space has a generator that it may use, or share with other instances.
     space = copy.deepcopy(space)
     space.seed(seed)
@@ -32,6 +34,8 @@ def actions(space: spaces.Space[Any], kind: str, seed: int) -> Iterator[Any]:
         while True:
             yield copy.deepcopy(repeated)
     rng = np.random.default_rng(seed)
+    while kind == "rare":
+        yield space.sample() if rng.random() < RARE else zero_action(space)
     while True:
         corner = _corner(space, rng)
         for _ in range(HOLD_STEPS):

@@ -16,8 +16,6 @@ WAIVERS = "rlctl_ignore"
 
 def describe_built(instance: Instance) -> Built:
     """Return what is known of an environment before it is used."""
-    import gymnasium
-
     env = instance.env
     inner = getattr(env, "unwrapped", env)
     spec = getattr(env, "spec", None)
@@ -34,7 +32,7 @@ def describe_built(instance: Instance) -> Built:
         max_steps=inner.max_steps if is_task else getattr(spec, "max_episode_steps", None),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         accepts_seed=instance.accepts_seed,
-        is_env=isinstance(env, gymnasium.Env),
+        is_env=instance.is_env,
         is_old_gym=any(base.__module__.partition(".")[0] == "gym" for base in type(inner).__mro__),
         metadata=_metadata(inner),
         uses_pybullet=bool(connected()),

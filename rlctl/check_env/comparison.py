@@ -1,4 +1,4 @@
-"""Comparing two lives of the same episode: the first difference, named."""
+"""Compares two recordings of the same episode: the first difference, by name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.evidence import Built, Trajectory
+from rlctl.check_env.messages import Built, Trajectory
 
 NEARLY = 1e-5
 """Up to this a first difference is a numerical residue, such as a simulation's that was not reset in full; chaos may
@@ -17,7 +17,7 @@ make it large later. Relative to the larger value or to 1; it is also what Gymna
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """Where two trajectories part."""
+    """Where two trajectories begin to differ."""
 
     step: int
     """0 is the observation of reset."""
@@ -32,11 +32,11 @@ class Difference:
 
     @property
     def is_small(self) -> bool:
-        """Whether the two part by a numerical residue only."""
+        """Whether the two differ by a numerical residue only."""
         return self.size <= NEARLY
 
     def text(self) -> str:
-        """Say it in words."""
+        """Return it as a message."""
         size = f" (a residue of {self.size:.0e}, later up to {self.largest:.0e})" if self.is_small else ""
         at = "at reset" if self.step == 0 else f"at step {self.step}"
         return f"first difference {at}: {self.element} is {self.first:.9g}, then {self.second:.9g}{size}"
@@ -58,7 +58,7 @@ def _plain(value: float) -> float | str:
     return value if np.isfinite(value) else str(value)
 
 
-def first_difference(built: Built, one: Trajectory, two: Trajectory) -> Difference | None:
+def find_difference(built: Built, one: Trajectory, two: Trajectory) -> Difference | None:
     """Compare two trajectories bit for bit as far as both go; NaN equals NaN."""
     found = []
     for index, _ in enumerate(built.leaves):

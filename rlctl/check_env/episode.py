@@ -70,7 +70,7 @@ class Episode:
         self._timer = timer
         self._actions = actions
         self._action_seed = seed if action_seed is None else action_seed
-        self._next: Iterator[Any] = iter(())
+        self._next = iter(self._choose_actions())
 
     def __iter__(self) -> Iterator[Moment]:
         yield self.reset()

@@ -33,6 +33,10 @@ class Experiment:
     of the first of its rules, and otherwise no failure of the environment."""
 
 
+PROVOKING: set[str] = set()
+"""The names of the experiments that do what no learner would."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Check:
     """How the parent process judges a rule from what was recorded."""
@@ -50,6 +54,8 @@ def experiment(
 
     def decorate(run: Callable[[Context], Iterator[Message]]) -> Experiment:
         assert all(rule in RULES for rule in rules)
+        if provokes:
+            PROVOKING.add(name)
         return Experiment(name, run, rules, share, provokes)
 
     return decorate

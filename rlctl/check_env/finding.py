@@ -61,21 +61,31 @@ FAMILIES, RULES = _load()
 """The families' titles by the beginning of their ids, and the rules by id."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, init=False)
 class Finding:
-    """Something that is wrong, or may be, with one environment. Severity and fix are the rule's where left out."""
+    """Something that is wrong, or may be, with one environment."""
 
     rule: str
     message: str
-    evidence: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    evidence: Mapping[str, Any]
     """Numbers and names that JSON can hold: seed, episode, step, value, expected."""
-    severity: Severity = None  # type: ignore[assignment]  # never None once it is made
-    fix: str = ""
+    severity: Severity
+    fix: str
 
-    def __post_init__(self) -> None:
-        rule = RULES[self.rule]
-        object.__setattr__(self, "severity", Severity(self.severity or rule.severity))
-        object.__setattr__(self, "fix", self.fix or rule.fix)
+    def __init__(
+        self,
+        rule: str,
+        message: str,
+        evidence: Mapping[str, Any] | None = None,
+        severity: Severity | None = None,
+        fix: str = "",
+    ) -> None:
+        """Severity and fix are the rule's where left out."""
+        text = RULES[rule]
+        severity = Severity(severity or text.severity)
+        values = {"rule": rule, "message": message, "evidence": evidence or {}, "severity": severity}
+        for name, value in {**values, "fix": fix or text.fix}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def name(self) -> str:

@@ -38,6 +38,13 @@ class Instance:
         self.progress = progress
 
     @property
+    def is_env(self) -> bool:
+        """Whether it inherits from `gymnasium.Env`."""
+        import gymnasium
+
+        return isinstance(self.env, gymnasium.Env)
+
+    @property
     def can_act(self) -> bool:
         """Whether its action space is one of Gymnasium's, from which actions can be drawn."""
         from gymnasium import spaces

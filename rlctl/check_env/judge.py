@@ -72,12 +72,12 @@ def _findings(rule: str, records: Records) -> list[Finding]:
         return found
     if records.built is None and not rule.startswith(LOADING):
         raise NotJudged("no instance could be built")
-    if experiment is not None and not found:
-        found = _ended(records, experiment, rule)
-        if not found:
-            _require_complete(records, experiment, rule)
-    if check is not None:
+    if experiment is not None:
+        found += _ended(records, experiment, rule)
+    if check is not None and not found:
         found += check.run(records)
+    if experiment is not None and not found:
+        _require_complete(records, experiment, rule)
     if check is None and experiment is None:
         require_checker(records, rule)
     return found

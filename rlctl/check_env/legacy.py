@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
-from rlctl.check_env.experiment import RECORDING, Check, Experiment
+from rlctl.check_env.experiment import PROVOKING, RECORDING, Check, Experiment
 from rlctl.check_env.finding import Finding, Severity
 from rlctl.check_env.messages import Built, Fact, Skipped, Trajectory
 from rlctl.check_env.records import Records
@@ -38,7 +38,7 @@ def rule(
     def decorate(run: Callable[[Records], Iterable[Seen]]) -> Any:
         def check(records: Records) -> Iterable[Finding]:
             for seen in run(records):
-                yield Finding(id, seen.message, seen.evidence, seen.severity, seen.fix or "")  # type: ignore[arg-type]
+                yield Finding(id, seen.message, seen.evidence, seen.severity, seen.fix or "")
 
         return None if only_complaints else Check(id, check, tuple(needs))
 
@@ -76,4 +76,6 @@ def why_missing(evidence: Records, study: str) -> str:
 
 def old_experiment(name: str) -> Experiment:
     study = next(each for each in STUDIES if each.name == name)
+    if study.provokes:
+        PROVOKING.add(name)
     return Experiment(name, study.run, (), study.share, "provoked" if study.provokes else "")

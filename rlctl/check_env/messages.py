@@ -156,6 +156,11 @@ class Failure:
     """Which child process: `probe`, `instances` or `checkers`."""
 
     @property
+    def in_call(self) -> str:
+        """The call, in words for a message: `step 7`, `reset`."""
+        return f"step {self.step}" if self.call == "step" else self.call
+
+    @property
     def place(self) -> dict[str, Any]:
         """Where it was, as a finding's evidence."""
         place = {"call": self.call, "seed": self.seed, "episode": self.episode, "step": self.step}

@@ -19,8 +19,8 @@ from rlctl.check_env.messages import (
     Trajectory,
 )
 
-BESIDE_OTHERS = ("interleaved", "after close", "after the end")
-"""Roles of episodes that say little about the environment as a learner uses it: rules of their own judge them."""
+OTHERS_MATTER = ("interleaved", "after close", "after the end")
+"""Roles of episodes beside another instance, and of steps that no learner takes: rules of their own judge them."""
 
 
 @dataclasses.dataclass
@@ -93,12 +93,14 @@ class Records:
             raise NotJudged("no instance could be built")
         return self.built
 
-    def require_alone(self) -> list[Trajectory]:
-        """Return all episodes of instances that were alone in their process; raises `NotJudged` if there is none.
+    @property
+    def alone(self) -> list[Trajectory]:
+        """Return all episodes of instances that were alone in their process and used as a learner uses them."""
+        return [each for each in self.trajectories if each.role not in OTHERS_MATTER]
 
-        What a neighbour does to an instance is the matter of other rules.
-        """
-        found = [each for each in self.trajectories if each.role not in BESIDE_OTHERS]
+    def require_alone(self) -> list[Trajectory]:
+        """Return the same; raises `NotJudged` if there is none."""
+        found = self.alone
         if not any(each.steps or each.observations for each in found):
             raise NotJudged("no episode was recorded")
         return found

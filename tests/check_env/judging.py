@@ -26,14 +26,21 @@ class Case:
     expected: frozenset[tuple[str, str]]
     """Every finding: rule and severity."""
     twin: str = "broken_envs.py:Clean"
+    also_needs: tuple[str, ...] = ()
+    """Experiments that find the mistake beside those that the rule needs: a library's checker."""
 
     @property
     def rules(self) -> tuple[str, ...]:
         return tuple(sorted(rule for rule, _ in self.expected))
 
 
-def case(broken: str, *expected: tuple[str, str], twin: str = "broken_envs.py:Clean") -> Case:
-    return Case(broken, frozenset(expected), twin)
+def case(
+    broken: str,
+    *expected: tuple[str, str],
+    twin: str = "broken_envs.py:Clean",
+    also_needs: tuple[str, ...] = (),
+) -> Case:
+    return Case(broken, frozenset(expected), twin, also_needs)
 
 
 def records_of(task, *experiments, seconds=families.PROCESS_S):
@@ -54,24 +61,24 @@ def records_of(task, *experiments, seconds=families.PROCESS_S):
 
 
 @functools.cache
-def verdict_of(task, *rules, seconds=families.PROCESS_S):
+def verdict_of(task, *rules, seconds=families.PROCESS_S, also_needs=()):
     """The verdict by some rules, from the experiments that they need; or by all."""
-    needed = families.find_needs(rules) | {"build"} if rules else ()
+    needed = families.find_needs(rules) | {"build", *also_needs} if rules else ()
     verdict = judge(records_of(task, *needed, seconds=seconds), rules or tuple(RULES))
     assert verdict.crashed == {}
     return verdict
 
 
-def findings(task, *rules, seconds=families.PROCESS_S):
-    return verdict_of(task, *rules, seconds=seconds).findings
+def findings(task, *rules, **settings):
+    return verdict_of(task, *rules, **settings).findings
 
 
-def found(task, *rules):
-    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules)}
+def found(task, *rules, **settings):
+    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules, **settings)}
 
 
 def check_case(case):
     """The mistake is found by its rules, and nothing by them in the twin. That no other rule finds anything in it is
     tested in test_all_rules.py."""
-    assert found(case.broken, *case.rules) == case.expected
+    assert found(case.broken, *case.rules, also_needs=case.also_needs) == case.expected
     assert found(case.twin, *case.rules) == set()

@@ -142,13 +142,14 @@ def test_command_of_a_broken_environment(tmp_path):
 
 
 def test_command_shows_the_worst_first_with_numbers_and_fix():
-    run = rlctl(f"{BROKEN}:NumpyBool")
+    run = rlctl(f"{BROKEN}:ArrayReward", "--select", "RL2")
     assert run.returncode == 1
     assert run.stdout.splitlines()[:4] == [
-        "error RL204  terminated or truncated is no bool",
-        "  terminated is a numpy.bool at step 1",
-        "  seed 1000, episode 0, actions random, step 1, type numpy.bool, expected bool",
-        "  fix: bool(...) around both: a comparison of numpy numbers gives numpy.bool.",
+        "error RL204  types of what step returns",
+        "  the reward is a numpy.ndarray at step 1",
+        "  seed 1000, episode 0, actions random, step 1, type numpy.ndarray, expected float",
+        "  fix: Return bool(...) for both flags (a comparison of numpy numbers gives numpy.bool), float(reward), and a "
+        "dict, empty if there is nothing to say.",
     ]
 
 

@@ -2,11 +2,8 @@
 
 import pytest
 
+from rlctl.check_env.families import resources
 from rlctl.check_env.finding import NotJudged
-from rlctl.check_env.records import Records
-from rlctl.check_env.results import Leaks
-from rlctl.check_env.rules import resources
-from rlctl.check_env.studies import worker_build
 from tests.check_env.judging import case, check_case, findings
 
 FILE = "broken_resources.py"
@@ -49,15 +46,8 @@ def test_memory_is_counted():
     assert finding.evidence["resets"] == 90
 
 
-def of_counts(**counts):
-    evidence = Records("any")
-    empty = {"clients": [], "bodies": [], "descriptors": [], "threads": [], "memory": [], "measured": []}
-    evidence.facts["Leaks"] = Leaks(**{**empty, **counts})
-    return evidence
-
-
 def found_in(**counts):
-    return [seen.message for seen in resources.leaks.run(of_counts(**counts))]
+    return [finding.message for finding in resources.find_growth(resources.Counts(**counts))]
 
 
 def test_what_changes_or_fills_once_is_no_leak():
@@ -92,7 +82,7 @@ def test_the_worker_says_what_it_raised():
 
 
 def test_a_worker_that_hangs_is_a_finding(monkeypatch):
-    monkeypatch.setattr(worker_build, "HANG_S", 0.3)
+    monkeypatch.setattr(resources, "WORKER_HANG_S", 0.3)
     finding = the_finding("SlowInWorker", "RL406")
     assert finding.message == "in a spawned, daemonic worker build did not come back in 0.3 s"
 

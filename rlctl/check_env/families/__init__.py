@@ -38,24 +38,27 @@ import dataclasses
 from collections.abc import Collection, Iterable
 
 from rlctl.check_env.experiment import Check, Experiment
-from rlctl.check_env.families import loading
+from rlctl.check_env.families import (
+    attributes,
+    determinism,
+    episodes,
+    interface,
+    isolation,
+    library_checkers,
+    loading,
+    resources,
+)
 from rlctl.check_env.finding import RULES
 from rlctl.check_env.legacy import old_experiment
 from rlctl.check_env.rules import (
     actions,
-    determinism,
-    display,
-    episodes,
     hidden_goal,
     hindsight,
-    interface,
-    isolation,
     misuse,
     observations,
     physics,
     physics_source,
     redundancy,
-    resources,
     reward_incentives,
     reward_terms,
     rewards,
@@ -80,40 +83,40 @@ PROCESSES = {
     "probe": Process(
         (
             loading.build,
-            old_experiment("comparisons"),
-            old_experiment("global random"),
+            determinism.compare_repetitions,
+            determinism.compare_generators,
             old_experiment("speed"),
-            old_experiment("episodes"),
+            episodes.record_episodes,
             old_experiment("starts"),
             old_experiment("search"),
             old_experiment("hindsight"),
-            old_experiment("leaks"),
-            old_experiment("after the end"),
+            resources.count_after_resets,
+            episodes.step_after_end,
         )
     ),
     "instances": Process(
         (
-            old_experiment("instances"),
+            isolation.compare_instances,
             old_experiment("worlds"),
             old_experiment("action effects"),
-            old_experiment("attributes"),
-            old_experiment("worker build"),
+            attributes.read_attributes,
+            resources.build_in_worker,
             old_experiment("out of range"),
-            old_experiment("step before reset"),
-            old_experiment("close twice"),
-            old_experiment("rendering"),
+            interface.step_before_reset,
+            interface.close_twice,
+            attributes.render,
             old_experiment("nan action"),
         ),
         hash_seed=1,  # another one, so that hash order shows
     ),
-    "checkers": Process((old_experiment("gymnasium checker"), old_experiment("sb3 checker"))),
+    "checkers": Process((library_checkers.run_gymnasium_checker, library_checkers.run_sb3_checker)),
 }
 """The child processes; the last one loads torch, and waits for a place."""
 
 CHECKERS = ("gymnasium checker", "sb3 checker")
 
 MODULES = (
-    *(loading, observations, spaces, redundancy, hidden_goal, interface, misuse, display, determinism, isolation),
+    *(loading, observations, spaces, redundancy, hidden_goal, interface, attributes, misuse, determinism, isolation),
     *(resources, episodes, rewards, reward_incentives, reward_terms, success, hindsight, actions),
     *(physics, physics_source, speed),
 )

@@ -35,7 +35,7 @@ def observation_rows(records: Records) -> list[Row]:
     rows: list[Row] = []
     for index, leaf in enumerate(built.leaves if built else ()):
         if built is not None and leaf.low is not None and leaf.high is not None:
-            seen = _seen([t.observations[index].values for t in records.trajectories if index in t.observations], leaf)
+            seen = _seen([t.observations[index].values for t in records.alone if index in t.observations], leaf)
             for name, part in _parts(built, leaf):
                 rows.append(_row(name, np.ravel(leaf.low)[part], np.ravel(leaf.high)[part], seen, part))
     return rows

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.check_env.evidence import Evidence, Trajectory
+from rlctl.check_env.families.determinism import compare as compared
 from rlctl.check_env.finding import NotApplicable, NotJudged, Severity
 from rlctl.check_env.legacy import Seen, rule
-from rlctl.check_env.rules.determinism import compared
 from rlctl.check_env.rules.reward_terms import constants
 from rlctl.check_env.rules.tried import (
     DISCOUNT,

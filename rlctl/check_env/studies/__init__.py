@@ -43,27 +43,14 @@ class Study:
 
 
 STUDIES = (
-    Study("comparisons", "probe", 6.0, "lives:comparisons"),
-    Study("global random", "probe", 0.5, "global_random:global_random"),
     Study("speed", "probe", 1.5, "speed:speed"),
-    Study("episodes", "probe", 6.0, "lives:episodes"),
     Study("starts", "probe", 1.0, "starts:starts"),
     Study("search", "probe", 3.0, "search:search"),
     Study("hindsight", "probe", 0.3, "hindsight:hindsight"),
-    Study("leaks", "probe", 3.0, "leaks:leaks"),
-    Study("after the end", "probe", 0.5, "misuse:after_end", provokes=True),
-    Study("instances", "instances", 10.0, "lives:instances"),
     Study("worlds", "instances", 4.0, "worlds:worlds"),
     Study("action effects", "instances", 4.0, "action_effects:action_effects"),
-    Study("attributes", "instances", 1.0, "attributes:attributes"),
-    Study("worker build", "instances", 3.0, "worker_build:worker_build"),
     Study("out of range", "instances", 0.5, "action_effects:out_of_range", provokes=True),
-    Study("step before reset", "instances", 0.3, "misuse:step_before_reset", provokes=True),
-    Study("close twice", "instances", 0.3, "misuse:close_twice", provokes=True),
-    Study("rendering", "instances", 1.0, "rendering:rendering", provokes=True),
     Study("nan action", "instances", 0.3, "action_effects:nan_action", provokes=True),
-    Study("gymnasium checker", "checkers", 10.0, "library_checkers:gymnasium_checker"),
-    Study("sb3 checker", "checkers", 10.0, "library_checkers:sb3_checker"),  # loads torch, which takes seconds
 )
 
 LIVES = ("comparisons", "episodes", "instances")

@@ -1,4 +1,7 @@
-"""Runs Gymnasium's and Stable-Baselines3's own checkers; what they say becomes plain data, never a traceback."""
+"""RL2, libraries: what Gymnasium's and Stable-Baselines3's own checkers say, as plain data, never a traceback.
+
+Which rule owns what of it is in rules.yaml; `check_env.complaints` makes findings of it.
+"""
 
 from __future__ import annotations
 
@@ -13,28 +16,28 @@ from types import TracebackType
 from typing import Any
 
 from rlctl.check_env.context import Context
-from rlctl.check_env.evidence import GYMNASIUM, RAISED, SB3
+from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import describe
-from rlctl.check_env.messages import Checked, Complaint, Message
+from rlctl.check_env.messages import GYMNASIUM, RAISED, SB3, Checked, Complaint, Message
 
 _LIBRARIES = re.compile(r"[/\\](gymnasium|stable_baselines3|rlctl[/\\]check_env)[/\\](?!envs[/\\])")
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _LONGEST = 400  # characters
 
-Complaints = list[dict[str, str]]
 
-
-def gymnasium_checker(context: Context) -> Iterator[Message]:
+@experiment("gymnasium checker", share=10.0)
+def run_gymnasium_checker(context: Context) -> Iterator[Message]:
     """Run Gymnasium's checker on an instance of its own."""
-    yield _message(GYMNASIUM, context, _gymnasium_checker)
+    yield _run(GYMNASIUM, context, _load_gymnasiums)
 
 
-def sb3_checker(context: Context) -> Iterator[Message]:
+@experiment("sb3 checker", share=10.0)
+def run_sb3_checker(context: Context) -> Iterator[Message]:
     """Run Stable-Baselines3's checker on an instance of its own."""
-    yield _message(SB3, context, _sb3_checker)
+    yield _run(SB3, context, _load_sb3s)  # loads torch, which takes seconds
 
 
-def _gymnasium_checker() -> Callable[[Any], None]:
+def _load_gymnasiums() -> Callable[[Any], None]:
     from gymnasium.utils.env_checker import check_env
 
     def check(env: Any) -> None:
@@ -48,7 +51,7 @@ def _gymnasium_checker() -> Callable[[Any], None]:
     return check
 
 
-def _sb3_checker() -> Callable[[Any], None]:
+def _load_sb3s() -> Callable[[Any], None]:
     from stable_baselines3.common.env_checker import check_env
 
     return lambda env: check_env(_without_gymnasiums_wrappers(env))
@@ -63,9 +66,9 @@ def _without_gymnasiums_wrappers(env: Any) -> Any:
     return env
 
 
-def _message(name: str, context: Context, load: Callable[[], Callable[[Any], None]]) -> Message:
+def _run(name: str, context: Context, load: Callable[[], Callable[[Any], None]]) -> Message:
     problem = None
-    complaints: Complaints = []
+    complaints: list[tuple[str, str]] = []
     try:
         checker = load()
     except Exception as error:
@@ -73,28 +76,28 @@ def _message(name: str, context: Context, load: Callable[[], Callable[[Any], Non
     else:
         env = context.build().env
         context.progress.enter("check")
-        complaints = complaints_of(checker, env)
+        complaints = collect_complaints(checker, env)
         context.progress.leave()
-    return Checked(name, problem, [Complaint(name, **each) for each in complaints])
+    return Checked(name, problem, [Complaint(name, *each) for each in complaints])
 
 
-def complaints_of(checker: Callable[[Any], None], env: Any) -> Complaints:
-    """Run a checker on an environment and return what it said; warnings of other code are left out."""
-    complaints: Complaints = []
-    home = _home(env)
-    with warnings.catch_warnings(record=True) as told:
+def collect_complaints(checker: Callable[[Any], None], env: Any) -> list[tuple[str, str]]:
+    """Run a checker on an environment and return what it said: kind and text; warnings of other code are left out."""
+    complaints: list[tuple[str, str]] = []
+    home = _find_home(env)
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             checker(env)
         except BaseException as error:  # an environment may raise anything, SystemExit too
-            complaints.append({"kind": "error", "text": _text(error, home)})
+            complaints.append(("error", _describe(error, home)))
         finally:
             _close(env, complaints, home)
-    said = [str(each.message) for each in told if _LIBRARIES.search(each.filename)]
-    return [{"kind": "warning", "text": _clean(text)} for text in dict.fromkeys(said)] + complaints
+    texts = [str(each.message) for each in caught if _LIBRARIES.search(each.filename)]
+    return [("warning", _clean(text)) for text in dict.fromkeys(texts)] + complaints
 
 
-def _home(env: Any) -> str:
+def _find_home(env: Any) -> str:
     """Return the folder of the package that the environment's class is written in, or its file."""
     try:
         file = Path(inspect.getfile(type(getattr(env, "unwrapped", env))))
@@ -104,23 +107,23 @@ def _home(env: Any) -> str:
     return f"{packages[-1]}{os.sep}" if packages else str(file)
 
 
-def _close(env: Any, complaints: Complaints, home: str) -> None:
+def _close(env: Any, complaints: list[tuple[str, str]], home: str) -> None:
     if not hasattr(env, "close"):
         return
     try:
         env.close()
     except BaseException as error:
-        complaints.append({"kind": "error", "text": _text(error, home)})
+        complaints.append(("error", _describe(error, home)))
 
 
-def _text(error: BaseException, home: str) -> str:
-    if _from_environment(error.__traceback__, home):
+def _describe(error: BaseException, home: str) -> str:
+    if _is_of_environment(error.__traceback__, home):
         return RAISED + describe(error)
     text = _clean(str(error)) or "no message"
     return text if isinstance(error, AssertionError) else f"{type(error).__name__}: {text}"
 
 
-def _from_environment(trace: TracebackType | None, home: str) -> bool:
+def _is_of_environment(trace: TracebackType | None, home: str) -> bool:
     """Say whether an exception passed through code that is neither a checker's nor a library's below it."""
     files = [frame.filename for frame in traceback.extract_tb(trace)]
     if home and not _LIBRARIES.search(home) and any(file.startswith(home) for file in files):

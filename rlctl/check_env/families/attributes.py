@@ -1,0 +1,241 @@
+"""RL2, what other code reads from an environment: attributes, spaces, pictures; and windows that nobody asked for."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import sys
+import textwrap
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from rlctl.check_env.bullet_clients import connected
+from rlctl.check_env.context import Context, RenderMode
+from rlctl.check_env.experiment import RECORDING, check, experiment
+from rlctl.check_env.failures import EnvironmentRaised, describe
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.instance import Instance
+from rlctl.check_env.leaves import pick
+from rlctl.check_env.messages import FIRST_SEED, Fact, Message, Skipped
+from rlctl.check_env.no_display import NO_DISPLAY, lost_display
+from rlctl.check_env.records import Records
+
+SPACES = ("action_space", "observation_space")
+PICTURES: dict[RenderMode, str] = {"rgb_array": "a uint8 array of shape (height, width, 3)", "ansi": "a str"}
+"""The render modes that open no window, and what `render` returns in them."""
+NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)
+"""What is raised where this machine has no graphics: whether it works elsewhere is not known."""
+NO_GRAPHICS_FIX = (
+    "Render without a display: with MuJoCo set MUJOCO_GL=egl (or osmesa), with pygame SDL_VIDEODRIVER=dummy; with "
+    "PyBullet use getCameraImage(renderer=p.ER_TINY_RENDERER)."
+)
+
+
+@experiment("attributes", "RL214", "RL404", "RL216")
+def read_attributes(context: Context) -> Iterator[Message]:
+    """Read one instance that was reset, and a second one beside it."""
+    with context.fresh() as instance:
+        if _count_windows():
+            evidence = {"value": "GUI", "expected": "DIRECT"}
+            yield Finding("RL216", "PyBullet was connected with a window (p.GUI)", evidence)
+        instance.reset(FIRST_SEED)
+        yield Fact("truncation", read_truncation(_inner(instance.env)))
+        if not instance.is_env:
+            for rule in ("RL214", "RL404"):
+                yield Skipped(rule, "it is not a gymnasium.Env (RL003)")
+            return
+        yield from _attribute_problems(instance.env)
+        with context.fresh() as other:
+            yield from _shared_spaces(instance, other)
+
+
+def _inner(env: Any) -> Any:
+    try:
+        return env.unwrapped
+    except Exception:  # is one of the problems
+        return env
+
+
+def _count_windows() -> int:
+    pybullet = sys.modules.get("pybullet")
+    if pybullet is None:
+        return 0
+    methods = [pybullet.getConnectionInfo(physicsClientId=each)["connectionMethod"] for each in connected()]
+    return methods.count(pybullet.GUI)
+
+
+def _attribute_problems(env: Any) -> Iterator[Finding]:
+    for problem in _problems(env):
+        yield Finding("RL214", problem, {"value": problem})
+    for name in SPACES:
+        if getattr(env, name, None) is not getattr(env, name, None):
+            problem = f"{name} is a new object each time it is read, so that seeding it has no effect"
+            yield Finding("RL214", problem, {"value": problem}, Severity.WARNING)
+
+
+def _problems(env: Any) -> Iterator[str]:
+    for name in ("unwrapped", "metadata", "render_mode", *SPACES):
+        try:
+            getattr(env, name)
+        except Exception as error:
+            yield f"{name} raises {describe(error)}"
+    inner = _inner(env)
+    if inner is None:
+        yield "unwrapped is None"
+        return
+    metadata = getattr(inner, "metadata", {})
+    if not isinstance(metadata, dict):
+        yield f"metadata is a {type(metadata).__name__}, not a dict"
+    try:
+        generator = getattr(inner, "np_random", None)
+    except Exception as error:
+        yield f"np_random raises {describe(error)}"
+        return
+    # Gymnasium's own older environments hand out a subclass of the Generator.
+    if generator is not None and not isinstance(generator, np.random.Generator):
+        kind = type(generator)
+        yield f"np_random is a {kind.__module__}.{kind.__name__}, not a numpy.random.Generator"
+
+
+def _shared_spaces(one: Instance, other: Instance) -> Iterator[Finding]:
+    objects, generators = [], []
+    for name in SPACES:
+        a, b = getattr(one.env, name, None), getattr(other.env, name, None)
+        if a is None or b is None:
+            continue
+        if a is b:
+            objects.append(name)
+        elif any(_generator(part) is _generator(twin) is not None for part, twin in _parts(one, name, a, b)):
+            generators.append(name)
+    if objects:
+        yield _shared(objects, f"two instances have one object as {' and '.join(objects)}")
+    if generators:
+        named = " and ".join(f"the {name}'s random generator" for name in generators)
+        yield _shared(generators, f"two instances share {named}")
+
+
+def _shared(names: list[str], message: str) -> Finding:
+    # Nobody samples observations.
+    severity = Severity.WARNING if "action_space" in names else Severity.INFO
+    return Finding("RL404", message, {"value": names, "expected": []}, severity)
+
+
+def _parts(one: Instance, name: str, a: Any, b: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield the two spaces, and the spaces inside them, in pairs."""
+    yield a, b
+    for leaf in one.action_leaves if name == "action_space" else one.leaves:
+        try:
+            yield pick(a, leaf.path), pick(b, leaf.path)
+        except (LookupError, TypeError):
+            continue
+
+
+def _generator(space: Any) -> Any:
+    return getattr(space, "np_random", None)
+
+
+def read_truncation(env: Any) -> str:
+    """Return what the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
+    step = getattr(type(env), "step", None)
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(step)))  # type: ignore[arg-type]
+    except (OSError, TypeError, SyntaxError):
+        return "unknown"
+    returned = [
+        node.value.elts[3]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple) and len(node.value.elts) == 5
+    ]
+    if not returned:
+        return "unknown"
+    return "never" if all(_is_false(tree, each) for each in returned) else "computed"
+
+
+def _is_false(tree: ast.AST, value: ast.expr) -> bool:
+    if isinstance(value, ast.Constant):
+        return value.value is False
+    if not isinstance(value, ast.Name):
+        return False
+    assigned = [
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign)
+        and any(isinstance(each, ast.Name) and each.id == value.id for each in node.targets)
+    ]
+    return bool(assigned) and all(isinstance(each, ast.Constant) and each.value is False for each in assigned)
+
+
+@experiment("rendering", "RL215", provokes="rendering without a window")
+def render(context: Context) -> Iterator[Message]:
+    """Try each promised render mode that opens no window, on an instance of its own."""
+    with context.fresh() as instance:
+        metadata = getattr(instance.env, "metadata", None)
+        modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
+    promised = [str(mode) for mode in modes] if isinstance(modes, (list, tuple, set)) else []
+    if not set(promised) & set(PICTURES):
+        raise NotApplicable(f"promises no render mode that needs no window ({promised or 'none'})")
+    for mode in PICTURES:
+        if mode in promised:
+            yield from _render_in(context, mode)
+
+
+def _render_in(context: Context, mode: RenderMode) -> Iterator[Finding]:
+    try:
+        with context.fresh(mode) as instance:
+            instance.reset(FIRST_SEED)
+            picture = instance.call("render", instance.env.render)
+    except EnvironmentRaised as error:
+        cause = error.__cause__ or error
+        if _is_missing(cause):
+            raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
+        call = "the constructor" if error.call == "build" else error.call
+        yield _of_mode(mode, f"{call} raises {describe(cause)}", describe(cause))
+        return
+    if wrong := _describe_wrong_picture(mode, picture):
+        yield _of_mode(mode, f"render returns {wrong}, not {PICTURES[mode]}", wrong)
+    elif mode == "rgb_array" and picture.size and (picture == picture[0, 0]).all():
+        colour = f"({', '.join(str(int(part)) for part in picture[0, 0])})"
+        yield _of_mode(mode, f"the picture after reset is all of one colour, {colour}", colour, Severity.INFO)
+
+
+def _of_mode(mode: RenderMode, what: str, value: str, severity: Severity | None = None) -> Finding:
+    evidence = {"mode": mode, "value": value, "expected": PICTURES[mode]}
+    message = f"with render_mode={mode!r} {what}"
+    if " raises " in what and NO_GRAPHICS.search(value):
+        return Finding("RL215", message, evidence, Severity.INFO, NO_GRAPHICS_FIX)
+    return Finding("RL215", message, evidence, severity)
+
+
+def _is_missing(error: BaseException | None) -> bool:
+    """Say whether a library is missing: that is this machine's fault, not the environment's."""
+    while error is not None:
+        if isinstance(error, ImportError) or type(error).__name__ == "DependencyNotInstalled":
+            return True
+        error = error.__cause__
+    return False
+
+
+def _describe_wrong_picture(mode: RenderMode, picture: Any) -> str:
+    if mode == "ansi":
+        # Gymnasium's API allows a string or a StringIO.
+        fine = isinstance(picture, str) or hasattr(picture, "getvalue")
+        return "" if fine else f"a {type(picture).__name__}"
+    if not isinstance(picture, np.ndarray):
+        return f"a {type(picture).__name__}"
+    fine = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
+    return "" if fine else f"an array of {picture.dtype} and shape {picture.shape}"
+
+
+@check("RL216", *RECORDING)
+def find_lost_display(records: Records) -> Iterator[Finding]:
+    for failure in records.failures:
+        if lost_display(failure):
+            line = next(line for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)).strip()
+            doing = {"load": "the import", "build": "the constructor"}.get(failure.call, failure.call)
+            message = f"the process {failure.error} in {doing}, for want of a display: {line!r}"
+            yield Finding("RL216", message, failure.place)
+            return
+    records.require_built()

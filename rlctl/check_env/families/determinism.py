@@ -1,0 +1,181 @@
+"""RL3: equal seeds and equal actions give equal episodes.
+
+Without it no result can be repeated, no failed episode reproduced, and no run resumed exactly. The rules go from the
+simplest cause to the farthest; where a nearer one explains a difference, the farther ones are not judged.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from rlctl.check_env.comparison import Difference, find_difference
+from rlctl.check_env.context import Context
+from rlctl.check_env.episode import Episode
+from rlctl.check_env.experiment import check, experiment
+from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message, Skipped, Trajectory
+from rlctl.check_env.recording import Plan, Recording
+from rlctl.check_env.records import Records
+
+COMPARED_STEPS = 300
+"""How far comparisons go."""
+DIRTY_STEPS = 37
+"""How far the other episode goes, at most, that is left unfinished before a repetition."""
+WATCHED_STEPS = 30
+"""For how many steps the process's random generators are compared."""
+FEWEST_SEEDS = 4
+LATE = 20
+"""What an unfinished episode changes only after so many steps is a residue, not the episode's start [steps]."""
+NO_TIME = "the first comparisons took all the time there is for them"
+
+
+@experiment("comparisons", share=6.0)
+def compare_repetitions(context: Context) -> Iterator[Message]:
+    """Play the first episode again: at once, after an unfinished other one, and with another seed."""
+    instance, budget = context.instance, context.budget
+    longest_s = budget.seconds_left / 4
+    steps = COMPARED_STEPS
+    for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
+        instance.progress.phase(role)
+        if role == "dirty":
+            unfinished = min(DIRTY_STEPS, max(1, steps // 2))
+            Recording(instance, Plan(role, 0, SECOND_SEED, "extreme", max_steps=unfinished, max_s=1.0), budget).run()
+        if budget.seconds_left < 0:
+            yield Skipped(role, NO_TIME)
+            continue
+        seed = SECOND_SEED if role == "seeds" else FIRST_SEED
+        recording = Recording(
+            instance, Plan(role, number, seed, "random", FIRST_SEED, COMPARED_STEPS, longest_s), budget
+        )
+        yield from recording.run()
+        steps = min(steps, recording.steps)
+    for number, role in enumerate(("unseeded", "unseeded again")):
+        if budget.seconds_left < 0:
+            yield Skipped(role, NO_TIME)
+        else:
+            plan = Plan(role, number, FIRST_SEED, max_steps=0, then_unseeded=True)
+            yield from Recording(instance, plan, budget).run()
+
+
+def compare(records: Records, first: str, second: str) -> tuple[Trajectory, Difference | None]:
+    """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
+    built = records.require_built()
+    if not built.accepts_seed:
+        raise NotJudged("reset takes no seed (RL202)")
+    a, b = records.require_role(first), records.require_role(second)
+    if "raised" in (a.ended, b.ended):
+        raise NotJudged("the episode raised (RL207)")
+    if not any(series.values.size for series in a.observations.values()):
+        raise NotJudged("no observation could be compared")
+    return a, find_difference(built, a, b)
+
+
+def require_repeatable(records: Records) -> None:
+    """Raise `NotJudged` if an instance's own repetition of an episode differs."""
+    if compare(records, "alone", "reused")[1] is not None:
+        raise NotJudged("the same instance already differs from itself (RL301, RL302)")
+
+
+def _report(
+    rule: str, records: Records, trajectory: Trajectory, difference: Difference, what: str, *, is_mild: bool = False
+) -> Finding:
+    severity = Severity.WARNING if difference.is_small or is_mild else None
+    if records.require_built().nondeterministic:
+        severity = Severity.INFO  # its registration says so
+    return Finding(rule, f"{what}: {difference.text()}", difference.evidence(trajectory), severity)
+
+
+@check("RL301", "comparisons")
+def compare_starts(records: Records) -> Iterator[Finding]:
+    trajectory, difference = compare(records, "alone", "reused")
+    if difference is not None and difference.step == 0:
+        yield _report("RL301", records, trajectory, difference, "reset twice with one seed")
+
+
+@check("RL302", "comparisons")
+def compare_trajectories(records: Records) -> Iterator[Finding]:
+    trajectory, difference = compare(records, "alone", "reused")
+    if difference is not None and difference.step > 0:
+        yield _report("RL302", records, trajectory, difference, "played twice by one instance")
+
+
+@check("RL303", "comparisons")
+def compare_after_other_episode(records: Records) -> Iterator[Finding]:
+    require_repeatable(records)
+    trajectory, difference = compare(records, "alone", "dirty")
+    if difference is not None:
+        what = "played again after an unfinished other episode"
+        yield _report("RL303", records, trajectory, difference, what, is_mild=difference.step > LATE)
+
+
+@check("RL304", "comparisons", "instances")
+def compare_instances(records: Records) -> Iterator[Finding]:
+    trajectory, difference = compare(records, "fresh process", "fresh instance")
+    if difference is not None:
+        require_repeatable(records)
+        yield _report("RL304", records, trajectory, difference, "played by a second instance in one process")
+
+
+@check("RL305", "comparisons", "instances")
+def compare_processes(records: Records) -> Iterator[Finding]:
+    trajectory, difference = compare(records, "alone", "fresh process")
+    if difference is not None:
+        require_repeatable(records)
+        yield _report("RL305", records, trajectory, difference, "played by a new process")
+
+
+@check("RL306", "comparisons", "episodes")
+def compare_seeds(records: Records) -> Iterator[Finding]:
+    built = records.require_built()
+    trajectory, difference = compare(records, "alone", "seeds")
+    if difference is not None:
+        return
+    starts = [each for each in records.require_alone() if 0 in each.observations and len(each.observations[0].steps)]
+    seeds = len({each.seed for each in starts})
+    if seeds < FEWEST_SEEDS:
+        raise NotJudged(f"fewer than {FEWEST_SEEDS} seeds were tried")
+    for index, _ in enumerate(built.leaves):
+        values = [each.observations[index].values[0] for each in starts if index in each.observations]
+        if any(not np.array_equal(values[0], other) for other in values[1:]):
+            return
+    message = f"{seeds} seeds give one start, and with the same actions one trajectory of {trajectory.steps} steps"
+    yield Finding("RL306", message, {"seeds": seeds, "value": 1, "expected": seeds})
+
+
+@check("RL308", "comparisons")
+def compare_unseeded(records: Records) -> Iterator[Finding]:
+    trajectory, difference = compare(records, "unseeded", "unseeded again")
+    if difference is not None:
+        require_repeatable(records)
+        what = "reset with a seed and then without one, twice"
+        yield _report("RL308", records, trajectory, difference, what)
+
+
+@experiment("global random", "RL309", share=0.5)
+def compare_generators(context: Context) -> Iterator[Message]:
+    """Play the beginning of an episode, and say which generators of the whole process it moves, and where first."""
+    moved: set[str] = set()
+    episode = Episode(context.instance, FIRST_SEED, max_steps=WATCHED_STEPS, deadline=context.budget.deadline)
+    before = _generator_states()
+    for moment in episode:
+        after = _generator_states()
+        for generator, state in after.items():
+            if state != before.get(generator, state) and generator not in moved:
+                moved.add(generator)
+                call, at = ("step", f" at step {moment.step}") if moment.step else ("reset", "")
+                evidence = {"generator": generator, "call": call, "step": moment.step}
+                yield Finding("RL309", f"{call} moves the global generator {generator}{at}", evidence)
+        before = _generator_states()
+
+
+def _generator_states() -> dict[str, Any]:
+    kind, keys, position, *rest = np.random.get_state()  # noqa: NPY002 (this one is what is compared)
+    states = {"numpy.random": (kind, np.asarray(keys).tobytes(), position, *rest), "random": random.getstate()}
+    if "torch" in sys.modules:
+        states["torch"] = sys.modules["torch"].random.get_rng_state().numpy().tobytes()
+    return states

@@ -1,0 +1,250 @@
+"""RL5: how episodes end, and what comes after the end."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from rlctl.check_env.context import Context
+from rlctl.check_env.episode import Episode
+from rlctl.check_env.experiment import RECORDING, check, experiment
+from rlctl.check_env.failures import EnvironmentRaised
+from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.leaves import Leaf, leaf_name
+from rlctl.check_env.messages import ENDS, FIRST_SEED, Fact, Message, Trajectory
+from rlctl.check_env.recording import Notes, Plan, Recording
+from rlctl.check_env.records import Records
+
+EPISODES = (
+    *("random", "zero", "extreme", "random", "random", "random"),
+    *("extreme", "zero", "random", "rare", "extreme", "random", "extreme", "rare"),
+    *("repeated", "repeated"),
+)
+"""How the actions of each episode are chosen; the first three come first, in case time runs out."""
+ENDLESS_STEPS = 10_000
+"""After so many steps an episode without an end is cut."""
+LATER_ENDLESS_STEPS = 1_000
+"""The same, once every kind of action was tried."""
+MOST_FAILURES = 3
+LONGEST_EPISODE = 2_000
+"""An episode that does not end within so many random steps is left [steps]."""
+STEPS_AFTER = 5
+"""A body that falls on for a few steps leaves its space by little; what does so by more than its width in these is not
+physics any more [steps]."""
+MUCH_LARGER = 10.0
+"""A reward so many times larger than any before, or than 1, comes from a state that no episode has."""
+
+FEWEST_EPISODES = 6
+SHORTEST_LIMIT = 5
+"""Games of fewer steps that always end together are games, not time limits [steps]."""
+FEWEST_TIES = 4
+SHORTEST_TIE = 20
+"""The same, where only some episodes end together [steps]."""
+ENOUGH_STEPS = 1_000
+"""An episode that was cut earlier says nothing about whether it would end [steps]."""
+
+
+@experiment("episodes", share=6.0)
+def record_episodes(context: Context) -> Iterator[Message]:
+    """Play whole episodes with actions of every kind."""
+    instance, budget = context.instance, context.budget
+    failures = cut = 0
+    for number, kind in enumerate(EPISODES):
+        if budget.seconds_left < 0 or budget.bytes_left < 0:
+            what = "time" if budget.seconds_left < 0 else "memory"
+            raise NotJudged(f"{number} of {len(EPISODES)} episodes were played in the {what} there is")
+        longest = LATER_ENDLESS_STEPS if number >= 3 and cut else ENDLESS_STEPS
+        plan = Plan("episodes", number, FIRST_SEED + number, kind, max_steps=longest, max_s=budget.seconds_left / 2)
+        recording = Recording(instance, plan, budget)
+        yield from recording.run()
+        cut += recording.was_cut
+        failures += recording.failure is not None
+        if failures >= MOST_FAILURES:
+            raise NotJudged(f"stopped after {MOST_FAILURES} episodes that raised")
+
+
+def _require_episodes(records: Records) -> list[Trajectory]:
+    """Return the whole episodes that can be judged: those that did not raise."""
+    episodes = [each for each in records.episodes if each.ended != "raised"]
+    if not episodes:
+        raise NotJudged(records.skipped.get("episodes", "no episode could be played"))
+    return episodes
+
+
+def _require_two_flags(episodes: Sequence[Trajectory]) -> None:
+    if any(form.what == "step" for each in episodes for form in each.forms):
+        raise NotJudged("step returns one flag for both (RL201)")
+
+
+@check("RL501", "episodes", "search")
+def find_time_limit_as_terminated(records: Records) -> Iterator[Finding]:
+    episodes = _require_episodes(records)
+    _require_two_flags(episodes)
+    if any(each.ended in ("truncated", "both") for each in episodes):
+        return
+    ended = [each for each in episodes if each.ended == "terminated"]
+    limit = max((each.steps for each in ended), default=0)
+    longer = [each for each in episodes if each.ended not in ENDS] + records.role("search")
+    if any(each.steps > limit for each in longer):
+        return
+    if len(ended) < FEWEST_EPISODES or len({each.actions for each in ended}) < 2:
+        raise NotJudged(f"only {len(ended)} episodes ended")
+    ties = [each for each in ended if each.steps == limit]
+    of = {"episodes": len(ties), "of": len(episodes)}
+    evidence = {"step": limit, **of, "value": "terminated", "expected": "truncated"}
+    if limit >= SHORTEST_LIMIT and len(ties) == len(episodes):
+        message = f"all {len(ties)} episodes, whatever the actions, end at step {limit} with terminated=True"
+        if all(_ends_with_odd_reward(each) for each in ties):
+            message += ", and with a reward unlike any before: a time limit, or an obstacle that none of them passes"
+            yield Finding("RL501", message, evidence, Severity.WARNING)
+        else:
+            yield Finding("RL501", message, evidence)
+    elif limit >= SHORTEST_TIE and len(ties) >= FEWEST_TIES and len({each.actions for each in ties}) > 1:
+        message = (
+            f"{len(ties)} of {len(episodes)} episodes end at step {limit} with terminated=True, and none is longer"
+        )
+        yield Finding("RL501", message, evidence, Severity.WARNING)
+
+
+def _ends_with_odd_reward(episode: Trajectory) -> bool:
+    """Say whether the last reward is outside of what all others are: an obstacle that was hit, not a clock."""
+    before, last = episode.rewards[:-1], episode.rewards[-1]
+    return bool(before.size and (last < before.min() or last > before.max()))
+
+
+@check("RL502", "episodes")
+def find_both_flags(records: Records) -> Iterator[Finding]:
+    episodes = _require_episodes(records)
+    both = [each for each in episodes if each.ended == "both"]
+    if len(both) >= 2 and not any(each.ended == "truncated" for each in episodes):
+        message = f"{len(both)} episodes end with terminated=True and truncated=True, none with truncated alone"
+        evidence = {**both[0].place, "step": both[0].steps, "value": len(both), "expected": 0}
+        yield Finding("RL502", message, evidence)
+
+
+@check("RL503", "episodes")
+def find_endless(records: Records) -> Iterator[Finding]:
+    limit, episodes = records.require_built().max_steps, _require_episodes(records)
+    if any(each.ended == "truncated" for each in episodes):
+        return
+    longest: dict[str, int] = {}
+    for each in episodes:
+        if not each.has_ended:
+            longest[each.actions] = max(longest.get(each.actions, 0), each.steps)
+    if not any(longest.values()):
+        return
+    if max(longest.values()) < (limit or ENOUGH_STEPS):
+        raise NotJudged(f"no end within {max(longest.values())} steps, and there was no time for more")
+    declared = f", past its own limit of {limit}" if limit else " and no time limit is known"
+    steps = ", ".join(f"{count:,} with {kind} actions" for kind, count in longest.items())
+    yield Finding("RL503", f"no end within {steps}{declared}", {"steps": longest, "expected": limit})
+
+
+@check("RL504", "episodes")
+def find_end_at_once(records: Records) -> Iterator[Finding]:
+    episodes = _require_episodes(records)
+    if len(episodes) >= FEWEST_EPISODES and all(each.has_ended and each.steps == 1 for each in episodes):
+        message = f"all {len(episodes)} episodes end on step 1"
+        yield Finding("RL504", message, {"step": 1, "episodes": len(episodes)})
+
+
+@check("RL506", "episodes", "search", "attributes")
+def find_no_time_limit(records: Records) -> Iterator[Finding]:
+    built, episodes = records.require_built(), _require_episodes(records)
+    if built.max_steps is not None or any(each.ended != "terminated" for each in episodes):
+        return  # those that did not end are RL503's
+    lengths = [each.steps for each in episodes]
+    is_continuous = any(leaf.kind == "Box" for leaf in built.leaves)
+    if len(set(lengths)) == 1 or (max(lengths) < SHORTEST_TIE and not is_continuous):
+        return  # a bandit, or a game of a few moves
+    _require_two_flags(episodes)
+    if list(find_time_limit_as_terminated.run(records)):
+        raise NotJudged("a time limit seems to be flagged as terminated (RL501)")
+    truncation = records.require_fact("truncation", "attributes")
+    if truncation == "computed":
+        return  # its limit was not reached
+    why = "step always returns truncated=False" if truncation == "never" else "none is declared or was reached"
+    message = f"no time limit: {why}; all {len(episodes)} episodes ended with terminated=True, the longest after "
+    evidence = {"episodes": len(episodes), "value": None, "expected": "max_episode_steps", "step": max(lengths)}
+    severity = Severity.WARNING if is_continuous and truncation == "never" else Severity.INFO
+    yield Finding("RL506", f"{message}{max(lengths)} steps", evidence, severity)
+
+
+@experiment("after the end", "RL505", share=0.5, provokes="a step after the episode's end")
+def step_after_end(context: Context) -> Iterator[Message]:
+    """Play an episode to its end, and step on."""
+    instance, budget = context.instance, context.budget
+    episode = Episode(instance, FIRST_SEED, max_steps=LONGEST_EPISODE, deadline=budget.deadline)
+    for _ in episode:
+        pass
+    if episode.ended not in ENDS:
+        raise NotJudged("the episode did not come to an end")
+    end, notes = episode.steps, Notes(instance)
+    try:
+        while episode.steps < end + STEPS_AFTER:
+            notes.add(episode.step())
+    except EnvironmentRaised:
+        pass  # refused, as it should be
+    yield Fact("end", end)
+    yield notes.trajectory("after the end", 0, FIRST_SEED, "random", "steps")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Problem:
+    """A number that is not an observation or a reward."""
+
+    kind: str
+    """`shape`, `not finite` or `outside`."""
+    text: str
+    step: int
+    value: str
+    expected: str
+
+
+@check("RL505", *RECORDING, "after the end")
+def find_nonsense_after_end(records: Records) -> Iterator[Finding]:
+    end, leaves = records.require_fact("end", "after the end"), records.require_built().leaves
+    after, alone = records.require_role("after the end"), records.require_alone()
+    # RL101, RL103, RL104 and RL601 have what whole episodes have already.
+    known = {problem.kind for each in alone for problem in _problems(each, leaves, widths=0.0)}
+    problems = [each for each in _problems(after, leaves, widths=1.0, first=end + 1) if each.kind not in known]
+    if problems:
+        worst = min(problems, key=lambda each: each.step)
+        message = f"{worst.text} at step {worst.step}, after the end at step {end}; it should be {worst.expected}"
+        evidence = {"seed": after.seed, "step": worst.step, "value": worst.value, "expected": worst.expected}
+        yield Finding("RL505", message, evidence)
+        return
+    finite = np.where(np.isfinite(after.rewards), after.rewards, 0.0)
+    largest = max((float(np.nanmax(np.abs(each.rewards), initial=0.0)) for each in alone), default=0.0)
+    if finite.size and np.abs(finite).max() > MUCH_LARGER * max(largest, 1.0):
+        at = int(np.abs(finite).argmax())
+        message = (
+            f"a step after the episode's end is rewarded with {finite[at]:.6g}; no step before was with more than "
+            f"{largest:.6g}"
+        )
+        evidence = {"seed": after.seed, "step": end + 1 + at, "value": float(finite[at]), "expected": largest}
+        yield Finding("RL505", message, evidence)
+
+
+def _problems(trajectory: Trajectory, leaves: Sequence[Leaf], *, widths: float, first: int = 1) -> Iterator[_Problem]:
+    """Yield the first place of each problem. A value is outside if it is by so many times the width of its bounds;
+    `first` is the trajectory's first step."""
+    for step in (np.flatnonzero(trajectory.reward_is_number & ~np.isfinite(trajectory.rewards)) + first)[:1]:
+        value = str(trajectory.rewards[step - first])
+        yield _Problem("not finite", f"the reward is {value}", int(step), value, "a finite number")
+    for form in trajectory.forms:
+        if form.what == "observation" and form.leaf is not None and form.shape != leaves[form.leaf].shape:
+            leaf, shape = leaves[form.leaf], str(form.shape)
+            yield _Problem("shape", f"{leaf_name(leaf)} has shape {shape}", form.step, shape, str(leaf.shape))
+    for index, series in trajectory.observations.items():
+        leaf, values = leaves[index], series.values.astype(np.float64)
+        low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
+        with np.errstate(invalid="ignore"):
+            outside = np.maximum(low - values, values - high) > (widths * (high - low) if widths else 0.0)
+        for kind, wrong in (("not finite", ~np.isfinite(values)), ("outside", outside)):
+            for row, *at in np.argwhere(wrong)[:1].tolist():
+                value, place = values[(row, *at)], tuple(at)
+                bounds = f"[{low[place]:g}, {high[place]:g}]" if kind == "outside" else "a finite number"
+                yield _Problem(kind, f"{leaf_name(leaf)} is {value:g}", int(series.steps[row]), f"{value:g}", bounds)

@@ -1,0 +1,246 @@
+"""RL4, resources: what an instance takes it gives back, and it can be built where training builds it."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import dataclasses
+import gc
+import json
+import multiprocessing
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any
+
+from rlctl.check_env.actions import actions
+from rlctl.check_env.bullet_clients import connected
+from rlctl.check_env.context import Context
+from rlctl.check_env.episode import Episode
+from rlctl.check_env.experiment import check, experiment
+from rlctl.check_env.failures import EnvironmentRaised, describe, failure
+from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.messages import FIRST_SEED, Fact, Message
+from rlctl.check_env.records import Records
+
+MOST_RESETS = 100
+WARM_UP = 10
+"""Resets after which caches and allocators are filled; memory is measured from there on."""
+TRIAL_RESETS = 3
+"""So many are timed to see how many there is time for."""
+MARGIN = 0.7
+"""The part of the time that is planned with, since a leak makes resets slower."""
+FEWEST_RESETS = 8
+"""With fewer, growth cannot be distinguished from a slow start."""
+SETTLING_RESETS = 2
+"""The first resets load what later ones keep."""
+LEAST_GROWTH = 3
+"""In each half of the resets, so that one late object is not a leak."""
+FEWEST_RESETS_FOR_MEMORY = 30
+MEMORY_GROWTH = 8 * 2**20
+"""Over the resets after the warm-up [bytes]. Allocators of clean environments move by 1 to 2 MiB; 0.1 MB per reset
+fills the memory of 16 workers in a day."""
+LATER_SHARE = 0.4
+"""Of the growth, so much must be in the second half: what fills once slows down, a leak does not."""
+WORKER_HANG_S = 10.0
+"""A call in the worker that takes longer hangs: each took less than a second or two in this process, or its time
+would be over before this is tried [s]."""
+WORKER_S = 30.0
+
+_PROCESS = Path("/proc/self")
+
+
+@dataclasses.dataclass
+class Counts:
+    """What an instance holds after each of many resets."""
+
+    clients: list[int] = dataclasses.field(default_factory=list)
+    """PyBullet clients of the process."""
+    bodies: list[int] = dataclasses.field(default_factory=list)
+    """Bodies in the worlds of all clients."""
+    descriptors: list[int] = dataclasses.field(default_factory=list)
+    threads: list[int] = dataclasses.field(default_factory=list)
+    memory: list[int] = dataclasses.field(default_factory=list)
+    """Resident memory [bytes] once the warm-up is over, half way, and at the end; empty where it is not known."""
+    measured: list[int] = dataclasses.field(default_factory=list)
+    """After how many resets each of these was measured."""
+
+    def count(self) -> None:
+        """Count what is there now."""
+        clients = connected()
+        self.clients.append(len(clients))
+        pybullet = sys.modules.get("pybullet")
+        self.bodies.append(sum(pybullet.getNumBodies(physicsClientId=each) for each in clients) if pybullet else 0)
+        if _PROCESS.exists():
+            self.descriptors.append(len(os.listdir(_PROCESS / "fd")))
+            self.threads.append(len(os.listdir(_PROCESS / "task")))
+
+    def measure_memory(self) -> None:
+        """Note the resident memory, without what only waits to be collected."""
+        if not _PROCESS.exists():
+            return
+        gc.collect()
+        # What was freed before would otherwise be used again, and hide what is kept.
+        if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+            trim(0)
+        pages = int((_PROCESS / "statm").read_text().split()[1])
+        self.memory.append(pages * os.sysconf("SC_PAGE_SIZE"))
+        self.measured.append(len(self.clients))
+
+
+@experiment("leaks", "RL405", share=3.0)
+def count_after_resets(context: Context) -> Iterator[Message]:
+    """Reset the process's instance many times, with one step each, and count what it holds."""
+    counts = Counts()
+    instance, budget = context.instance, context.budget
+    gc.freeze()  # what there is already need not be looked through again and again
+    try:
+        begun, planned = budget.seconds_left, MOST_RESETS
+        while (done := len(counts.clients)) < planned and budget.seconds_left > 0:
+            for _ in Episode(instance, FIRST_SEED + done, number=done, max_steps=1):
+                pass
+            counts.count()
+            done += 1
+            if done == TRIAL_RESETS:
+                affordable = done * MARGIN * begun / max(1e-9, begun - budget.seconds_left)
+                planned = max(done, min(MOST_RESETS, int(affordable)))
+            if done in (WARM_UP, (WARM_UP + planned) // 2, planned):
+                counts.measure_memory()
+    except EnvironmentRaised as error:
+        yield failure(error, context.progress)
+    finally:
+        gc.unfreeze()
+    yield from find_growth(counts)
+
+
+def find_growth(counts: Counts) -> Iterator[Finding]:
+    """Yield what grows with every reset; raises `NotJudged` where there were too few of them."""
+    resets = len(counts.clients)
+    if resets < FEWEST_RESETS:
+        raise NotJudged(f"there was time for only {resets} resets")
+    for what, series, severity in (
+        ("PyBullet clients", counts.clients, Severity.ERROR),
+        ("bodies in the PyBullet world", counts.bodies, Severity.ERROR),
+        ("open file descriptors", counts.descriptors, Severity.WARNING),
+        ("threads", counts.threads, Severity.WARNING),
+    ):
+        if len(series) == resets and (growth := _growth(series)):
+            first, after = series[SETTLING_RESETS], resets - SETTLING_RESETS - 1
+            message = f"{what} grow with every reset: from {first} to {series[-1]} in {after} resets"
+            yield _report(message, what, series[-1], first, after, growth / after, severity)
+            return  # a client brings its own bodies, files, threads and memory
+    if len(counts.memory) == 3 and counts.measured[-1] >= FEWEST_RESETS_FOR_MEMORY:
+        start, middle, end = counts.memory
+        resets = counts.measured[-1] - counts.measured[0]
+        if end - start > MEMORY_GROWTH and end - middle > LATER_SHARE * (end - start):
+            message = (
+                f"memory grows with every reset: by {(end - start) / 2**20:.1f} MiB in {resets} resets, of which "
+                f"{(end - middle) / 2**20:.1f} MiB in the second half"
+            )
+            yield _report(message, "memory", end, start, resets, (end - start) / resets)
+
+
+def _growth(series: list[int]) -> int:
+    """Return by how much a count grows, if it does so all the time; else 0."""
+    series = series[SETTLING_RESETS:]
+    first, second = series[: len(series) // 2], series[len(series) // 2 :]
+    grows = all(half[-1] - half[0] >= LEAST_GROWTH for half in (first, second)) and min(second) >= max(first)
+    return series[-1] - series[0] if grows else 0
+
+
+def _report(
+    message: str, what: str, value: int, first: int, resets: int, per_reset: float, severity: Severity | None = None
+) -> Finding:
+    evidence = {"element": what, "value": value, "expected": first, "resets": resets, "per_reset": per_reset}
+    return Finding("RL405", message, evidence, severity)
+
+
+@experiment("worker build", share=3.0)
+def build_in_worker(context: Context) -> Iterator[Message]:
+    """Build, reset, step and close in a worker as Stable-Baselines3's SubprocVecEnv starts them: spawned, daemonic."""
+    spawn = multiprocessing.get_context("spawn")
+    ours, theirs = spawn.Pipe(duplex=False)
+    worker = spawn.Process(target=_work, args=(theirs, json.dumps(dataclasses.asdict(context.spec))), daemon=True)
+    worker.start()
+    theirs.close()
+    try:
+        call, error, details = _follow(ours, worker, context.budget.seconds_left)
+    finally:
+        ours.close()
+        worker.kill()
+        worker.join()
+    yield Fact("worker", {"call": call, "error": error, "details": details})
+
+
+def _follow(connection: Connection, worker: SpawnProcess, seconds_left: float) -> tuple[str, str, str | None]:
+    """Follow the worker to its end, or to where it fails; return its last call, what went wrong, and a traceback."""
+    deadline = time.monotonic() + min(WORKER_S, seconds_left)
+    call = "import"
+    while True:
+        left_s = deadline - time.monotonic()
+        limit_s = left_s if call == "import" else min(WORKER_HANG_S, left_s)
+        if not connection.poll(max(0.0, limit_s)):
+            if limit_s < WORKER_HANG_S or call == "import":
+                raise NotJudged("there was too little time for a worker process")
+            return call, f"did not come back in {limit_s:g} s", None
+        try:
+            message = json.loads(connection.recv_bytes())
+        except EOFError:
+            worker.join(5.0)
+            code = worker.exitcode
+            how = f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
+            return call, how, None
+        if "error" in message:
+            return call, f"raises {message['error']}", message["details"]
+        if message["call"] == "done":
+            return call, "", None
+        call = message["call"]
+
+
+def _work(connection: Connection, spec: str) -> None:
+    def send(**message: Any) -> None:
+        connection.send_bytes(json.dumps(message).encode())
+
+    try:
+        _play(json.loads(spec), lambda call: send(call=call))
+    except BaseException as error:  # `SystemExit` too: an environment may raise anything
+        send(error=describe(error), details=traceback.format_exc())
+    else:
+        send(call="done")
+
+
+def _play(spec: dict[str, Any], enter: Callable[[str], None]) -> None:
+    from rlctl import env_spec, registry
+
+    enter("load")
+    made_from = env_spec.EnvSpec(**spec)
+    registry.load(made_from.task)
+    enter("build")
+    env = made_from.make()
+    enter("reset")
+    env.reset()
+    enter("step")
+    env.step(next(actions(env.action_space, "random", FIRST_SEED)))
+    enter("close")
+    with contextlib.suppress(Exception):  # closing is tried elsewhere
+        env.close()
+
+
+@check("RL406", "worker build")
+def find_failure_in_worker(records: Records) -> Iterator[Finding]:
+    worker = records.require_fact("worker", "worker build")
+    if not worker["error"]:
+        return
+    if any(each.call in ("load", "build") for each in records.failures):
+        raise NotJudged("a second instance cannot be built at all (RL403)")
+    if any(each.call == worker["call"] for each in records.failures):
+        raise NotJudged(f"{worker['call']} fails outside of a worker, too")
+    doing = "the import" if worker["call"] in ("import", "load") else worker["call"]
+    details = {"traceback": worker["details"]} if worker["details"] else {}
+    message = f"in a spawned, daemonic worker {doing} {worker['error']}"
+    yield Finding("RL406", message, {"call": worker["call"], **details})
