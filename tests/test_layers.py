@@ -20,6 +20,7 @@ LAYERS = [
     {"run"},
     {"gym"},
     {"env_spec"},
+    {"dict_spaces"},
     {"named_task"},
     {"registry"},
     {"task"},

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.dict_spaces import Observations, take_row
 from rlctl.export.agreement import Agreement, Comparison
 from rlctl.rollout.collect import Episode, run_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Observations, Workers
+from rlctl.rollout.workers import Workers
 from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import BatchActor
 from rlctl.run.torch_policy import TorchPolicy
@@ -125,14 +126,8 @@ class _SideBySide:
         if rows[0] == 0:
             if starts[0]:
                 self._alone.reset()
-            self._comparison.add(expected[:1], self._alone.predict(_first(observations))[None])
+            self._comparison.add(expected[:1], self._alone.predict(take_row(observations, 0))[None])
         if not self._torch_drives:
             return actions
         self._comparison.observations += len(rows)
         return expected
-
-
-def _first(observations: Observations) -> Any:
-    if isinstance(observations, dict):
-        return {key: value[0] for key, value in observations.items()}
-    return observations[0]

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.dict_spaces import Observations, split
 from rlctl.replay.recorder import Rollout
-from rlctl.run.episode import Observations, RecordedEpisode
+from rlctl.run.episode import RecordedEpisode
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,8 +99,7 @@ def _columns(recorded: RecordedEpisode, rollout: Rollout) -> list[_Column]:
 
 
 def _parts(observations: Observations) -> dict[str, NDArray[Any]]:
-    parts = observations if isinstance(observations, dict) else {"": observations}
-    return {name: values.reshape(len(values), -1) for name, values in parts.items()}
+    return {name: values.reshape(len(values), -1) for name, values in split(observations).items()}
 
 
 def _element_names(name: str, count: int, rollout: Rollout) -> list[str]:

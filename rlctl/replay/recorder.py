@@ -13,12 +13,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl import registry
+from rlctl import dict_spaces, registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.replay.scene import Camera, Env, Scene, SceneReader, Warn
 from rlctl.run.env_info import EnvInfo, describe
-from rlctl.run.episode import EpisodeInfo, Observations, RecordedEpisode
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.run.policy import collect_versions
 from rlctl.task.env import TaskEnv
 
@@ -228,7 +228,7 @@ class EpisodeRecorder:
         known = [success for success in self._successes if success is not None]
         return Rollout(
             env=self._info,
-            episode=RecordedEpisode(info, actions, _stack(self._observations), rewards, raw),
+            episode=RecordedEpisode(info, actions, dict_spaces.stack(self._observations), rewards, raw),
             weighted_terms=np.array(self._weighted, np.float64).reshape(steps, terms),
             successes=np.array(known, np.bool_) if steps and len(known) == steps else None,
             ended=self.over,
@@ -267,9 +267,3 @@ def _copy(observation: Any, space: spaces.Space[Any]) -> Any:
     if value.shape != space.shape:
         raise ValueError(f"observation has shape {value.shape}, the space has {space.shape}")
     return value
-
-
-def _stack(observations: list[Any]) -> Observations:
-    if isinstance(observations[0], dict):
-        return {key: np.stack([each[key] for each in observations]) for key in observations[0]}
-    return np.stack(observations)

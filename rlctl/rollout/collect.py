@@ -9,8 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl import dict_spaces
+from rlctl.dict_spaces import Observations
 from rlctl.errors import EpisodeFailed
-from rlctl.rollout.workers import EpisodeResult, Observations, Workers
+from rlctl.rollout.workers import EpisodeResult, Workers
 
 
 class Actor(Protocol):
@@ -96,12 +98,12 @@ def run_episodes(
             raise
         if record:
             for index, env in enumerate(rows.tolist()):
-                recorders[env].add(_row(observations, index), actions[index], arrays, env)
+                recorders[env].add(dict_spaces.take_row(observations, index), actions[index], arrays, env)
         for result in ended:
             index = running.pop(result.env)
             trajectory = None
             if record:
-                last = _row(workers.final_observations([result.env]), 0)
+                last = dict_spaces.take_row(workers.final_observations([result.env]), 0)
                 trajectory = recorders[result.env].trajectory(last)
             episodes[index] = Episode(index, result.seed, result, trajectory)
             if on_episode:
@@ -129,14 +131,5 @@ class _Recorder:
 
     def trajectory(self, last: Any) -> Trajectory:
         steps = [*self._observations, last]
-        if isinstance(last, dict):
-            observations: Observations = {key: np.stack([step[key] for step in steps]) for key in last}
-        else:
-            observations = np.stack(steps)
+        observations = dict_spaces.stack(steps)
         return Trajectory(observations, np.stack(self._actions), np.array(self._rewards), np.stack(self._terms))
-
-
-def _row(observations: Observations, index: int) -> Any:
-    if isinstance(observations, dict):
-        return {key: value[index] for key, value in observations.items()}
-    return observations[index]

@@ -11,18 +11,16 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from rlctl.dict_spaces import split_space
+
 Fields = dict[str, tuple[tuple[int, ...], np.dtype[Any]]]
 
 _ALIGNMENT = 64  # [bytes], a cache line: two workers never write one
-SINGLE = ""
-"""The key of an observation that is not a dictionary."""
 
 
 def observation_fields(space: spaces.Space[Any]) -> Fields:
-    """Return shape and dtype per observation key; `SINGLE` where the space is no Dict."""
-    if isinstance(space, spaces.Dict):
-        return {key: _leaf(value) for key, value in space.spaces.items()}
-    return {SINGLE: _leaf(space)}
+    """Return shape and dtype per observation key; see `rlctl.dict_spaces`."""
+    return {key: _leaf(part) for key, part in split_space(space).items()}
 
 
 def _leaf(space: spaces.Space[Any]) -> tuple[tuple[int, ...], np.dtype[Any]]:

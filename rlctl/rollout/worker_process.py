@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from rlctl.dict_spaces import SINGLE, split, split_space
 from rlctl.env_spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
 from rlctl.rollout import goal_rewards, returned_values
 from rlctl.rollout.failures import FailedInEpisode, encode_error
 from rlctl.rollout.process_group import end_with_parent
 from rlctl.rollout.returned_values import InvalidReturn
-from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
+from rlctl.rollout.shared_arrays import SharedArrays, observation_fields
 from rlctl.rollout.worker_output import write_stderr
 from rlctl.run.env_info import describe
 from rlctl.task.env import TaskEnv
@@ -86,8 +87,7 @@ class _Worker:
         self.episodes = [_Episode(env, first + i) for i, env in enumerate(envs)]
         space = envs[0].observation_space
         self.fields = observation_fields(space)
-        leaves = space.spaces if isinstance(space, spaces.Dict) else {SINGLE: space}
-        self.categories = {key: returned_values.category_bounds(leaf) for key, leaf in leaves.items()}
+        self.categories = {key: returned_values.category_bounds(part) for key, part in split_space(space).items()}
         self.space = space
         # A task's environment has looked at its observation itself.
         self.checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
@@ -104,7 +104,7 @@ class _Worker:
         if self.checked:
             target[SINGLE][episode.index] = observation
             return
-        parts = observation if isinstance(observation, dict) else {SINGLE: observation}
+        parts = split(observation)
         if parts.keys() != target.keys():
             raise InvalidReturn(f"observation has the keys {sorted(parts)}, the space has {sorted(target)}")
         for key, value in parts.items():

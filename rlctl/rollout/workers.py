@@ -24,16 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl import errors
+from rlctl.dict_spaces import Observations, join
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.rollout import goal_rewards
 from rlctl.rollout.process_group import block_signals, end
 from rlctl.rollout.process_start import Process, StartProcess, default_start
-from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, anonymous_file
+from rlctl.rollout.shared_arrays import SharedArrays, anonymous_file
 from rlctl.rollout.worker_output import forward
 from rlctl.run.env_info import EnvInfo
-
-Observations = NDArray[Any] | dict[str, NDArray[Any]]
 
 # Started this way a worker finds what its parent finds, and the caller's script is not run again.
 # Who stops a service signals all of its processes, and the main process decides: ignored before anything slow is
@@ -372,8 +371,7 @@ class Workers:
 
 
 def _copy_rows(arrays: dict[str, NDArray[Any]], rows: Any) -> Observations:
-    picked: dict[str, Any] = {key: array[rows].copy() for key, array in arrays.items()}
-    result: Observations = picked.get(SINGLE, picked)
+    result: Observations = join({key: array[rows].copy() for key, array in arrays.items()})
     return result
 
 

@@ -11,12 +11,12 @@ import pydantic
 from numpy.typing import NDArray
 from pydantic import Field
 
+from rlctl.dict_spaces import Observations, split
 from rlctl.errors import ArtifactError
 from rlctl.run import files, untrusted
 from rlctl.run.named_spec import EpisodeSpec
 
 FORMAT = 1
-Observations = NDArray[Any] | dict[str, NDArray[Any]]
 
 
 class EpisodeInfo(pydantic.BaseModel):
@@ -55,11 +55,8 @@ class RecordedEpisode:
 
 def save_episode(path: Path, episode: RecordedEpisode) -> None:
     """Write an episode, whole or not at all."""
-    observations = episode.observations
-    if isinstance(observations, dict):
-        parts = {f"observations/{key}": value for key, value in observations.items()}
-    else:
-        parts = {"observations": observations}
+    observations = split(episode.observations)
+    parts = {f"observations/{key}" if key else "observations": value for key, value in observations.items()}
     files.write_npz(
         path,
         {
@@ -102,7 +99,7 @@ def _mismatch(episode: RecordedEpisode) -> str | None:
     steps, names = len(rewards), len(episode.info.term_names)
     if episode.terms.shape != (steps, names) or episode.terms.dtype != np.float64:
         return f"reward terms are {_describe_array(episode.terms)}, not float64 of shape {(steps, names)}"
-    parts = observations if isinstance(observations, dict) else {"": observations}
+    parts = split(observations)
     # Of an episode that failed there are its actions alone, however many.
     acted, observed = (None, 0) if episode.info.failure and not steps else (steps, steps + 1)
     for name, values, count in (("actions", episode.actions, acted), *((k, v, observed) for k, v in parts.items())):

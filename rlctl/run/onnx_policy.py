@@ -12,11 +12,12 @@ import onnxruntime
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from rlctl.dict_spaces import Observations, split, split_space
 from rlctl.env_spec import LARGEST_SPACE
 from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.run import memory, onnx_file, untrusted
 from rlctl.run.onnx_file import METADATA_KEY
-from rlctl.run.policy import ROWS, Observations, Policy, PolicyInfo, State, parse_info
+from rlctl.run.policy import ROWS, Policy, PolicyInfo, State, parse_info
 
 SINGLE_INPUT = "obs"
 """Name of the input of an observation that is no dictionary; those of a dictionary are named by their keys."""
@@ -76,10 +77,8 @@ class OnnxPolicy(Policy):
     def forward(
         self, observations: Observations, state: State | None, deterministic: bool
     ) -> tuple[NDArray[Any], State | None]:
-        if isinstance(observations, dict):
-            batch = {name: np.asarray(observations[name], dtype) for name, (_, dtype) in self._fields.items()}
-        else:
-            batch = {SINGLE_INPUT: np.asarray(observations, self._fields[SINGLE_INPUT][1])}
+        parts = {key or SINGLE_INPUT: part for key, part in split(observations).items()}
+        batch = {name: np.asarray(parts[name], dtype) for name, (_, dtype) in self._fields.items()}
         return self._run(batch, state, deterministic)
 
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
@@ -88,7 +87,7 @@ class OnnxPolicy(Policy):
         A recurrent policy remembers; call `reset` when an episode begins.
         """
         # A row costs less than the ROWS rows that keep an evaluation independent of its width.
-        given = observation if isinstance(observation, dict) else {SINGLE_INPUT: observation}
+        given = {key or SINGLE_INPUT: part for key, part in split(observation).items()}
         batch = {}
         for name, (shape, dtype) in self._fields.items():
             value = np.asarray(given[name], dtype) if name in given else np.empty(())
@@ -142,9 +141,7 @@ def _open_session(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, s
 
 def _fields(space: spaces.Space[Any]) -> dict[str, tuple[tuple[int, ...], Any]]:
     """Shape and dtype of every input that is an observation."""
-    if isinstance(space, spaces.Dict):
-        return {key: (each.shape or (), each.dtype) for key, each in space.spaces.items()}
-    return {SINGLE_INPUT: (space.shape or (), space.dtype)}
+    return {key or SINGLE_INPUT: (part.shape or (), part.dtype) for key, part in split_space(space).items()}
 
 
 @functools.cache

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 import pydantic
-from gymnasium import spaces
 from numpy.typing import NDArray
 from pydantic import Field
 
 import rlctl
+from rlctl.dict_spaces import Observations, join, map_parts, split_space
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.named_task import POLICY
@@ -35,7 +35,6 @@ ROWS = 64
 """Every forward pass has this many rows: the last bit of a result depends on the size of the batch, and an episode
 must not depend on how many others run beside it."""
 
-Observations = NDArray[Any] | dict[str, NDArray[Any]]
 State = tuple[NDArray[np.float32], ...]
 """Recurrent state: arrays of shape (layers, rows, size)."""
 
@@ -178,11 +177,7 @@ class Policy(abc.ABC):
     def __init__(self, info: PolicyInfo) -> None:
         self.info = info
         self.observation_space, self.action_space = info.env.spaces()
-        self._expected = (
-            {key: space.shape for key, space in self.observation_space.spaces.items()}
-            if isinstance(self.observation_space, spaces.Dict)
-            else self.observation_space.shape
-        )
+        self._expected = join({key: space.shape for key, space in split_space(self.observation_space).items()})
         self._own: BatchActor | None = None
         self._starts = True
 
@@ -204,10 +199,10 @@ class Policy(abc.ABC):
         if self._own is None:
             self._own = BatchActor(self, 1)
         self._own.deterministic = deterministic
-        batch = _map(observation, lambda value: np.asarray(value)[None])
-        shapes, expected = _shapes(_map(batch, lambda value: value[0])), self._expected
-        if shapes != expected:
-            raise ValueError(f"observation of shape {shapes}, the policy wants {expected}")
+        shapes = map_parts(np.shape, observation)
+        if shapes != self._expected:
+            raise ValueError(f"observation of shape {shapes}, the policy wants {self._expected}")
+        batch = map_parts(lambda value: np.asarray(value)[None], observation)
         action = self._own.act(batch, np.array([0]), np.array([self._starts]))[0]
         self._starts = False
         return np.asarray(action)
@@ -216,12 +211,6 @@ class Policy(abc.ABC):
         """Begin an episode: forget the recurrent state."""
         self._starts = True
 
-    @property
-    def observation_parts(self) -> dict[str, spaces.Space[Any]]:
-        """The spaces of a dict observation by key, or the one that there is under an empty key."""
-        space = self.observation_space
-        return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
-
     def try_once(self) -> None:
         """Act once, on made-up observations; raises `ValueError` for actions that the action space cannot have.
 
@@ -229,10 +218,9 @@ class Policy(abc.ABC):
         """
         parts = {
             key: np.full((ROWS, *(space.shape or ())), getattr(space, "start", 0), space.dtype)
-            for key, space in self.observation_parts.items()
+            for key, space in split_space(self.observation_space).items()
         }
-        observations = parts if isinstance(self.observation_space, spaces.Dict) else parts[""]
-        actions, _ = self.forward(observations, self.initial_state(), True)
+        actions, _ = self.forward(join(parts), self.initial_state(), True)
         wanted = (ROWS, *(self.action_space.shape or ()))
         if actions.shape != wanted or not np.isfinite(actions).all():
             raise ValueError(f"its actions are {actions.dtype} of shape {actions.shape[1:]}, or not finite")
@@ -259,9 +247,9 @@ class BatchActor:
             block = rows[low : low + ROWS]
             state = None
             if self._state is not None:
-                state = tuple(_padded(part[:, block], axis=1) for part in self._state)
+                state = tuple(_pad(part[:, block], axis=1) for part in self._state)
             actions, after = self.policy.forward(
-                _map(observations, lambda value, low=low: _padded(value[low : low + ROWS])),
+                map_parts(functools.partial(_take_block, low), observations),
                 state,
                 self.deterministic,
             )
@@ -272,17 +260,11 @@ class BatchActor:
         return np.concatenate(blocks)
 
 
-def _map(observations: Any, function: Any) -> Any:
-    if isinstance(observations, dict):
-        return {key: function(value) for key, value in observations.items()}
-    return function(observations)
+def _take_block(low: int, values: NDArray[Any]) -> NDArray[Any]:
+    return _pad(values[low : low + ROWS])
 
 
-def _shapes(observation: Any) -> Any:
-    return _map(observation, np.shape)
-
-
-def _padded(values: NDArray[Any], axis: int = 0) -> NDArray[Any]:
+def _pad(values: NDArray[Any], axis: int = 0) -> NDArray[Any]:
     missing = ROWS - values.shape[axis]
     if missing == 0:
         return values

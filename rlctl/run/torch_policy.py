@@ -19,8 +19,9 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.vec_env import VecTransposeImage
 from torch.overrides import TorchFunctionMode
 
+from rlctl.dict_spaces import Observations, join, split, split_space
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
-from rlctl.run.policy import ROWS, Observations, Policy, PolicyInfo, State, read_policy
+from rlctl.run.policy import ROWS, Policy, PolicyInfo, State, read_policy
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": stable_baselines3.PPO,
@@ -189,13 +190,14 @@ class Normalizer:
         """Normalise a batch, shape (rows, ...)."""
         if not self._statistics:
             return observations
-        if isinstance(observations, dict):
-            return {
-                key: self._one(key, value) if key in self._statistics else value for key, value in observations.items()
-            }
-        return self._one("", observations)
+        normalized = {
+            key: self._normalize(key, value) if key in self._statistics else value
+            for key, value in split(observations).items()
+        }
+        result: Observations = join(normalized)
+        return result
 
-    def _one(self, key: str, values: NDArray[Any]) -> NDArray[np.float32]:
+    def _normalize(self, key: str, values: NDArray[Any]) -> NDArray[np.float32]:
         mean, scale = self._statistics[key]
         normalized: NDArray[np.float32] = np.clip((values - mean) / scale, -self.clip, self.clip).astype(np.float32)  # type: ignore[operator]
         return normalized
@@ -237,7 +239,7 @@ class TorchPolicy(Policy):
         }
         network.load_state_dict(state)
         policy = cls(info, network, Normalizer(info, tensors))
-        shapes = {key: space.shape for key, space in policy.observation_parts.items()}
+        shapes = {key: space.shape for key, space in split_space(policy.observation_space).items()}
         for key in info.normalized_keys:
             for name in (f"normalize/{key}/mean", f"normalize/{key}/var"):
                 if tensors[name].shape != shapes.get(key):

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from rlctl.dict_spaces import Observations
 from rlctl.rollout.collect import Actor, Episode, run_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Observations, Workers
+from rlctl.rollout.workers import Workers
 from rlctl.run.policy import BatchActor, PolicyInfo
 from rlctl.run.recipe import Recipe
 from rlctl.run.torch_policy import Normalizer, TorchPolicy

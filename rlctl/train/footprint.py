@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from rlctl.dict_spaces import split_space
 from rlctl.errors import RecipeError
 from rlctl.run import memory
 from rlctl.run.hyperparameters import ON_POLICY
@@ -84,16 +85,13 @@ def _network(kwargs: Mapping[str, Any]) -> int:
 
 
 def _elements(space: spaces.Space[Any]) -> int:
-    if isinstance(space, spaces.Dict):
-        return sum(_elements(each) for each in space.spaces.values())
-    return math.prod(space.shape or ())
+    return sum(math.prod(part.shape or ()) for part in split_space(space).values())
 
 
 def _stored(space: spaces.Space[Any]) -> int:
     """Return the bytes of an observation in the dtype of its space, as replay buffers keep it."""
-    if isinstance(space, spaces.Dict):
-        return sum(_stored(each) for each in space.spaces.values())
-    return math.prod(space.shape or ()) * np.dtype(space.dtype or np.float32).itemsize
+    parts = split_space(space).values()
+    return sum(math.prod(part.shape or ()) * np.dtype(part.dtype or np.float32).itemsize for part in parts)
 
 
 def _actions(space: spaces.Space[Any]) -> int:

@@ -10,6 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
+from rlctl.dict_spaces import split
 from rlctl.env_spec import EnvSpec
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo, collect_versions
@@ -48,5 +49,4 @@ def observation_statistics(normalizer: VecNormalize | None) -> dict[str, Running
     """Return the running statistics per observation key, "" for an observation that is no dict."""
     if normalizer is None or not normalizer.norm_obs:
         return {}
-    rms = normalizer.obs_rms
-    return dict(rms) if isinstance(rms, dict) else {"": rms}
+    return split(normalizer.obs_rms)

@@ -21,6 +21,7 @@ from safetensors.numpy import save as save_tensors
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from rlctl.dict_spaces import split
 from rlctl.errors import ArtifactError
 from rlctl.run import files, untrusted
 
@@ -136,8 +137,7 @@ def _arrays(buffer: ReplayBuffer) -> Tensors:
     arrays: Tensors = {}
     for name in _FIELDS:
         value: Any = getattr(buffer, name)
-        parts = value if isinstance(value, dict) else {"": value}
-        arrays |= {f"{name}/{key}": part for key, part in parts.items()}
+        arrays |= {f"{name}/{key}": part for key, part in split(value).items()}
     return arrays
 
 

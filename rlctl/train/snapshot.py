@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from rlctl.dict_spaces import split
 from rlctl.errors import ArtifactError, DivergedError
 from rlctl.train.pack import observation_statistics
 
@@ -226,7 +227,7 @@ def _observed(model: BaseAlgorithm) -> Tensors:
     found: Tensors = {}
     for name in _OBSERVED:
         value: Any = getattr(model, name)
-        parts = value if isinstance(value, dict) else {"": value}
+        parts = split(value)
         found |= {f"rollout/{name}/{key}": part for key, part in parts.items() if part is not None}
     return found
 

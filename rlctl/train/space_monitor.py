@@ -8,7 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.rollout.shared_arrays import SINGLE, SharedArrays, observation_fields
+from rlctl.dict_spaces import split, split_space
+from rlctl.rollout.shared_arrays import SharedArrays, observation_fields
 from rlctl.train.progress import Progress
 
 
@@ -16,7 +17,7 @@ class SpaceMonitor:
     """Looks at the observations of all environments after each step: some microseconds, for all of them together."""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
-        leaves = space.spaces if isinstance(space, spaces.Dict) else {SINGLE: space}
+        leaves = split_space(space)
         self._dtypes = [dtype for _, dtype in observation_fields(space).values()]
         self._keys = list(leaves)
         self._bounds = {key: leaf for key, leaf in leaves.items() if isinstance(leaf, spaces.Box) and _can_exceed(leaf)}
@@ -26,7 +27,7 @@ class SpaceMonitor:
 
     def look(self, observations: Any) -> None:
         """Count those that are outside; arrays have a row per environment."""
-        parts = observations if isinstance(observations, dict) else {SINGLE: observations}
+        parts = split(observations)
         rows: set[int] = set()
         for key, box in self._bounds.items():
             values = parts[key]

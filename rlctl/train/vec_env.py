@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from rlctl.dict_spaces import take_row
 from rlctl.rollout.history import ActionHistory
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import EpisodeResult, Workers
@@ -77,7 +78,7 @@ class WorkerVecEnv(VecEnv):
             for index, result in enumerate(ended):
                 env = result.env
                 self.episodes_started[env] += 1
-                infos[env] = self._end_info(result, _row(final, index))
+                infos[env] = self._end_info(result, take_row(final, index))
             self._begun(envs)
             self.ended += ended
         # float32, as SB3's own environments hand rewards over.
@@ -124,9 +125,3 @@ class WorkerVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         return [False for _ in self._get_indices(indices)]
-
-
-def _row(observations: Any, index: int) -> Any:
-    if isinstance(observations, dict):
-        return {key: value[index] for key, value in observations.items()}
-    return observations[index]

@@ -1,0 +1,48 @@
+"""Dict spaces taken apart: a space and observations of it as parts by key; any other space has one part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+Observations = NDArray[Any] | dict[str, NDArray[Any]]
+"""Observations of several rows: environments, or steps."""
+
+SINGLE = ""
+"""The key of the only part of a space that is not a Dict."""
+
+
+def split_space(space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:
+    """Return the parts of a space by key, in its order."""
+    return dict(space.spaces) if isinstance(space, spaces.Dict) else {SINGLE: space}
+
+
+def split(observation: Any) -> dict[str, Any]:
+    """Return the parts of an observation, or of several, by key."""
+    return observation if isinstance(observation, dict) else {SINGLE: observation}
+
+
+def join(parts: Mapping[str, Any]) -> Any:
+    """Return the observation that `split` has taken apart."""
+    return parts[SINGLE] if SINGLE in parts else dict(parts)
+
+
+def map_parts(function: Callable[[Any], Any], observation: Any) -> Any:
+    """Return an observation with `function` applied to each of its parts."""
+    return join({key: function(part) for key, part in split(observation).items()})
+
+
+def take_row(observations: Any, row: int) -> Any:
+    """Return one observation of several."""
+    return map_parts(lambda part: part[row], observations)
+
+
+def stack(observations: Sequence[Any]) -> Observations:
+    """Return observations as rows, shape (len(observations), ...)."""
+    rows = [split(each) for each in observations]
+    stacked: Observations = join({key: np.stack([row[key] for row in rows]) for key in rows[0]})
+    return stacked
