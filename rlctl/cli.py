@@ -78,7 +78,7 @@ def check_env(
         typer.Option(metavar="RULES", help="Judge only these: RL3,RL501.", show_default=False),
     ] = [],  # noqa: B006
     ignore: Annotated[
-        list[str], typer.Option(metavar="RULES", help="Leave these out: RL107.", show_default=False)
+        list[str], typer.Option(metavar="RULES", help="Leave these out: RL106.", show_default=False)
     ] = [],  # noqa: B006
     strict: Annotated[bool, typer.Option("--strict", help="Exit 1 for warnings too.")] = False,
     form: Annotated[

@@ -26,60 +26,6 @@ class GlobalUse:
 
 
 @dataclasses.dataclass(frozen=True)
-class ActionEffects:
-    """What each dimension of the action does."""
-
-    dimensions: list[ActionEffect]
-    """Those that were tried."""
-    total: int
-    """How many the action has."""
-    left_out: str
-    """Why not all were tried; empty if they were."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ActionEffect:
-    """What one dimension of the action does."""
-
-    name: str
-    """`action[2]`."""
-    effect: str
-    """`lasting`; `cost`: in the reward of its own step only; `copy`: beside that, only as a copy of itself in the
-    observation; `none`."""
-    saturates: str
-    """`switch`: only its sign counts; `range`: from a fifth of its range on nothing changes; empty otherwise."""
-    seeds: list[int]
-    steps: int
-    """How far the longest comparison went."""
-
-
-@dataclasses.dataclass(frozen=True)
-class OutOfRange:
-    """An episode with actions of twice the bounds, against one at the bounds."""
-
-    raised: str | None
-    """What the first such action raised."""
-    seed: int
-    steps: int
-    difference: str
-    """`observation`, `reward`, `end`; empty if there is none."""
-    step: int
-    inside: float
-    outside: float
-
-
-@dataclasses.dataclass(frozen=True)
-class NanAction:
-    """What came of an action of NaN."""
-
-    raised: str | None
-    finite: bool
-    """Whether all observations and rewards that came back were finite."""
-    seed: int
-    step: int
-
-
-@dataclasses.dataclass(frozen=True)
 class Leaks:
     """Counts after each reset of one instance: what it keeps of earlier episodes."""
 
@@ -146,21 +92,6 @@ class CloseTwice:
     """Closing an instance that is closed."""
 
     raised: str | None
-
-
-@dataclasses.dataclass(frozen=True)
-class Hindsight:
-    """What `compute_reward` says of steps that were rewarded already."""
-
-    defined: bool
-    """Whether the environment has it, and the goals it is about; nothing else is known if not."""
-    steps: int
-    worst: int | None
-    """The step whose reward differs most; None where none could be computed."""
-    rewards: list[float] | None
-    """The reward of that step, and what `compute_reward` says."""
-    wrong: str | None
-    """What else is wrong with what it returns."""
 
 
 @dataclasses.dataclass(frozen=True)

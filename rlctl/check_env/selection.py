@@ -1,4 +1,4 @@
-"""From `--select RL3,RL501` and `--ignore RL107` to rules."""
+"""From `--select RL3,RL501` and `--ignore RL106` to rules."""
 
 from __future__ import annotations
 

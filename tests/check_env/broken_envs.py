@@ -125,6 +125,16 @@ class OutOfRange(Clean):
         return self.position + np.float32(7.0 * (self.steps == 30))
 
 
+class OutOfRangeAtReset(Clean):
+    def observe(self):
+        return self.position + np.float32(7.0 * (self.steps == 0))
+
+
+class OftenOutOfRange(Clean):
+    def observe(self):
+        return self.position + np.float32(7.0 * (self.steps % 5 == 3))
+
+
 class Rounding(Clean):
     def observe(self):
         rounded = np.nextafter(np.float32(self.size), np.float32(np.inf))

@@ -8,10 +8,16 @@ from gymnasium import spaces
 class Asymmetric(Clean):
     def __init__(self):
         super().__init__()
-        self.action_space = spaces.Box(np.float32([-1.0, 0.0]), np.float32([1.0, 1.0]))
+        self.action_space = spaces.Box(np.float32([-1.0, -0.5]), np.float32([1.0, 1.0]))
 
     def move(self, action):
         super().move(np.clip(action, self.action_space.low, self.action_space.high))
+
+
+class Thrust(Asymmetric):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Box(np.float32([-1.0, 0.0]), np.float32([1.0, 1.0]))
 
 
 class Seen(Clean):
@@ -36,6 +42,12 @@ class FloatPicture(Seen):
 
 class TwoAxes(Seen):
     shape = (48, 48)
+
+
+class FloatTable(TwoAxes):
+    """Rows of measurements: nothing is wrong with it."""
+
+    dtype, high = np.float32, 1
 
 
 class Dark(Seen):

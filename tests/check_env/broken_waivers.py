@@ -6,7 +6,7 @@ from gymnasium import spaces
 
 
 class Wide(Clean):
-    rlctl_ignore = {"RL107": "the actions are Newtons, as the real motor has them"}
+    rlctl_ignore = {"RL106": "the actions are Newtons, as the real motor has them"}
 
     def __init__(self):
         super().__init__()
@@ -17,12 +17,12 @@ class Wide(Clean):
 
 
 class NoReason(Wide):
-    rlctl_ignore = {"RL107": " "}
+    rlctl_ignore = {"RL106": " "}
 
 
 class NoSuchRule(Wide):
-    rlctl_ignore = {"RL1007": "typing"}
+    rlctl_ignore = {"RL1006": "typing"}
 
 
 class NoDictionary(Wide):
-    rlctl_ignore = ("RL107",)
+    rlctl_ignore = ("RL106",)

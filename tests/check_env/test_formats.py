@@ -160,17 +160,20 @@ def test_a_clean_environment_fits_on_a_screen():
 
 def test_waived_findings_are_listed_with_the_reason_and_do_not_count(waiving):
     assert waiving.verdict.findings == []
-    assert [finding.rule for finding in waiving.verdict.waived] == ["RL107"]
-    assert "waived RL107 (actions are in [-2, 2], not in [-1, 1]): the actions are Newtons" in plain.text(waiving)
+    assert [finding.rule for finding in waiving.verdict.waived] == ["RL106"]
+    assert (
+        "waived RL106 (2 of 2 actions are not in [-1, 1]: action[0] is in [-2, 2]): the actions are Newtons"
+        in plain.text(waiving)
+    )
     assert ", 1 waived; " in plain.summary(waiving)
 
 
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        ("NoReason", "RL107 is waived without a reason"),
-        ("NoSuchRule", r"no rule 'RL1007'. Did you mean 'RL107'\?"),
-        ("NoDictionary", r"no rule \"\('RL107',\)\""),
+        ("NoReason", "RL106 is waived without a reason"),
+        ("NoSuchRule", r"no rule 'RL1006'. Did you mean 'RL106'\?"),
+        ("NoDictionary", r"no rule \"\('RL106',\)\""),
     ],
 )
 def test_a_waiver_that_is_none_is_refused(task, message):
@@ -191,7 +194,7 @@ def test_a_crash_wins(crashed):
 def test_rules_are_chosen_by_family_and_id():
     assert {rule[:3] for rule in choose_rules(["RL3"])} == {"RL3"}
     assert choose_rules(["rl301,RL501"]) == ["RL301", "RL501"]
-    assert "RL107" not in choose_rules([], ["RL107"])
+    assert "RL106" not in choose_rules([], ["RL106"])
     assert choose_rules() == list(RULES)
     with pytest.raises(UsageError, match=r"--select RL35: no such rule. Did you mean 'RL3"):
         choose_rules(["RL35"])
@@ -258,6 +261,6 @@ def test_command_tells_in_every_format_why_nothing_could_be_built(form):
 
 
 def test_command_refuses_a_waiver_without_a_reason():
-    run = rlctl(f"{HERE}/broken_waivers.py:NoReason", "--select", "RL107")
+    run = rlctl(f"{HERE}/broken_waivers.py:NoReason", "--select", "RL106")
     assert (run.returncode, run.stdout) == (2, "")
-    assert "RL107 is waived without a reason" in run.stderr
+    assert "RL106 is waived without a reason" in run.stderr

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rlctl.check_env.rules import reward_incentives
-from rlctl.check_env.rules.tried import discounted, worth_of
-from rlctl.check_env.studies.search import action_of
+from rlctl.check_env.actions import action_at
+from rlctl.check_env.families.incentives import pair_up
+from rlctl.check_env.rewarded import discounted_steps, discounted_sum
 from tests.check_env.judging import case, check_case, findings, found, records_of
 
 BROKEN = "broken_rewards.py"
@@ -64,8 +64,8 @@ def finding_of(name):
 
 def test_worth_is_discounted():
     # 1 + 0.99 * 2 + 0.9801 * 3 = 5.9203; -(1 + 0.99 + 0.9801) = -2.9701
-    assert discounted(np.array([1.0, 2.0, 3.0])) == pytest.approx(5.9203)
-    assert worth_of(-1.0, 3) == pytest.approx(-2.9701)
+    assert discounted_sum(np.array([1.0, 2.0, 3.0])) == pytest.approx(5.9203)
+    assert discounted_steps(-1.0, 3) == pytest.approx(-2.9701)
 
 
 def test_falling_is_compared_with_going_on():
@@ -84,15 +84,15 @@ def test_hovering_is_compared_from_where_two_lives_part():
     actions[2:] = 1.0
     finished = dataclasses.replace(life, rewards=np.array([0.0, 0.0, 9.0]), action_values=np.zeros((3, 2)))
     hovered = dataclasses.replace(life, rewards=np.array([0.0, 0.0, 5.0, 5.0]), action_values=actions, ended="steps")
-    pair = reward_incentives._pair(finished, hovered, longest=6)
+    pair = pair_up(finished, hovered, longest=6)
     # From the third step on: 9, against 5 for each of the steps 3 to 6, the last two of them not lived.
     assert pair.step == 2
     assert pair.per_step == 5.0
-    assert pair.worth == pytest.approx((9.0, 5 * (1 + 0.99 + 0.9801 + 0.970299)))
+    assert (pair.finishing, pair.hovering) == pytest.approx((9.0, 5 * (1 + 0.99 + 0.9801 + 0.970299)))
     ended = dataclasses.replace(hovered, ended="truncated")
-    assert reward_incentives._pair(finished, ended, longest=6).worth == pytest.approx((9.0, 5 * 1.99))
+    assert pair_up(finished, ended, longest=6).hovering == pytest.approx(5 * 1.99)
     elsewhere = dataclasses.replace(hovered, seed=life.seed + 1)
-    assert reward_incentives._pair(finished, elsewhere, longest=6) is None
+    assert pair_up(finished, elsewhere, longest=6) is None
 
 
 def test_hovering_is_found_and_placed():
@@ -136,7 +136,7 @@ def test_numbers_become_actions_of_every_kind():
         (np.full(7, 0.5), [0.0, 0.5], 2, ([1, 2], [1, 1])),
         (np.ones(7), [1.0, 1.0], 3, ([1, 3], [1, 1])),
     ]:
-        action = action_of(space, numbers)
+        action = action_at(space, numbers)
         assert space.contains(action)
         assert action["arm"].tolist() == arm
         assert action["gear"] == gear
@@ -144,7 +144,7 @@ def test_numbers_become_actions_of_every_kind():
 
 
 def test_search_finds_what_chance_does_not():
-    lives = records_of("reach").role("search")
+    lives = records_of("reach", "search").role("search")
     assert any(life.infos["is_success"].values.any() for life in lives if life.actions == "searched")
     assert len({life.seed for life in lives if life.actions == "searched"}) == 1
     assert sum(life.steps for life in lives) <= 6200

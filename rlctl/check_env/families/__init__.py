@@ -39,32 +39,31 @@ from collections.abc import Collection, Iterable
 
 from rlctl.check_env.experiment import Check, Experiment
 from rlctl.check_env.families import (
+    actions,
     attributes,
     determinism,
     episodes,
+    features,
+    hidden_goal,
+    hindsight,
+    incentives,
     interface,
     isolation,
     library_checkers,
     loading,
+    observations,
     resources,
+    rewards,
+    search,
+    spaces,
+    success,
 )
 from rlctl.check_env.finding import RULES
 from rlctl.check_env.legacy import old_experiment
 from rlctl.check_env.rules import (
-    actions,
-    hidden_goal,
-    hindsight,
-    misuse,
-    observations,
     physics,
     physics_source,
-    redundancy,
-    reward_incentives,
-    reward_terms,
-    rewards,
-    spaces,
     speed,
-    success,
 )
 
 PROCESS_S = 18.0
@@ -87,9 +86,9 @@ PROCESSES = {
             determinism.compare_generators,
             old_experiment("speed"),
             episodes.record_episodes,
-            old_experiment("starts"),
-            old_experiment("search"),
-            old_experiment("hindsight"),
+            success.record_starts,
+            search.search,
+            hindsight.recompute_rewards,
             resources.count_after_resets,
             episodes.step_after_end,
         )
@@ -98,14 +97,14 @@ PROCESSES = {
         (
             isolation.compare_instances,
             old_experiment("worlds"),
-            old_experiment("action effects"),
+            actions.compare_actions,
             attributes.read_attributes,
             resources.build_in_worker,
-            old_experiment("out of range"),
+            actions.exceed_bounds,
             interface.step_before_reset,
             interface.close_twice,
             attributes.render,
-            old_experiment("nan action"),
+            actions.give_nan,
         ),
         hash_seed=1,  # another one, so that hash order shows
     ),
@@ -116,8 +115,8 @@ PROCESSES = {
 CHECKERS = ("gymnasium checker", "sb3 checker")
 
 MODULES = (
-    *(loading, observations, spaces, redundancy, hidden_goal, interface, attributes, misuse, determinism, isolation),
-    *(resources, episodes, rewards, reward_incentives, reward_terms, success, hindsight, actions),
+    *(loading, observations, spaces, features, hidden_goal, interface, attributes, determinism, isolation),
+    *(resources, episodes, rewards, incentives, success, hindsight, actions),
     *(physics, physics_source, speed),
 )
 

@@ -1,4 +1,4 @@
-"""RL1: an observation that leaves out what the reward depends on."""
+"""RL114: an observation that leaves out what the reward depends on."""
 
 from __future__ import annotations
 
@@ -8,19 +8,17 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.evidence import Evidence, Trajectory
-from rlctl.check_env.finding import NotApplicable, Severity
-from rlctl.check_env.legacy import Seen, rule
-from rlctl.check_env.rules.known import built
-from rlctl.check_env.rules.tried import WITH_SEARCH, rewarded
+from rlctl.check_env.experiment import check
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
+from rlctl.check_env.messages import Trajectory
+from rlctl.check_env.records import Records
+from rlctl.check_env.rewarded import WITH_SEARCH, require_rewarded
 
 Numbers = NDArray[np.float64]
 
-NEAR = 0.05
-"""Two steps are alike where each number of both observations is as near as this, in units of its standard deviation
-over everything that was tried."""
-NEAR_ACTION = 0.25
-"""The same for the action, much of which the observations show already."""
+NEAR, NEAR_ACTION = 0.05, 0.25
+"""Two steps are alike where each number of both observations is as near as this, and each of the actions (much of which
+the observations show already), in units of its standard deviation over everything that was recorded."""
 MOST_STEPS = 2_000
 """Steps that are compared, each with each."""
 MOST_PAIRS = 20_000
@@ -42,37 +40,27 @@ class _Steps:
     numbers: NDArray[np.int64]
     """Which step of its episode each is."""
     known: Numbers
-    """What a step is known by: observation before, observation after, action; in units of what is near. Shape
-    (n, elements)."""
+    """Observation before, observation after, action; in units of what is near. Shape (n, elements)."""
     rewards: Numbers
 
 
-@rule(
-    "RL114",
-    "something that decides the reward is hidden",
-    Severity.WARNING,
-    "Put the goal, or what else reset draws at random and the reward uses, into the observation.",
-    needs=WITH_SEARCH,
-)
-def hidden_goal(evidence: Evidence) -> Iterator[Seen]:
-    """In episodes with different seeds the same observation, action and next observation have different rewards, while
-    within one episode they have the same: something that reset draws, most often the goal, decides the reward and is
-    not in the observation. The policy cannot know where to go, and learns the average."""
-    steps = _steps(evidence, rewarded(evidence))
+@check("RL114", *WITH_SEARCH)
+def find_hidden_goal(records: Records) -> Iterator[Finding]:
+    steps = _steps(records, require_rewarded(records))
     one, two = _alike(steps.known)
     differences = np.abs(steps.rewards[one] - steps.rewards[two])
     across = steps.seeds[one] != steps.seeds[two]
-    # Of one episode, lived twice perhaps, but at different times: chance in the reward would show.
+    # Of one episode, recorded twice perhaps, but at different times: chance in the reward would show.
     within = ~across & (steps.numbers[one] != steps.numbers[two])
     seeds = len(np.unique(np.concatenate([steps.seeds[one[across]], steps.seeds[two[across]]])))
     if across.sum() < FEWEST_PAIRS or within.sum() < FEWEST_PAIRS or seeds < FEWEST_SEEDS:
         return  # no two episodes came to the same state
     different, same = float(np.median(differences[across])), float(np.median(differences[within]))
-    spread = float(steps.rewards.std())
-    if different > LARGE_PART * spread and different > TIMES * same:
+    if different > LARGE_PART * float(steps.rewards.std()) and different > TIMES * same:
         pair = np.flatnonzero(across)[int(differences[across].argmax())]
         first, second = int(one[pair]), int(two[pair])
-        yield Seen(
+        yield Finding(
+            "RL114",
             f"with {seeds} seeds, steps that look alike have rewards {different:.3g} apart (median of {across.sum():,} "
             f"pairs), within one episode {same:.2g}: {steps.rewards[first]:.4g} and {steps.rewards[second]:.4g}, say",
             {
@@ -86,44 +74,40 @@ def hidden_goal(evidence: Evidence) -> Iterator[Seen]:
         )
 
 
-def _steps(evidence: Evidence, lives: list[Trajectory]) -> _Steps:
-    leaves = built(evidence).leaves
+def _steps(records: Records, episodes: list[Trajectory]) -> _Steps:
+    leaves = records.require_built().leaves
     if not leaves or any(not leaf.supported for leaf in leaves):
         raise NotApplicable("a part of the observation cannot be compared")
     if any(len(leaf.shape) == 3 for leaf in leaves):
         raise NotApplicable("images are not compared")
-    parts = [part for life in lives if (part := _of_life(life, len(leaves))) is not None]
+    parts = [part for each in episodes if (part := _steps_of(each, len(leaves))) is not None]
     if not parts:
-        raise NotApplicable("no whole observation was recorded")
+        raise NotJudged("no whole observation was recorded")
     seeds, numbers, known, rewards = (np.concatenate(each) for each in zip(*parts, strict=True))
-    chosen = _chosen(seeds, numbers)
+    # Some, evenly, of the beginnings of episodes, where they are most alike, and as many of all others.
+    halves = [np.flatnonzero(numbers <= 3), np.flatnonzero(numbers > 3)]
+    chosen = np.concatenate([each[:: max(1, -(-len(each) * 2 // MOST_STEPS))] for each in halves])
     near = NEAR * known.std(axis=0)
-    near[known.shape[1] - lives[0].action_values.shape[1] :] *= NEAR_ACTION / NEAR
-    # Numbers of places and kinds are alike only if they are equal.
+    near[known.shape[1] - episodes[0].action_values.shape[1] :] *= NEAR_ACTION / NEAR
+    # Whole numbers, of places and kinds, are alike only if they are equal.
     whole = (known == np.round(known)).all(axis=0)
     near[whole] = np.minimum(near[whole], 0.5)
     scaled = known[chosen] / np.where(near > 0, near, 1.0)
     return _Steps(seeds[chosen], numbers[chosen], scaled, rewards[chosen])
 
 
-def _chosen(seeds: NDArray[np.int64], numbers: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Choose steps evenly among the begins of episodes, where they are most alike, and among all others."""
-    begins, others = np.flatnonzero(numbers <= 3), np.flatnonzero(numbers > 3)
-    return np.concatenate([each[:: max(1, -(-len(each) * 2 // MOST_STEPS))] for each in (begins, others)])
-
-
-def _of_life(life: Trajectory, leaves: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Numbers, Numbers] | None:
-    """Return seeds, numbers, what is known and rewards of a life's steps; a last one that ends is left out."""
-    steps = life.steps - (life.ended in ("terminated", "both", "raised"))
-    series = [life.observations.get(index) for index in range(leaves)]
-    if steps < 1 or any(each is None or len(each.steps) != life.steps + 1 for each in series):
+def _steps_of(episode: Trajectory, leaves: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Numbers, Numbers] | None:
+    """Return seeds, numbers, what is known and rewards of an episode's steps; a last one that ends is left out."""
+    steps = episode.steps - (episode.ended in ("terminated", "both", "raised"))
+    series = [episode.observations.get(index) for index in range(leaves)]
+    if steps < 1 or any(each is None or len(each.steps) != episode.steps + 1 for each in series):
         return None
-    flat = [each.values.reshape(life.steps + 1, -1).astype(np.float64) for each in series if each is not None]
+    flat = [each.values.reshape(episode.steps + 1, -1).astype(np.float64) for each in series if each is not None]
     observations = np.concatenate(flat, axis=1)
     if not np.isfinite(observations).all():
         return None
-    known = np.concatenate([observations[:steps], observations[1 : steps + 1], life.action_values[:steps]], axis=1)
-    return np.full(steps, life.seed), np.arange(1, steps + 1), known, life.rewards[:steps]
+    known = np.concatenate([observations[:steps], observations[1 : steps + 1], episode.action_values[:steps]], axis=1)
+    return np.full(steps, episode.seed), np.arange(1, steps + 1), known, episode.rewards[:steps]
 
 
 def _alike(known: Numbers) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

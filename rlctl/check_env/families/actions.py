@@ -1,0 +1,250 @@
+"""RL7: the actions do something, in all of their range, and only there."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import tempfile
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.check_env.action_trials import (
+    REPEATED_STEPS,
+    Dimension,
+    Frame,
+    OutOfTime,
+    Trials,
+    dimensions,
+    is_float_box,
+    observations_differ,
+    steps_of_other_rewards,
+    to_frame,
+)
+from rlctl.check_env.context import Context
+from rlctl.check_env.episode import Episode
+from rlctl.check_env.experiment import experiment
+from rlctl.check_env.failures import EnvironmentRaised
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.leaves import Leaf
+from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message
+
+MOST_DIMENSIONS = 64
+STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))
+"""Seeds and steps that are compared until a difference shows: most show at once, some need time or another start."""
+LONGEST_DELAY = 4
+"""Observations may hold so many earlier actions; a penalty on changes of the action reaches as far [steps]."""
+SATURATED = 0.2
+"""The part of the range from which on nothing may change for it to be called saturated: four fifths are then lost."""
+SWITCH = 0.01
+"""If even from here on nothing changes, only the sign counts: a gripper's switch, say, which may be meant."""
+TWICE = 2.0
+STEPS_AFTER_NAN = 5
+MOST_NAMES = 8
+"""So many dimensions are named in a message."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Effect:
+    """What one dimension of the action does."""
+
+    name: str
+    kind: str
+    """`lasting`; `cost`: in the reward of its own step only; `copy`: beside that, only as a copy of itself in the
+    observation; `none`."""
+    saturates: str = ""
+    """`switch`: only its sign counts; `range`: from a fifth of its range on nothing changes; empty otherwise."""
+
+
+@experiment("action effects", "RL701", "RL702", share=4.0)
+def compare_actions(context: Context) -> Iterator[Message]:
+    """Play the same episode with each number of the action at other values."""
+    with context.fresh() as instance:
+        every = dimensions(instance.action_leaves)
+        if not every:
+            raise NotJudged("no action of a known kind that can be varied")
+        trials = Trials(context, instance)
+        trials.require_repeatable()
+        effects: list[_Effect] = []
+        why = f"only {MOST_DIMENSIONS} are compared" if len(every) > MOST_DIMENSIONS else ""
+        try:
+            for dimension in every[:MOST_DIMENSIONS]:
+                effects.append(_effect(trials, dimension))
+        except OutOfTime:
+            why = "there was no time for more"
+        if not effects:
+            raise NotJudged("there was no time to compare a single action")
+    left_out = f" ({len(effects)} of {len(every)} dimensions: {why})" if why else ""
+    yield from _without_effect(effects, len(every), left_out)
+    yield from _saturated(effects, left_out)
+
+
+def _effect(trials: Trials, dimension: Dimension) -> _Effect:
+    copies = trials.copies(dimension, FIRST_SEED, REPEATED_STEPS, LONGEST_DELAY)
+    kind = "none"
+    for seed, steps in STAGES:
+        plain = trials.plain(seed, steps)
+        for end in dimension.ends:
+            played = trials.with_value(seed, steps, dimension, end)
+            if observations_differ(plain, played, copies):
+                saturates = _saturates(trials, dimension, copies) if dimension.is_continuous else ""
+                return _Effect(dimension.name, "lasting", saturates)
+            if steps_of_other_rewards(plain, played):
+                kind = "cost"
+            elif kind == "none" and observations_differ(plain, played):
+                kind = "copy"
+    return _Effect(dimension.name, "lasting" if kind == "cost" and _lasts(trials, dimension) else kind)
+
+
+def _lasts(trials: Trials, dimension: Dimension) -> bool:
+    """Say whether a single changed action changes rewards long after it: by a state that is not observed."""
+    for seed, steps in STAGES[1:]:
+        plain = trials.plain(seed, steps)
+        at = (len(plain) - 1) // 4
+        for end in dimension.ends:
+            played = trials.with_value(seed, steps, dimension, end, at)
+            # The action of index `at` gives frame `at + 1`.
+            if any(step > at + 1 + LONGEST_DELAY for step in steps_of_other_rewards(plain, played)):
+                return True
+    return False
+
+
+def _saturates(trials: Trials, dimension: Dimension, copies: NDArray[np.intp]) -> str:
+    """Say whether small and large values do the same, in both directions."""
+    low, high = dimension.bounds
+    middle, half = (low + high) / 2, (high - low) / 2
+
+    def same(first: float, second: float) -> bool:
+        for seed, steps in STAGES:
+            one, two = (trials.with_value(seed, steps, dimension, middle + part * half) for part in (first, second))
+            if observations_differ(one, two, copies):
+                return False
+        return True
+
+    if not (same(SATURATED, 1.0) and same(-SATURATED, -1.0)) or (same(0.0, 1.0) and same(0.0, -1.0)):
+        return ""
+    return "switch" if same(SWITCH, 1.0) and same(-SWITCH, -1.0) else "range"
+
+
+def _without_effect(effects: Sequence[_Effect], total: int, left_out: str) -> Iterator[Finding]:
+    dead, costly, copied = ([each.name for each in effects if each.kind == kind] for kind in ("none", "cost", "copy"))
+    if dead:
+        what = "no action has any effect" if len(dead) == total else f"{_list(dead)} without any effect"
+        how = f"at its lowest and highest value, over {STAGES[-1][1]} steps from two seeds"
+        message = f"{what}: {how}, no observation, reward or end changes{left_out}"
+        yield _finding("RL701", dead, message, Severity.ERROR if len(dead) == total else Severity.WARNING)
+    if costly:
+        message = f"{_list(costly)} changes nothing but its own step's reward, a cost for doing nothing{left_out}"
+        # If no action moves anything, it is a bandit, or a series that is only watched.
+        acts = any(each.kind == "lasting" for each in effects)
+        yield _finding("RL701", costly, message, Severity.WARNING if acts else Severity.INFO)
+    if copied:
+        message = f"{_list(copied)} changes nothing but its own copy in the observation{left_out}"
+        yield _finding("RL701", copied, message, Severity.INFO)
+
+
+def _saturated(effects: Sequence[_Effect], left_out: str) -> Iterator[Finding]:
+    for kind, part, what, severity in (
+        ("range", SATURATED, "", Severity.WARNING),
+        ("switch", SWITCH, ": a switch", Severity.INFO),
+    ):
+        if names := [each.name for each in effects if each.saturates == kind]:
+            message = f"{_list(names)}: from {part} of its range on, nothing changes{what}{left_out}"
+            yield _finding("RL702", names, message, severity)
+
+
+def _list(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(names[:MOST_NAMES]) + more
+
+
+def _finding(rule: str, names: list[str], message: str, severity: Severity) -> Finding:
+    evidence = {"value": names, "seed": FIRST_SEED, "seeds": [FIRST_SEED, SECOND_SEED], "steps": STAGES[-1][1]}
+    return Finding(rule, message, evidence, severity)
+
+
+@experiment("out of range", "RL703", share=0.5, provokes="an action of twice the bounds")
+def exceed_bounds(context: Context) -> Iterator[Message]:
+    """Play an episode at the corners of the action space, and again with twice these actions."""
+    with context.fresh() as instance:
+        if not any(each.is_continuous for each in dimensions(instance.action_leaves)):
+            raise NotApplicable("no continuous action with finite bounds")
+        trials = Trials(context, instance, "extreme")
+        trials.require_repeatable()
+        inside = trials.plain(FIRST_SEED, REPEATED_STEPS)
+        beyond = [trials.change(each, _twice) for each in trials.actions(FIRST_SEED, REPEATED_STEPS)]
+        outside, _ = _play_until_refused(Episode(instance, FIRST_SEED, beyond, max_steps=len(beyond)))
+        yield from _first_difference(inside, outside)
+
+
+def _play_until_refused(episode: Episode) -> tuple[list[Frame], bool]:
+    """Return the frames of an episode, and whether a step of it raised."""
+    frames: list[Frame] = []
+    try:
+        for moment in episode:
+            frames.append(to_frame(moment))
+    except EnvironmentRaised as error:
+        if error.call != "step":
+            raise
+        return frames, True
+    return frames, False
+
+
+def _twice(part: Any, leaf: Leaf) -> Any:
+    if not is_float_box(leaf):
+        return part
+    low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    middle = np.where(bounded, (low + high) / 2, 0.0)
+    return np.where(bounded, middle + TWICE * (part - middle), part)
+
+
+def _first_difference(inside: list[Frame], outside: list[Frame]) -> Iterator[Finding]:
+    for step, (a, b) in enumerate(zip(inside, outside, strict=False)):
+        if a.ended != b.ended:
+            what, expected, value = "whether the episode ends", float(any(a.ended)), float(any(b.ended))
+        elif observations_differ([a], [b]):
+            what, (expected, value) = "an observation", _largest_difference(a.observation, b.observation)
+        elif a.reward != b.reward and np.isfinite((a.reward, b.reward)).all():
+            what, expected, value = "the reward", a.reward, b.reward
+        else:
+            continue
+        message = (
+            f"with twice the largest actions {what} is {value:.6g} at step {step}; with the largest {expected:.6g}"
+        )
+        yield Finding("RL703", message, {"seed": FIRST_SEED, "step": step, "value": value, "expected": expected})
+        return
+
+
+def _largest_difference(one: NDArray[Any], two: NDArray[Any]) -> tuple[float, float]:
+    if one.shape != two.shape:
+        return float(one.size), float(two.size)
+    a, b = np.nan_to_num(one.astype(np.float64)), np.nan_to_num(two.astype(np.float64))
+    i = int(np.abs(a - b).argmax())
+    return float(a[i]), float(b[i])
+
+
+@experiment("nan action", "RL704", share=0.3, provokes="an action of NaN")
+def give_nan(context: Context) -> Iterator[Message]:
+    """Take an action of NaN, and a few good ones after it."""
+    import gymnasium
+
+    with context.fresh() as instance:
+        if not any(is_float_box(leaf) for leaf in instance.action_leaves):
+            raise NotApplicable("no continuous action")
+        if not isinstance(instance.env, gymnasium.Env):
+            raise NotJudged("it is not a gymnasium.Env (RL003)")
+        trials = Trials(context, instance)
+        first, *good = trials.actions(FIRST_SEED, 1 + STEPS_AFTER_NAN)
+        nan = trials.change(first, lambda part, leaf: np.full_like(part, np.nan) if is_float_box(leaf) else part)
+        # A simulator may write a log of what it did not like to where it is: MuJoCo does.
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            frames, is_refused = _play_until_refused(Episode(instance, FIRST_SEED, [nan, *good], max_steps=6))
+    if is_refused:
+        return
+    is_finite = all(np.isfinite(each.reward) and np.isfinite(each.observation).all() for each in frames[1:])
+    value = "only finite numbers come back" if is_finite else "NaN comes back"
+    evidence = {"seed": FIRST_SEED, "step": 1, "value": value, "expected": "an exception"}
+    yield Finding("RL704", f"an action of NaN is accepted, and {value}", evidence)

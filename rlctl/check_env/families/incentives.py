@@ -1,0 +1,197 @@
+"""RL604 to RL606: what the reward makes worth doing, found by comparing recorded episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.check_env.experiment import check
+from rlctl.check_env.families.determinism import compare
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.messages import Trajectory
+from rlctl.check_env.records import Records
+from rlctl.check_env.rewarded import (
+    DISCOUNT,
+    WITH_SEARCH,
+    at_step,
+    constant_terms,
+    discounted_steps,
+    discounted_sum,
+    ends_in_success,
+    has_succeeded,
+    has_terms,
+    longest_episode,
+    reports_success,
+    require_rewarded,
+    terms_of,
+)
+
+LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5
+"""Part of all rewards that the last one of an episode is as good as, from which its end looks like a goal, or like
+nothing in particular. Below, it looks like a failure."""
+LATE = 10
+"""Up to how many steps before its end another episode may part from one that finished, to be compared with it."""
+FAR_ABOVE = 5.0
+"""The last reward of an episode is that of a goal, where success is not reported, if it stands out by so many times the
+spread of the rewards in its first half: a robot that falls while it walks fast ends with a good reward too."""
+CLEARLY = 0.1
+"""How much more hovering has to be worth than finishing."""
+NEARLY = 0.05
+"""How much better than doing nothing something has to be, to be better."""
+FEWEST_COMPARED = 10
+COMPARED_STEPS = 200
+"""How much of the episodes is compared at most: the search's are no longer."""
+SHORTEST_COMPARED = 10
+MOST_OF = 0.5
+
+
+@check("RL604", *WITH_SEARCH)
+def find_paid_ends(records: Records) -> Iterator[Finding]:
+    episodes = require_rewarded(records)
+    if not any(each.terminated.any() for each in episodes):
+        raise NotApplicable("nothing ended an episode early")
+    longest = longest_episode(records, episodes)
+    inner = np.concatenate([each.rewards[: each.steps - each.has_ended] for each in episodes])
+    early = [
+        each for each in episodes if each.ended == "terminated" and each.steps < longest and not ends_in_success(each)
+    ]
+    if not early or not inner.size or inner.max() > 0 or inner.mean() == 0:
+        return
+    mean = float(inner.mean())
+    gains = [float(each.rewards[-1]) - mean - DISCOUNT * discounted_steps(mean, longest - each.steps) for each in early]
+    gain = float(np.median(gains))
+    severity = _severity_of_end(episodes, early, inner)
+    if gain <= 0 or severity is None:
+        return
+    example = early[int(np.argmax(gains))]
+    last = float(example.rewards[-1])
+    yield Finding(
+        "RL604",
+        f"{len(early)} of {len(episodes)} episodes ended early without success. The mean reward is {mean:.3g} and none "
+        f"but the last is above 0, so ending at step {example.steps} with {last:.3g} saves "
+        f"{-DISCOUNT * discounted_steps(mean, longest - example.steps):.3g} (discounted by {DISCOUNT} up to step "
+        f"{longest})",
+        at_step(example, example.steps, value=last, mean_reward=mean, gain=gain),
+        severity,
+    )
+
+
+def _severity_of_end(
+    episodes: Sequence[Trajectory], early: Sequence[Trajectory], inner: NDArray[np.float64]
+) -> Severity | None:
+    if reports_success(episodes):
+        return Severity.WARNING
+    as_good_as = float(np.median([np.mean(inner <= each.rewards[-1]) for each in early]))
+    if as_good_as >= LIKE_A_GOAL:
+        return None
+    return Severity.INFO if as_good_as >= LIKE_ANY else Severity.WARNING
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """Two episodes that are the same up to a step, from where one finishes and the other hovers."""
+
+    finished: Trajectory
+    step: int
+    finishing: float
+    """The discounted rewards from that step on."""
+    hovering: float
+    per_step: float
+    """The mean reward of hovering."""
+
+
+@check("RL605", *WITH_SEARCH)
+def find_paid_hovering(records: Records) -> Iterator[Finding]:
+    episodes = require_rewarded(records)
+    is_reported = reports_success(episodes)
+    finished = [each for each in episodes if _finishes(each, is_reported)]
+    if not finished:
+        raise NotApplicable("nothing ended an episode at a goal")
+    if max(float(each.rewards[:-1].max(initial=0.0)) for each in episodes) <= 0:
+        return  # there is nothing to be earned by staying
+    if compare(records, "alone", "reused")[1] is not None:
+        raise NotJudged("equal seeds and actions give unequal episodes (RL301, RL302)")
+    others = [each for each in records.role("search") if each.steps and not _finishes(each, is_reported)]
+    longest = longest_episode(records, episodes)
+    pairs = [pair for one in finished for two in others if (pair := pair_up(one, two, longest)) is not None]
+    if not pairs:
+        raise NotJudged("no episode that stops just before the goal could be played")
+    best = max(pairs, key=lambda pair: pair.hovering - pair.finishing)
+    if best.per_step > 0 and best.hovering > best.finishing + CLEARLY * abs(best.finishing):
+        step, expected = best.step + 1, f"below {best.finishing:.6g}"
+        yield Finding(
+            "RL605",
+            f"finishing at step {best.finished.steps} is worth {best.finishing:.4g} from step {step} on; stopping "
+            f"there instead earns {best.per_step:.3g} per step, worth {best.hovering:.4g} (discounted by {DISCOUNT} up "
+            f"to step {longest})",
+            at_step(best.finished, step, value=best.hovering, expected=expected, per_step=best.per_step),
+        )
+
+
+def _finishes(episode: Trajectory, success_is_reported: bool) -> bool:
+    """Whether an episode ended at the goal: as it reports, or else with a reward far above what it began with."""
+    if episode.ended not in ("terminated", "both"):
+        return False
+    if success_is_reported:
+        return ends_in_success(episode)
+    begin = episode.rewards[: episode.steps // 2]
+    return len(begin) > 1 and bool(episode.rewards[-1] > begin.max() + FAR_ABOVE * np.ptp(begin))
+
+
+def pair_up(one: Trajectory, two: Trajectory, longest: int) -> Pair | None:
+    """Compare an episode that finished with another of the same seed that parts from it shortly before that.
+
+    `longest`: how long an episode may last [steps]. None if they are not such a pair.
+    """
+    if one.role != two.role or one.seed != two.seed or two.steps <= one.steps or two.ended == "raised":
+        return None
+    differ = (one.action_values != two.action_values[: one.steps]).any(axis=1)
+    step = int(differ.argmax())
+    if not differ.any() or step < one.steps - LATE:
+        return None
+    rest = two.rewards[step:]
+    to_come = 0 if two.has_ended else longest - two.steps
+    hovering = discounted_sum(rest) + DISCOUNT ** len(rest) * discounted_steps(float(rest[-LATE:].mean()), to_come)
+    return Pair(one, step, discounted_sum(one.rewards[step:]), hovering, float(rest.mean()))
+
+
+@check("RL606", *WITH_SEARCH)
+def find_paid_idleness(records: Records) -> Iterator[Finding]:
+    compared = [each for each in require_rewarded(records) if each.role in ("episodes", "search")]
+    idle = [each for each in compared if each.actions == "zero"]
+    others = [each for each in compared if each.actions != "zero"]
+    if not idle or len(others) < FEWEST_COMPARED:
+        raise NotJudged(f"{len(idle)} episodes with zero actions and {len(others)} others were recorded")
+    steps = min(COMPARED_STEPS, *(each.steps for each in idle))
+    if any(each.terminated.any() or has_succeeded(each) for each in idle) or steps < SHORTEST_COMPARED:
+        return
+    nothing = [discounted_sum(each.rewards[:steps]) for each in idle]
+    something = [discounted_sum(each.rewards[:steps]) for each in others if each.steps >= steps or each.has_ended]
+    if not something or len({float(reward) for each in compared for reward in each.rewards[:steps]}) == 1:
+        return  # a reward that never changes is RL602's
+    mean, best = float(np.mean(nothing)), max(something)
+    if mean <= 0 or min(nothing) <= 0 or best > mean + NEARLY * abs(mean):
+        return
+    bonus, share = _bonus(idle)
+    because = f"; {100 * share:.0f} % of it is the term {bonus!r}, which never changes" if bonus else ""
+    yield Finding(
+        "RL606",
+        f"doing nothing is worth {mean:.4g} over {steps} steps (discounted by {DISCOUNT}), the best of "
+        f"{len(something)} other episodes {best:.4g}{because}",
+        at_step(idle[0], steps, value=mean, best=best, term=bonus, share=share),
+        Severity.WARNING if bonus else Severity.INFO,
+    )
+
+
+def _bonus(idle: Sequence[Trajectory]) -> tuple[str | None, float]:
+    """Return the constant positive term that is most of the reward, if there is one, and its share."""
+    total = sum(float(np.nansum(np.abs(values))) for each in idle for values in terms_of(each).values())
+    if total <= 0 or not all(has_terms(each) for each in idle):
+        return None, 0.0
+    steps = sum(each.steps for each in idle)
+    shares = {name: value * steps / total for name, value in constant_terms(idle).items() if value > 0}
+    largest = max(shares, key=lambda name: shares[name], default=None)
+    return (largest, shares[largest]) if largest is not None and shares[largest] >= MOST_OF else (None, 0.0)

@@ -1,0 +1,191 @@
+"""RL101 to RL105: observations, inside their space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.check_env.experiment import check
+from rlctl.check_env.finding import Finding, Severity
+from rlctl.check_env.leaves import Leaf, leaf_name
+from rlctl.check_env.messages import Form, Series, Trajectory
+from rlctl.check_env.records import Records
+
+ROUNDING = 1e-6
+"""Excess over a bound, relative to the bound, up to which it is float rounding."""
+LARGE_SHARE = 0.1
+"""Part of all observations from which values outside the bounds are no rare extreme."""
+
+
+def _forms(records: Records) -> Iterator[tuple[Leaf, list[tuple[Trajectory, Form]]]]:
+    """Yield what each leaf that can be judged looked like, in all episodes."""
+    for index, leaf in enumerate(records.require_built().leaves):
+        if leaf.supported:
+            yield (
+                leaf,
+                [
+                    (trajectory, form)
+                    for trajectory in records.require_alone()
+                    for form in trajectory.forms
+                    if form.what == "observation" and form.leaf == index
+                ],
+            )
+
+
+def _series(records: Records, index: int) -> Iterator[tuple[Trajectory, Series]]:
+    """Yield the values of a leaf, per episode."""
+    for trajectory in records.require_alone():
+        if index in trajectory.observations:
+            yield trajectory, trajectory.observations[index]
+
+
+def _when(step: int) -> str:
+    return "from reset" if step == 0 else f"at step {step}"
+
+
+@check("RL101")
+def find_wrong_shape(records: Records) -> Iterator[Finding]:
+    for leaf, forms in _forms(records):
+        for trajectory, form in forms:
+            if what := _wrong_shape(leaf, form):
+                shape = None if form.shape is None else list(form.shape)
+                message = f"{leaf_name(leaf)} {_when(form.step)} {what}"
+                evidence = {**trajectory.place, "step": form.step, "type": form.type, "shape": shape}
+                yield Finding("RL101", message, {**evidence, "expected": list(leaf.shape)})
+                break
+    for trajectory in records.require_alone():
+        for form in trajectory.forms:
+            if form.what == "keys":
+                message = f"observation has the keys {form.type}; the space has other ones"
+                yield Finding("RL101", message, {**trajectory.place, "step": form.step})
+                return
+
+
+def _wrong_shape(leaf: Leaf, form: Form) -> str:
+    if form.type == "missing":
+        return f"is missing; the space has shape {leaf.shape}"
+    if form.shape != leaf.shape:
+        what = f"has shape {form.shape}" if form.shape is not None else f"is not an array but a {form.type}"
+        return f"{what}; the space has shape {leaf.shape}"
+    return f"is a {form.type}, not a numpy array" if form.type in ("list", "tuple") else ""
+
+
+@check("RL102")
+def find_wrong_dtype(records: Records) -> Iterator[Finding]:
+    wrong = [
+        (leaf, trajectory, form)
+        for leaf, forms in _forms(records)
+        for trajectory, form in forms
+        if _has_wrong_dtype(leaf, form)
+    ]
+    parts = len({leaf.path for leaf, *_ in wrong})
+    for leaf, trajectory, form in wrong[:1]:
+        more = f"; {parts - 1} other parts differ too" if parts > 1 else ""
+        message = f"{leaf_name(leaf)} {_when(form.step)} is {form.dtype}; the space is {leaf.dtype}{more}"
+        is_number = np.dtype(form.dtype).kind in "biuf"
+        evidence = {**trajectory.place, "step": form.step, "dtype": form.dtype, "expected": leaf.dtype}
+        yield Finding("RL102", message, evidence, Severity.WARNING if is_number else Severity.ERROR)
+
+
+def _has_wrong_dtype(leaf: Leaf, form: Form) -> bool:
+    if form.dtype is None or form.shape != leaf.shape or form.type in ("list", "tuple"):
+        return False
+    dtype, declared = np.dtype(form.dtype), np.dtype(leaf.dtype)
+    if leaf.kind != "Box":
+        return dtype.kind not in "iub"
+    return dtype != declared and not (form.type in ("float", "int") and leaf.shape == ())
+
+
+@check("RL103")
+def find_out_of_range(records: Records) -> Iterator[Finding]:
+    for index, leaf in enumerate(records.require_built().leaves):
+        if not leaf.supported:
+            continue
+        worst: tuple[float, Trajectory, Series, int, int] | None = None
+        outside = total = 0
+        from_reset = False
+        for trajectory, series in _series(records, index):
+            excess = _excess(leaf, series.values).reshape(len(series.values), -1)
+            rows = excess.max(axis=1, initial=0.0)
+            outside, total = outside + int((rows > 0).sum()), total + len(rows)
+            from_reset |= bool((rows[series.steps == 0] > 0).any())
+            if rows.size and rows.max() > (worst[0] if worst else 0.0):
+                row = int(rows.argmax())
+                worst = float(rows[row]), trajectory, series, row, int(excess[row].argmax())
+        if worst is not None:
+            is_often = from_reset or outside >= LARGE_SHARE * total
+            yield _out_of_range(records, index, *worst[1:], outside=(outside, total), is_often=is_often)
+
+
+def _excess(leaf: Leaf, values: NDArray[Any]) -> NDArray[np.float64]:
+    """How far values are outside their bounds; 0 inside, and for NaN, which is another rule's."""
+    low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
+    wide = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        excess = np.maximum(np.maximum(low - wide, wide - high), 0.0)
+    return np.where(np.isfinite(wide), excess, 0.0)
+
+
+def _out_of_range(
+    records: Records,
+    index: int,
+    trajectory: Trajectory,
+    series: Series,
+    row: int,
+    flat: int,
+    *,
+    outside: tuple[int, int],
+    is_often: bool,
+) -> Finding:
+    built = records.require_built()
+    leaf, step = built.leaves[index], int(series.steps[row])
+    value = float(series.values[row].flat[flat])
+    low, high = (float(np.ravel(np.asarray(bound))[flat]) for bound in (leaf.low, leaf.high))
+    bound = low if value < low else high
+    is_rounding = np.dtype(leaf.dtype).kind == "f" and abs(value - bound) <= ROUNDING * max(abs(bound), 1e-3)
+    element = built.element(index, flat)
+    return Finding(
+        "RL103",
+        f"{element} is {value:.9g} {_when(step)}; the space allows [{low:.9g}, {high:.9g}]"
+        f"{' (float rounding)' if is_rounding else ''}; {outside[0]} of {outside[1]} observations are outside",
+        {
+            **trajectory.place,
+            "step": step,
+            "element": element,
+            "value": value,
+            "expected": [low, high],
+            "observations_outside": outside[0],
+            "observations": outside[1],
+        },
+        Severity.ERROR if is_often and not is_rounding else Severity.WARNING,
+    )
+
+
+@check("RL104")
+def find_not_finite(records: Records) -> Iterator[Finding]:
+    built = records.require_built()
+    for index, _ in enumerate(built.leaves):
+        for trajectory, series in _series(records, index):
+            if series.values.dtype.kind != "f" or np.isfinite(series.values).all():
+                continue
+            values = series.values.reshape(len(series.values), -1)
+            row, flat = np.argwhere(~np.isfinite(values))[0].tolist()
+            step, element, value = int(series.steps[row]), built.element(index, flat), str(values[row, flat])
+            evidence = {**trajectory.place, "step": step, "element": element, "value": value, "expected": "finite"}
+            yield Finding("RL104", f"{element} is {value} {_when(step)}", evidence)
+            break
+
+
+@check("RL105")
+def find_shared_memory(records: Records) -> Iterator[Finding]:
+    leaves = records.require_built().leaves
+    for trajectory in records.require_alone():
+        for form in trajectory.forms:
+            if form.what == "memory" and form.leaf is not None:
+                name = leaf_name(leaves[form.leaf])
+                message = f"step {form.step} wrote into the memory of the {name} returned before it"
+                yield Finding("RL105", message, {**trajectory.place, "step": form.step, "steps": form.count})
+                return

@@ -1,0 +1,120 @@
+"""RL601 to RL603, RL607 and RL612: the reward as a number, and its terms in `info["reward_terms"]`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from rlctl.check_env.experiment import check
+from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.messages import MOST_INFOS, Trajectory
+from rlctl.check_env.records import Records
+from rlctl.check_env.rewarded import (
+    WITH_SEARCH,
+    at_step,
+    constant_terms,
+    has_succeeded,
+    require_rewarded,
+    require_terms,
+    summarize,
+    terms_of,
+)
+
+LARGE = 10.0
+"""Root mean square per step from which a reward is large. With the usual discount a return is up to a hundred times
+as much, and value networks begin near 0. Pendulum's rewards, down to -16, are below it."""
+HUGE = 1_000.0
+"""A single reward beyond this, ten times the usual bonus for finishing, spoils the value estimate of all before it."""
+ROUNDING = 1e-5
+"""How far a sum of terms may be off, relative to the sum of all sizes: terms are often float32."""
+MEANT_CONSTANT = re.compile(
+    r"(^|_)(alive|aliveness|surviv\w*|time|steps?|living|life|exist\w*|constant|bias)(_|$)", re.I
+)
+"""Names of terms that are meant to be the same at every step."""
+
+
+@check("RL601")
+def find_not_finite(records: Records) -> Iterator[Finding]:
+    for episode in records.require_alone():
+        wrong = np.flatnonzero(~np.isfinite(episode.rewards) & episode.reward_is_number)
+        if wrong.size:
+            step, value = int(wrong[0]) + 1, str(episode.rewards[wrong[0]])
+            evidence = at_step(episode, step, value=value, expected="finite")
+            yield Finding("RL601", f"the reward is {value} at step {step}", evidence)
+            return
+
+
+@check("RL602", *WITH_SEARCH)
+def find_constant_reward(records: Records) -> Iterator[Finding]:
+    episodes = require_rewarded(records)
+    constant = float(episodes[0].rewards[0])
+    if any((each.rewards != constant).any() or each.terminated.any() for each in episodes):
+        return
+    at_success = any(has_succeeded(each) for each in episodes)
+    also = ", also where is_success is true" if at_success else ""
+    yield Finding(
+        "RL602",
+        f"the reward is {constant:g} at every step of {summarize(episodes)}{also}, and nothing ends an episode early",
+        {"value": constant, "episodes": len(episodes), "steps": sum(each.steps for each in episodes)},
+        Severity.WARNING if constant > 0 or at_success else Severity.INFO,
+    )
+
+
+@check("RL603")
+def find_badly_scaled(records: Records) -> Iterator[Finding]:
+    require_rewarded(records)
+    episodes = [each for each in records.episodes if each.steps]
+    if not episodes:
+        return
+    inner = np.concatenate([each.rewards[: each.steps - each.has_ended] for each in episodes])
+    size = float(np.sqrt(np.mean(inner**2))) if inner.size else 0.0
+    largest = max(episodes, key=lambda each: float(np.abs(each.rewards).max()))
+    step = int(np.abs(largest.rewards).argmax())
+    value = float(largest.rewards[step])
+    if size > LARGE:
+        message = f"the reward per step is {size:.3g} (root mean square), up to {value:.3g}"
+    elif abs(value) > HUGE:
+        message = f"the reward is {value:.3g} at step {step + 1}; usual is {size:.2g}"
+    else:
+        return
+    evidence = at_step(largest, step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
+    yield Finding("RL603", message, evidence, Severity.INFO if records.normalizes else Severity.WARNING)
+
+
+@check("RL607", *WITH_SEARCH)
+def find_wrong_sum(records: Records) -> Iterator[Finding]:
+    episodes = require_terms(records)
+    if any(len(each.infos) >= MOST_INFOS for each in episodes):
+        raise NotJudged(f"info has more than {MOST_INFOS} numbers, not all were recorded")
+    worst: tuple[float, Trajectory, int, float] | None = None
+    wrong = steps = 0
+    for each in episodes:
+        values = np.stack(list(terms_of(each).values()))
+        is_known = ~np.isnan(values).all(axis=0)
+        sums, sizes = np.nansum(values, axis=0), np.nansum(np.abs(values), axis=0)
+        off = np.where(is_known, np.abs(sums - each.rewards), 0.0)
+        off[off <= ROUNDING * np.maximum(sizes, np.abs(each.rewards))] = 0.0
+        wrong, steps, step = wrong + int((off > 0).sum()), steps + int(is_known.sum()), int(off.argmax())
+        if off[step] > (worst[0] if worst else 0.0):
+            worst = float(off[step]), each, step, float(sums[step])
+    if worst is not None:
+        _, episode, step, total = worst
+        reward = float(episode.rewards[step])
+        terms = {name: None if np.isnan(each[step]) else float(each[step]) for name, each in terms_of(episode).items()}
+        yield Finding(
+            "RL607",
+            f"the terms add up to {total:.6g} at step {step + 1}, the reward is {reward:.6g}; they differ at {wrong:,} "
+            f"of {steps:,} steps",
+            at_step(episode, step + 1, value=total, expected=reward, terms=terms),
+        )
+
+
+@check("RL612", *WITH_SEARCH)
+def find_constant_penalty(records: Records) -> Iterator[Finding]:
+    episodes = require_terms(records)
+    for name, value in constant_terms(episodes).items():
+        if value < 0 and not MEANT_CONSTANT.search(name):
+            message = f"reward term {name!r} is {value:.6g} at every step of {summarize(episodes)}"
+            yield Finding("RL612", message, {"term": name, "value": value, "episodes": len(episodes)})
