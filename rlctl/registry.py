@@ -123,6 +123,9 @@ def load(task: str) -> Callable[..., Any]:
             raise TaskError(f"task {task!r} of {entry.distribution} {entry.version}: {entry.problem}")
         return _load_target(task, entry.target)
     if _GYMNASIUM_ID.match(task):
+        package = task.rpartition(":")[0]
+        if package and _module_file(package) is not None:
+            _import_module(task, package)  # here, so that what it raises is known as an import's
         return _load_gymnasium(task)
     if ":" in task:
         return _load_target(task, task)

@@ -20,6 +20,7 @@ from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.instance import Instance
 from rlctl.check_env.leaves import pick
 from rlctl.check_env.messages import FIRST_SEED, Fact, Message, Skipped
+from rlctl.check_env.missing_files import missing_file
 from rlctl.check_env.no_display import NO_DISPLAY, lost_display
 from rlctl.check_env.records import Records
 
@@ -189,6 +190,8 @@ def _render_in(context: Context, mode: RenderMode) -> Iterator[Finding]:
             picture = instance.call("render", instance.env.render)
     except EnvironmentRaised as error:
         cause = error.__cause__ or error
+        if missing_file(cause) is not None:
+            raise NotJudged("a file that the environment loads is missing (RL007)") from None
         if _is_missing(cause):
             raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
         call = "the constructor" if error.call == "build" else error.call

@@ -81,6 +81,12 @@ def require_repeatable(records: Records) -> None:
         raise NotJudged("the same instance already differs from itself (RL301, RL302)")
 
 
+def require_independent(records: Records) -> None:
+    """Raise `NotJudged` if an episode depends on the one before it."""
+    if compare(records, "alone", "reused")[1] is not None or compare(records, "alone", "dirty")[1] is not None:
+        raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
+
+
 def _report(
     rule: str, records: Records, trajectory: Trajectory, difference: Difference, what: str, *, is_mild: bool = False
 ) -> Finding:
@@ -151,7 +157,7 @@ def compare_seeds(records: Records) -> Iterator[Finding]:
 def compare_unseeded(records: Records) -> Iterator[Finding]:
     trajectory, difference = compare(records, "unseeded", "unseeded again")
     if difference is not None:
-        require_repeatable(records)
+        require_independent(records)
         what = "reset with a seed and then without one, twice"
         yield _report("RL308", records, trajectory, difference, what)
 

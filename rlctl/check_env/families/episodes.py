@@ -94,18 +94,15 @@ def find_time_limit_as_terminated(records: Records) -> Iterator[Finding]:
     ties = [each for each in ended if each.steps == limit]
     of = {"episodes": len(ties), "of": len(episodes)}
     evidence = {"step": limit, **of, "value": "terminated", "expected": "truncated"}
+    has_obstacle = all(_ends_with_odd_reward(each) for each in ties)
     if limit >= SHORTEST_LIMIT and len(ties) == len(episodes):
         message = f"all {len(ties)} episodes, whatever the actions, end at step {limit} with terminated=True"
-        if all(_ends_with_odd_reward(each) for each in ties):
+        if has_obstacle:
             message += ", and with a reward unlike any before: a time limit, or an obstacle that none of them passes"
-            yield Finding("RL501", message, evidence, Severity.WARNING)
-        else:
-            yield Finding("RL501", message, evidence)
+        yield Finding("RL501", message, evidence, Severity.INFO if has_obstacle else None)
     elif limit >= SHORTEST_TIE and len(ties) >= FEWEST_TIES and len({each.actions for each in ties}) > 1:
-        message = (
-            f"{len(ties)} of {len(episodes)} episodes end at step {limit} with terminated=True, and none is longer"
-        )
-        yield Finding("RL501", message, evidence, Severity.WARNING)
+        message = f"{len(ties)} of {len(episodes)} episodes end at step {limit} with terminated=True, none later"
+        yield from () if has_obstacle else (Finding("RL501", message, evidence),)
 
 
 def _ends_with_odd_reward(episode: Trajectory) -> bool:

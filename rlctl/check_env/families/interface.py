@@ -41,7 +41,7 @@ def find_wrong_types(records: Records) -> Iterator[Finding]:
     for what in ("terminated", "truncated"):
         for trajectory, form in _first_forms(records, what, "bool"):
             message = f"{what} is {_a(form.type)} at step {form.step}"
-            severity = Severity.WARNING if form.type in ("numpy.bool", "numpy.bool_") else None
+            severity = Severity.INFO if form.type in ("numpy.bool", "numpy.bool_") else None
             yield _of_form("RL204", message, trajectory, form, "bool", severity)
     for trajectory, form in _first_forms(records, "reward", *NUMBERS):
         is_number = form.type.startswith(("numpy.float", "numpy.int", "numpy.uint"))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from rlctl.check_env.comparison import find_difference
 from rlctl.check_env.context import Context
 from rlctl.check_env.experiment import check, experiment
-from rlctl.check_env.families.determinism import COMPARED_STEPS, compare
+from rlctl.check_env.families.determinism import COMPARED_STEPS, compare, require_independent
 from rlctl.check_env.families.interface import select_failures
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.instance import Instance
@@ -74,12 +74,11 @@ def _close_in_between(context: Context, recording: Recording, neighbour: Instanc
     yield from recording.messages()
 
 
-def _require_independent(records: Records) -> None:
-    """Raise `NotJudged` unless instances and episodes that follow each other do the same."""
+def _require_same_alone(records: Records) -> None:
+    """Raise `NotJudged` unless instances, and episodes, that follow each other do the same."""
     if compare(records, "fresh process", "fresh instance")[1] is not None:
         raise NotJudged("two instances differ already when they are alone (RL301 to RL304)")
-    if compare(records, "alone", "reused")[1] is not None or compare(records, "alone", "dirty")[1] is not None:
-        raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
+    require_independent(records)
 
 
 def _failure(records: Records, rule: str, phase: str, doing: str) -> Finding | None:
@@ -113,7 +112,7 @@ def _difference(records: Records, rule: str, beside: Trajectory, doing: str) -> 
 
 @check("RL401", "comparisons", "instances")
 def find_shared_world(records: Records) -> Iterator[Finding]:
-    _require_independent(records)
+    _require_same_alone(records)
     found = _failure(records, "RL401", "interleaved", IN_TURNS)
     if found is None:
         records.require_role("interleaved")
@@ -125,7 +124,7 @@ def find_shared_world(records: Records) -> Iterator[Finding]:
 
 @check("RL402", "comparisons", "instances")
 def find_effect_of_closing(records: Records) -> Iterator[Finding]:
-    _require_independent(records)
+    _require_same_alone(records)
     found = _failure(records, "RL402", "after close", AFTER_CLOSE)
     if found is None:
         if list(find_shared_world.run(records)):
