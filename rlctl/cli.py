@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
+from typer.core import TyperGroup
 
 from rlctl import __version__
 from rlctl.errors import RlctlError, UsageError
@@ -26,6 +27,19 @@ app = typer.Typer(
 
 tasks_app = typer.Typer()
 app.add_typer(tasks_app, name="tasks")
+
+
+class _RunsGroup(TyperGroup):
+    """Reads `rlctl runs [TASK]` as `rlctl runs list [TASK]`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args or (args[0] not in self.commands and args[0] not in ctx.help_option_names):
+            args = ["list", *args]
+        return super().parse_args(ctx, args)
+
+
+runs_app = typer.Typer(cls=_RunsGroup, help="List runs, show one, compare several, remove what is not needed.")
+app.add_typer(runs_app, name="runs")
 
 TASK_FORMS = "Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id."
 OptionalTask = Annotated[
@@ -359,6 +373,117 @@ def new_task(
     from rlctl.tasks.new import create, show
 
     show(create(name), json)
+
+
+@runs_app.command("list")
+def list_runs(
+    task: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Argument(metavar="[TASK]", help="Only the runs of this task.", show_default=False),
+    ] = None,
+    sort: Annotated[str, typer.Option(metavar="newest|score|steps|minutes", help="Order.")] = "newest",
+    json: Json = None,
+) -> None:
+    """List every run below ./runs. `rlctl runs` alone does the same."""
+    from rlctl.runs.listing import list_runs, show
+
+    show(list_runs(task, sort=sort), json)
+
+
+@runs_app.command("show")
+def show_run(run: Run = None, json: Json = None) -> None:
+    """Show a run: its recipe, curve, evaluations, warnings and files."""
+    from rlctl.runs.show import describe, show
+
+    show(describe(run), json)
+
+
+@runs_app.command("compare")
+def compare_runs(
+    runs: Annotated[
+        list[str],
+        typer.Argument(metavar="A B...", help="Runs, globs or folders of runs; the first is the baseline."),
+    ],
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes that each run plays.", min=2)] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    task: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Evaluate all on this task.", show_default=False),
+    ] = None,
+    threshold: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="Success rate (or return) to be reached soon; 0.9 where success is known."),
+    ] = None,
+    gate: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(metavar="not-worse", help="Exit 1 if one is worse than the first.", show_default=False),
+    ] = None,
+    json: Json = None,
+) -> None:
+    """Say whether a policy, or a recipe trained with several seeds, is better than another."""
+    _claim_stdout()
+    if gate not in (None, "not-worse"):
+        raise UsageError(f"--gate {gate}: the one gate there is is not-worse")
+    from rlctl.runs.comparison import CompareRequest, compare
+    from rlctl.runs.comparison_report import show
+
+    result = compare(CompareRequest(runs, episodes, seed, task, threshold))
+    show(result, json)
+    if gate:
+        result.check()
+
+
+@runs_app.command("import")
+def import_run(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.zip", help="Model of Stable-Baselines3 or rl-zoo3.")],
+    task: Annotated[str, typer.Option(metavar="TASK", help=f"What it was trained on. {TASK_FORMS}")],
+    vecnormalize: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(metavar="FILE.pkl", help="Its normalisation, if it has one.", show_default=False),
+    ] = None,
+    algo: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Its algorithm, where the file does not tell it.", show_default=False),
+    ] = None,
+    settings: Set = [],  # noqa: B006
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--output", "-o", metavar="FILE", help="Policy file to write. Default: MODEL.safetensors."),
+    ] = None,
+    json: Json = None,
+) -> None:
+    """Turn a model of Stable-Baselines3 into a policy file. Nothing in the model is unpickled."""
+    _claim_stdout()
+    from rlctl.runs.import_model import ImportRequest, import_model, show
+
+    request = ImportRequest(model, task, vecnormalize, algo, output, _task_settings(settings))
+    show(import_model(request), json)
+
+
+@runs_app.command("rm")
+def remove_runs(
+    runs: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Argument(metavar="RUN...", help="Folders of runs.", show_default=False),
+    ] = None,
+    keep_best: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(metavar="N", help="Remove all finished or failed runs but the N best of each task.", min=0),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Remove runs, never one that is being trained."""
+    from rlctl.runs.removal import plan_removal, remove_with_report
+
+    remove_with_report(plan_removal(runs or [], keep_best=keep_best), yes=yes)
+
+
+@runs_app.command("prune")
+def prune_runs(yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False) -> None:
+    """Remove the checkpoints of finished runs, which are needed only to train on."""
+    from rlctl.runs.removal import plan_prune, remove_with_report
+
+    remove_with_report(plan_prune(), yes=yes)
 
 
 def _claim_stdout() -> None:

@@ -14,7 +14,7 @@ LAYERS = [
     {"__main__"},
     {"cli"},
     {"train"},
-    {"export", "replay", "tasks"},
+    {"export", "replay", "tasks", "runs"},
     {"check_env", "eval"},
     {"rollout"},
     {"run"},

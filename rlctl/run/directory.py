@@ -10,12 +10,14 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rlctl import registry
 from rlctl.errors import ArtifactError, UsageError, did_you_mean, short_repr
 from rlctl.run import files
-from rlctl.run.recipe import Recipe, read, validate
+
+if TYPE_CHECKING:
+    from rlctl.run.recipe import Recipe
 
 ROOT = Path("runs")
 _DIGITS = 18  # of a training step
@@ -91,6 +93,8 @@ class RunDirectory:
 
     def recipe(self) -> Recipe:
         """Read the resolved recipe; raises `ArtifactError` if it is not the one that the training began with."""
+        from rlctl.run.recipe import read, validate
+
         content = read(self.recipe_file)
         if not files.is_as_sealed(self.recipe_file):
             raise ArtifactError(
@@ -194,6 +198,23 @@ class RunLock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
+
+
+def is_being_written(folder: Path) -> bool:
+    """Say whether a process trains in a run folder now; False where the file system has no locks."""
+    try:
+        descriptor = os.open(folder / ".lock", os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return False
 
 
 def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:

@@ -10,14 +10,14 @@ import stat
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, BinaryIO
-
-import numpy as np
-import pydantic
-from numpy.typing import NDArray
+from typing import IO, TYPE_CHECKING, Any, BinaryIO
 
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.run import memory
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 JSON_LIMIT = 16 * 2**20  # [bytes]
 _DEPTH = 100
@@ -105,6 +105,8 @@ def _within(value: dict[str, Any] | list[Any]) -> Any:
 
 def explain_error(error: Exception) -> str:
     """Return in a line what is wrong with a description; of pydantic's report the first problem, with its place."""
+    import pydantic
+
     if isinstance(error, pydantic.ValidationError):
         problem = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in problem["loc"]) or "it"
@@ -144,6 +146,8 @@ def _check_archive(members: list[zipfile.ZipInfo]) -> None:
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    import numpy as np
+
     with archive.open(member) as stream:
         shape, dtype = _read_header(stream)
         if dtype.hasobject:
@@ -157,6 +161,8 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[A
 
 
 def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    import numpy as np
+
     version = np.lib.format.read_magic(stream)
     if version == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(stream)

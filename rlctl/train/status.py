@@ -11,11 +11,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from rlctl import registry
-from rlctl.errors import DivergedError, Interrupted
+from rlctl.errors import DivergedError, Interrupted, RlctlError
 from rlctl.run import files
 from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import collect_versions
-from rlctl.run.recipe import Recipe
+from rlctl.run.recipe import Recipe, resolve
+from rlctl.run.recipe_difference import find_difference
 
 if TYPE_CHECKING:
     from rlctl.train.progress import Progress
@@ -33,6 +34,7 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
         **_identity(task),
         "algo": recipe.algo,
         "seed": recipe.seed,
+        "recipe_changes": _find_recipe_changes(task, recipe),
         "device": device,
         "versions": collect_versions(),
         "git_commit": _git_commit(),
@@ -46,6 +48,17 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
     else:
         changes["started"] = _now()
     run.write_status(changes)
+
+
+def _find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
+    """Return the keys in which a recipe differs from the task's own, and their values."""
+    constructor: Any = registry.load(task)
+    stages = constructor.stages if registry.is_task(constructor) else ()
+    try:
+        packaged = resolve(task, None, {}, stages)
+    except RlctlError:  # a packaged recipe that is wrong in itself; this one was made right by --config or --set
+        return {}
+    return {key: value for key, (value, _) in find_difference(recipe, packaged).items()}
 
 
 def _identity(task: str) -> dict[str, Any]:
