@@ -1,0 +1,1 @@
+"""`rlctl runs`: what can be asked of trained runs: list, show, compare, remove."""

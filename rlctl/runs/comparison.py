@@ -1,0 +1,225 @@
+"""`rlctl runs compare`: is one policy, or one recipe, better than another?
+
+Single runs are compared as policies: each plays the same episodes. Groups of runs (several training seeds of a recipe)
+are compared as recipes: each run's best policy is evaluated, and the score of a seed is its mean over the episodes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import glob
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
+from rlctl.run.directory import RunDirectory, find_run
+from rlctl.run.recipe_difference import find_difference
+from rlctl.runs.statistics import (
+    Difference,
+    SeedDifference,
+    Verdict,
+    return_difference,
+    seed_difference,
+    success_difference,
+)
+from rlctl.runs.summary import evaluations, summarize
+
+Quantity = Literal["success", "return"]
+
+THRESHOLD = 0.9
+"""Success rate whose first evaluation is looked for, where no other is asked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CompareRequest:
+    """What the command line asks for."""
+
+    sides: Sequence[str]
+    """Runs, globs, or folders of runs; the first is the baseline."""
+    episodes: int = 100
+    seed: int = 0
+    task: str | None = None
+    """Task to evaluate all on, instead of the one each was trained on."""
+    threshold: float | None = None
+    """Success rate, or return where a task has no success, whose first evaluation is looked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluatedRun:
+    """A run, its best policy's episodes, and when it reached the threshold."""
+
+    path: Path
+    seed: int | None
+    evaluation: Evaluation
+    steps_to_threshold: int | None
+    seconds_to_threshold: float | None
+
+    def values(self, quantity: Quantity) -> NDArray[np.float64]:
+        """Return the success (0 or 1) or return of each episode, shape (episodes,); NaN where it is not reported."""
+        results = [episode.result for episode in self.evaluation.episodes]
+        values = [each.success if quantity == "success" else each.total_reward for each in results]
+        return np.array([np.nan if value is None else value for value in values], np.float64)
+
+
+@dataclasses.dataclass(frozen=True)
+class Side:
+    """One of the things compared: a policy, or the runs of a recipe."""
+
+    name: str
+    runs: list[EvaluatedRun]
+
+    @property
+    def has_success(self) -> bool:
+        return all(run.evaluation.success_rate is not None for run in self.runs)
+
+    def scores(self, quantity: Quantity) -> NDArray[np.float64]:
+        """Return each run's mean over its episodes, shape (runs,)."""
+        return np.array([run.values(quantity).mean() for run in self.runs], np.float64)
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A side beside the baseline: by how much it differs, and in what."""
+
+    side: Side
+    differences: dict[Quantity, Difference]
+    """`success`, where the task reports it, then `return`."""
+    recipe_changes: dict[str, tuple[Any, Any]]
+    """Per dotted key, the value here and the baseline's."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Success decides; where it cannot tell, the return does."""
+        verdicts = (each.verdict for each in self.differences.values())
+        return next((verdict for verdict in verdicts if verdict is not Verdict.CANNOT_TELL), Verdict.CANNOT_TELL)
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """The baseline and what was compared with it."""
+
+    of_recipes: bool
+    """Whether recipes are compared, seed by seed; else two policies, episode by episode."""
+    task: str
+    baseline: Side
+    candidates: list[Candidate]
+    episodes: int
+    threshold: float | None
+
+    def check(self) -> None:
+        """Raise `AnswerIsNo` if a candidate is worse than the baseline."""
+        worse = [each.side.name for each in self.candidates if each.verdict is Verdict.WORSE]
+        if worse:
+            raise AnswerIsNo(f"gate missed: {', '.join(worse)} worse than {self.baseline.name}")
+
+
+def compare(request: CompareRequest) -> Comparison:
+    """Evaluate every run and compare each side with the first.
+
+    Raises `UsageError` for less than two sides, a run compared with itself, runs of different tasks without `task`,
+    and groups beside single runs; `ArtifactError` for runs that are missing, damaged or without a policy.
+    """
+    if len(request.sides) < 2:
+        raise UsageError("give two or more to compare, the baseline first: rlctl runs compare A B")
+    groups = [find_group(text) for text in request.sides]
+    _refuse_unequal(request.sides, groups)
+    task = _common_task([run for group in groups for run in group], request.task)
+    sides = [
+        Side(_name(text, group), [_evaluate(run, request) for run in group])
+        for text, group in zip(request.sides, groups, strict=True)
+    ]
+    baseline, *others = sides
+    of_recipes = len(groups[0]) > 1
+    return Comparison(
+        of_recipes=of_recipes,
+        task=task,
+        baseline=baseline,
+        candidates=[_candidate(baseline, side, of_recipes) for side in others],
+        episodes=request.episodes,
+        threshold=_threshold(request, baseline),
+    )
+
+
+def find_group(text: str) -> list[RunDirectory]:
+    """Return the runs that a word stands for: those of a glob or a folder of runs, or one run."""
+    found: list[Path] = []
+    if any(character in text for character in "*?["):
+        found = [path for path in map(Path, sorted(glob.glob(text))) if (path / "run.json").is_file()]
+        if not found:
+            raise ArtifactError(f"{text}: no run matches")
+    elif Path(text).is_dir() and not (Path(text) / "run.json").is_file():
+        found = sorted(path.parent for path in Path(text).glob("*/run.json"))
+    return [RunDirectory(path) for path in found] or [find_run(text)]
+
+
+def _name(text: str, group: list[RunDirectory]) -> str:
+    return text.rstrip("/") if len(group) > 1 else str(group[0].path)
+
+
+def _refuse_unequal(texts: Sequence[str], groups: list[list[RunDirectory]]) -> None:
+    sizes = {len(group) > 1 for group in groups}
+    if len(sizes) > 1:
+        alone = next(text for text, group in zip(texts, groups, strict=True) if len(group) == 1)
+        raise UsageError(
+            f"{alone}: one run beside a group of seeds. A recipe is judged by several seeds: "
+            "train more, or compare two single runs as policies"
+        )
+    paths = [run.path.resolve() for group in groups for run in group]
+    twice = next((path for path in paths if paths.count(path) > 1), None)
+    if twice is not None:
+        raise UsageError(f"{twice}: given twice; a run cannot be compared with itself")
+
+
+def _common_task(runs: list[RunDirectory], task: str | None) -> str:
+    tasks = list(dict.fromkeys(str(run.status()["task"]) for run in runs))
+    if task is not None:
+        return task
+    if len(tasks) > 1:
+        raise UsageError(f"these runs are of different tasks ({', '.join(tasks)}); --task TASK evaluates all on one")
+    return tasks[0]
+
+
+def _evaluate(run: RunDirectory, request: CompareRequest) -> EvaluatedRun:
+    evaluation = run_evaluation(
+        EvalRequest(run=str(run.path), task=request.task, episodes=request.episodes, seed=request.seed), Gates()
+    )
+    has_success = evaluation.success_rate is not None
+    column = "success" if has_success else "return"
+    threshold = request.threshold if request.threshold is not None else THRESHOLD if has_success else None
+    reached = (
+        next((row for row in evaluations(run) if (value := row.get(column)) is not None and value >= threshold), None)
+        if threshold is not None
+        else None
+    )
+    steps, seconds = (reached.get("steps"), reached.get("seconds")) if reached else (None, None)
+    return EvaluatedRun(run.path, summarize(run.path).seed, evaluation, None if steps is None else int(steps), seconds)
+
+
+def _threshold(request: CompareRequest, side: Side) -> float | None:
+    if request.threshold is not None:
+        return request.threshold
+    return THRESHOLD if side.has_success else None
+
+
+def _candidate(baseline: Side, side: Side, of_recipes: bool) -> Candidate:
+    quantities: list[Quantity] = ["success", "return"] if baseline.has_success and side.has_success else ["return"]
+    differ = _between_recipes if of_recipes else _between_policies
+    differences = {quantity: differ(baseline, side, quantity) for quantity in quantities}
+    changes = find_difference(RunDirectory(side.runs[0].path).recipe(), RunDirectory(baseline.runs[0].path).recipe())
+    return Candidate(side, differences, changes)
+
+
+def _between_policies(baseline: Side, side: Side, quantity: Quantity) -> Difference:
+    one, two = (each.runs[0].values(quantity) for each in (baseline, side))
+    if quantity == "success":
+        return success_difference(one.astype(np.bool_), two.astype(np.bool_))
+    return return_difference(one, two)
+
+
+def _between_recipes(baseline: Side, side: Side, quantity: Quantity) -> SeedDifference:
+    return seed_difference(baseline.scores(quantity), side.scores(quantity))

@@ -1,0 +1,88 @@
+"""`rlctl runs`: every run below ./runs, newest first."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from rlctl import registry
+from rlctl.errors import UsageError, did_you_mean
+from rlctl.run.directory import ROOT
+from rlctl.runs.summary import RunSummary, find_runs, summarize
+
+SORT_KEYS = {
+    "newest": lambda run: (run.started or run.path.name, run.path.name),
+    "score": lambda run: run.score,
+    "steps": lambda run: run.steps or 0,
+    "minutes": lambda run: run.seconds or 0.0,
+}
+_CHANGES_SHOWN = 4
+
+
+def list_runs(task: str | None = None, *, sort: str = "newest", root: Path = ROOT) -> list[RunSummary]:
+    """Return the runs of a task, or all, best or newest first.
+
+    Raises `UsageError` for an unknown order or a task without runs.
+    """
+    if sort not in SORT_KEYS:
+        raise UsageError(f"--sort {sort}: give one of {', '.join(SORT_KEYS)}.{did_you_mean(sort, list(SORT_KEYS))}")
+    found = [summarize(path) for path in find_runs(root)]
+    if task is not None:
+        every = found
+        found = [run for run in every if run.task == task or run.path.parent.name == registry.make_slug(task)]
+        if not found:
+            names = sorted({run.task for run in every})
+            raise UsageError(f"no run of {task!r} under {root.resolve()}.{did_you_mean(task, names)}")
+    return sorted(found, key=SORT_KEYS[sort], reverse=True)
+
+
+def show(runs: list[RunSummary], json: str | None) -> None:
+    """Print the table, or write it as JSON."""
+    from rlctl import output
+
+    if json is not None:
+        output.write_result_json(json, {"runs": [as_json(run) for run in runs]})
+        return
+    out = output.out()
+    if not runs:
+        out.print(f"no runs yet under {ROOT.resolve()}; train one: rlctl train reach")
+        return
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for column in ("run", "algo", "seed", "state", "steps", "minutes", "success", "return", "differs from the recipe"):
+        right = column in ("seed", "steps", "minutes", "success", "return")
+        table.add_column(column, header_style="bold", justify="right" if right else "left", overflow="fold")
+    for run in runs:
+        table.add_row(*_cells(run))
+    out.print(table)
+
+
+def _cells(run: RunSummary) -> list[Any]:
+    from rich.text import Text
+
+    styles = {"done": "green", "running": "cyan", "failed": "red", "damaged": "red"}
+    return [
+        Text(run.name),
+        run.algo,
+        "" if run.seed is None else str(run.seed),
+        Text(run.state_text, style=styles.get(run.state, "")),
+        "" if run.steps is None else f"{run.steps:,}",
+        "" if run.seconds is None else f"{run.seconds / 60:.1f}",
+        "" if run.best_success is None else f"{run.best_success:.1%}",
+        "" if run.best_return is None else f"{run.best_return:.2f}",
+        Text(format_changes(run.changes)),
+    ]
+
+
+def format_changes(changes: dict[str, Any]) -> str:
+    """Return recipe changes as `key=value`, the first few of them."""
+    shown = [f"{key}={value}" for key, value in list(changes.items())[:_CHANGES_SHOWN]]
+    more = len(changes) - len(shown)
+    return " ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+def as_json(run: RunSummary) -> dict[str, Any]:
+    """Return a summary as plain data."""
+    return {**dataclasses.asdict(run), "path": str(run.path), "name": run.name}

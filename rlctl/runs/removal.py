@@ -1,0 +1,119 @@
+"""`rlctl runs rm` and `prune`: free the disk without losing what is still wanted."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.run.directory import ROOT, RunDirectory, is_being_written
+from rlctl.run.memory import format_bytes
+from rlctl.runs.listing import list_runs
+from rlctl.runs.summary import RunSummary
+
+
+@dataclasses.dataclass(frozen=True)
+class Removal:
+    """Folders that are to go, and their size."""
+
+    paths: list[Path]
+    bytes: int
+    what: str
+    """What they are: `runs`, or `folders of checkpoints`."""
+
+
+def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Path = ROOT) -> Removal:
+    """Find the runs to remove: those given, or per task all but the `keep_best` best that are finished or failed.
+
+    Raises `UsageError` where nothing or both is asked for, or a run is being trained; `ArtifactError` for a folder that
+    is not a run.
+    """
+    if bool(runs) == (keep_best is not None):
+        raise UsageError("say what to remove: RUN..., or --keep-best N for all but the N best of each task")
+    if keep_best is not None:
+        return _measured([run.path for run in _all_but_best(list_runs(root=root), keep_best)], "runs")
+    paths = [_checked(Path(text), root) for text in runs]
+    for path in paths:
+        if is_being_written(path):
+            raise UsageError(f"{path}: this run is being trained; nothing was removed")
+    return _measured(list(dict.fromkeys(paths)), "runs")
+
+
+def _checked(path: Path, root: Path) -> Path:
+    """Return a run's folder; only a folder with a run.json of ours, or a damaged one where runs are, is one."""
+    below = root / path
+    found = path if path.is_dir() else below
+    is_run = (found / "run.json").is_file()
+    is_below_root = found.resolve().parent.parent == root.resolve() and found.is_dir()
+    if found.is_symlink() or not (is_run or is_below_root):
+        raise ArtifactError(f"{path}: not the folder of a run; `rlctl runs` lists them")
+    if is_run:
+        RunDirectory(found).status()
+    return found
+
+
+def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:
+    ended = [run for run in runs if run.state in ("done", "failed") and not is_being_written(run.path)]
+    by_task: dict[str, list[RunSummary]] = {}
+    for run in sorted(ended, key=lambda run: run.score, reverse=True):
+        by_task.setdefault(run.task, []).append(run)
+    return [run for task in by_task.values() for run in task[count:]]
+
+
+def plan_prune(root: Path = ROOT) -> Removal:
+    """Find the checkpoints, replay buffers included, of finished runs; they are needed only to train on."""
+    runs = [run for run in list_runs(root=root) if run.state == "done" and not is_being_written(run.path)]
+    folders = [RunDirectory(run.path).checkpoint(0).parent for run in runs]
+    return _measured([folder for folder in folders if folder.is_dir()], "folders of checkpoints")
+
+
+def _measured(paths: list[Path], what: str) -> Removal:
+    size = sum(file.lstat().st_size for path in paths for file in path.rglob("*") if not file.is_dir())
+    return Removal(paths, size, what)
+
+
+def remove_with_report(removal: Removal, *, yes: bool) -> None:
+    """List what is to go and its size, ask, remove, and say what came free."""
+    from rlctl import output
+
+    out = output.out()
+    for path in removal.paths:
+        out.print(str(path), markup=False)
+    if not removal.paths:
+        out.print("nothing to remove")
+    elif remove(removal, yes=yes):
+        out.print(f"removed {len(removal.paths)} {removal.what}: {format_bytes(removal.bytes)} free")
+
+
+def remove(removal: Removal, *, yes: bool) -> bool:
+    """Remove the folders after asking on the terminal; False if the answer was no.
+
+    Raises `UsageError` where nobody can be asked and `yes` is not set.
+    """
+    if not removal.paths:
+        return False
+    if not yes:
+        if not sys.stdin.isatty():
+            raise UsageError("nothing was removed: there is no terminal to ask on; --yes removes without asking")
+        import typer
+
+        if not typer.confirm(f"remove these {len(removal.paths)}?", err=True):
+            return False
+    for path in removal.paths:
+        if is_being_written(path if (path / ".lock").exists() else path.parent):
+            raise UsageError(f"{path}: this run is being trained; it was not removed")
+        _remove_folder(path)
+    return True
+
+
+def _remove_folder(path: Path) -> None:
+    """Remove a folder; under another name first, so that a half-removed one is not taken for a run."""
+    beside = path.with_name(f".{path.name}.removed")
+    try:
+        path.rename(beside)
+        shutil.rmtree(beside)
+    except OSError as error:
+        raise ArtifactError(f"{path}: cannot be removed: {error.strerror}") from None

@@ -1,0 +1,180 @@
+"""Is one policy, or one recipe, really better than another? Tests, intervals, and how much data would decide.
+
+Two policies are compared on the same episodes, so the unit is the episode and the test is paired. Two recipes are
+compared by training each several times, so the unit is the training seed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+ALPHA = 0.05
+"""Below this p-value a difference is called one; intervals are of 1 - ALPHA."""
+POWER = 0.8
+_RESAMPLES = 9999
+
+
+class Verdict(enum.StrEnum):
+    """What the data say of a candidate against the baseline."""
+
+    BETTER = "better"
+    WORSE = "worse"
+    CANNOT_TELL = "cannot tell"
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """A candidate's mean minus the baseline's."""
+
+    mean: float
+    low: float
+    """Lower end of the 95 % interval; equal to `mean` where there is nothing to resample."""
+    high: float
+    p: float
+    """Two-sided p-value; 1 where all pairs are equal."""
+    needed: int | None
+    """About how many episodes, or seeds per recipe, would decide, if the difference is as it seems; None if it is 0."""
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.p >= ALPHA or self.mean == 0:
+            return Verdict.CANNOT_TELL
+        return Verdict.BETTER if self.mean > 0 else Verdict.WORSE
+
+
+@dataclasses.dataclass(frozen=True)
+class SeedDifference(Difference):
+    """The same between two recipes, over training seeds."""
+
+    probability_of_improvement: float
+    """How often a training of the candidate beats one of the baseline; ties count half (Agarwal et al., 2021)."""
+    smallest_p: float
+    """The smallest p-value that so many seeds can reach at all."""
+
+
+def success_difference(baseline: NDArray[np.bool_], candidate: NDArray[np.bool_]) -> Difference:
+    """Compare two policies' successes on the same episodes: McNemar's exact test (McNemar, 1947).
+
+    Both of shape (episodes,). Raises `ValueError` if the shapes differ.
+    """
+    from scipy.stats import binomtest
+
+    gained, lost = int((candidate & ~baseline).sum()), int((baseline & ~candidate).sum())
+    difference = candidate.astype(np.float64) - baseline
+    disagreeing = gained + lost
+    p = float(binomtest(gained, disagreeing, 0.5).pvalue) if disagreeing else 1.0
+    low, high = _mean_interval(difference)
+    return Difference(float(difference.mean()), low, high, p, _episodes_for_success(gained, lost, len(difference)))
+
+
+def return_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64]) -> Difference:
+    """Compare two policies' returns on the same episodes: a paired permutation test and a bootstrap interval.
+
+    Both of shape (episodes,). Raises `ValueError` if the shapes differ.
+    """
+    from scipy.stats import permutation_test
+
+    difference = candidate - baseline
+    mean = float(difference.mean())
+    if not difference.any():
+        return Difference(0.0, 0.0, 0.0, 1.0, None)
+    test = permutation_test(
+        (difference,), np.mean, permutation_type="samples", n_resamples=_RESAMPLES, vectorized=True, rng=_rng()
+    )
+    low, high = _mean_interval(difference)
+    std = float(difference.std(ddof=1)) if difference.size > 1 else math.nan
+    return Difference(mean, low, high, float(test.pvalue), _sample_size(mean, std))
+
+
+def seed_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64]) -> SeedDifference:
+    """Compare two recipes by the final scores of their training seeds: an exact permutation test where it is small.
+
+    Shapes (seeds,), which may differ. The interval of the difference of means is a bootstrap over seeds.
+    """
+    from scipy.stats import permutation_test
+
+    mean = float(candidate.mean() - baseline.mean())
+    wins = np.sign(candidate[:, None] - baseline[None, :])
+    improvement = float((wins + 1).mean() / 2)
+    smallest = min(1.0, 2 / math.comb(baseline.size + candidate.size, baseline.size))
+    if min(baseline.size, candidate.size) < 2:
+        return SeedDifference(mean, mean, mean, 1.0, None, improvement, smallest)
+    p = 1.0
+    if wins.any():
+        result = permutation_test((candidate, baseline), _difference_of_means, n_resamples=_RESAMPLES, rng=_rng())
+        p = float(result.pvalue)
+    low, high = _interval((candidate, baseline), _difference_of_means)
+    std = math.sqrt(float(candidate.var(ddof=1) + baseline.var(ddof=1)))
+    needed = _sample_size(mean, std)
+    return SeedDifference(mean, low, high, p, None if needed is None else max(needed, 4), improvement, smallest)
+
+
+def interquartile_mean(scores: NDArray[np.float64]) -> float:
+    """Return the mean of the middle half (Agarwal et al., 2021)."""
+    from scipy.stats import trim_mean
+
+    return float(trim_mean(scores, 0.25))
+
+
+def interquartile_mean_interval(scores: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the 95 % bootstrap interval of the interquartile mean over seeds, shape (seeds,)."""
+    from scipy.stats import trim_mean
+
+    def middle(values: NDArray[np.float64], axis: int = -1) -> Any:
+        return trim_mean(values, 0.25, axis=axis)
+
+    return _interval((scores,), middle)
+
+
+def _difference_of_means(one: NDArray[np.float64], two: NDArray[np.float64], axis: int = -1) -> Any:
+    return np.mean(one, axis=axis) - np.mean(two, axis=axis)
+
+
+def _mean_interval(values: NDArray[np.float64]) -> tuple[float, float]:
+    return _interval((values,), np.mean)
+
+
+def _interval(samples: tuple[NDArray[np.float64], ...], statistic: Any) -> tuple[float, float]:
+    """Return a percentile bootstrap interval; the statistic itself, twice, where no sample varies."""
+    from scipy.stats import bootstrap
+
+    if all(np.ptp(sample) == 0 for sample in samples):
+        value = float(statistic(*samples))
+        return value, value
+    found = bootstrap(
+        samples, statistic, confidence_level=1 - ALPHA, n_resamples=_RESAMPLES, method="percentile", rng=_rng()
+    )
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(0)  # the same data give the same figures
+
+
+def _sample_size(difference: float, std: float) -> int | None:
+    """Return for how many samples a t-test would find the difference: ((z_a + z_b) std / difference)^2."""
+    if difference == 0 or not math.isfinite(std):
+        return None
+    return max(2, math.ceil((sum(_quantiles()) * std / difference) ** 2))
+
+
+def _episodes_for_success(gained: int, lost: int, episodes: int) -> int | None:
+    """Return for how many pairs McNemar's test would find the difference (Connor, 1987)."""
+    if gained == lost:
+        return None
+    disagreeing, difference = (gained + lost) / episodes, (gained - lost) / episodes
+    alpha, beta = _quantiles()
+    root = alpha * math.sqrt(disagreeing) + beta * math.sqrt(max(disagreeing - difference**2, 0.0))
+    return math.ceil((root / difference) ** 2)
+
+
+def _quantiles() -> tuple[float, float]:
+    from scipy.stats import norm
+
+    return float(norm.ppf(1 - ALPHA / 2)), float(norm.ppf(POWER))

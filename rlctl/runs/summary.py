@@ -1,0 +1,177 @@
+"""A run in a few numbers, read from the small files of its folder; a damaged folder is a summary too."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from rlctl.errors import ArtifactError
+from rlctl.run.directory import ROOT, RunDirectory, is_being_written
+
+_TAIL_BYTES = 4096
+"""The last row of a table is looked for here; a row has at most some hundred bytes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSummary:
+    """What `rlctl runs` shows of a run. Numbers are None where the run does not have them yet."""
+
+    path: Path
+    task: str = ""
+    algo: str = ""
+    seed: int | None = None
+    state: str = ""
+    """`done`, `running`, `stopped`, `failed` or `damaged`."""
+    reason: str = ""
+    """Why it failed or is damaged."""
+    started: str = ""
+    """ISO 8601, UTC."""
+    steps: int | None = None
+    seconds: float | None = None
+    """Spent training [s]."""
+    best_step: int | None = None
+    best_success: float | None = None
+    best_return: float | None = None
+    changes: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Recipe keys, dotted, that differ from the task's own recipe, and their values."""
+    versions: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Return the path below the folder of all runs: `reach/2026-11-21_10-30-00_s0`."""
+        return "/".join(self.path.parts[-2:])
+
+    @property
+    def state_text(self) -> str:
+        """Return the state in words, with the step it stopped at or the reason."""
+        if self.state == "stopped":
+            return f"stopped at step {self.steps or 0:,}"
+        return f"{self.state}: {self.reason}" if self.reason else self.state
+
+    @property
+    def score(self) -> tuple[float, float]:
+        """Return what to rank runs of one task by: success first, then return."""
+        success = -1.0 if self.best_success is None else self.best_success
+        return success, -float("inf") if self.best_return is None else self.best_return
+
+
+def find_runs(root: Path = ROOT) -> Iterator[Path]:
+    """Yield every run folder below `root`, damaged ones included: all folders two levels down."""
+    for task in _folders(root):
+        yield from _folders(task)
+
+
+def _folders(path: Path) -> list[Path]:
+    try:
+        with os.scandir(path) as entries:
+            folders = [each for each in entries if each.is_dir(follow_symlinks=False) and not each.name.startswith(".")]
+    except OSError:
+        return []
+    return [Path(each.path) for each in folders]
+
+
+def summarize(path: Path) -> RunSummary:
+    """Read one run; never raises for what is in the folder."""
+    run = RunDirectory(path)
+    try:
+        status = run.status()
+    except (ArtifactError, OSError) as error:
+        reason = "no run.json" if not run.status_file.is_file() else _first_line(str(error))
+        return RunSummary(path, task=path.parent.name, state="damaged", reason=reason)
+    try:
+        return _summarize(run, status)
+    except (ArtifactError, OSError, ValueError, TypeError, KeyError) as error:
+        return RunSummary(path, task=str(status["task"]), state="damaged", reason=_first_line(str(error)))
+
+
+def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
+    last = last_row(run.metrics_file)
+    best = best_row(evaluations(run))
+    state, reason = _state(run, status)
+    return RunSummary(
+        path=run.path,
+        task=status["task"],
+        algo=str(status.get("algo", "")),
+        seed=status.get("seed"),
+        state=state,
+        reason=reason,
+        started=str(status.get("started", "")),
+        steps=int(float(last["steps"])) if last else status.get("steps"),
+        seconds=status.get("seconds") or (float(last["seconds"]) if last else None),
+        best_step=int(best["steps"] or 0) if best else None,
+        best_success=best["success"] if best else None,
+        best_return=best["return"] if best else None,
+        changes=dict(status.get("recipe_changes") or {}),
+        versions=dict(status.get("versions") or {}),
+    )
+
+
+def _state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str]:
+    state, error = status.get("status"), _first_line(str(status.get("error") or ""))
+    if state == "finished":
+        return "done", ""
+    if state == "running":
+        # A killed training could not write that it stopped; its lock went with it.
+        return ("running" if is_being_written(run.path) else "stopped"), ""
+    if state == "interrupted":
+        return "stopped", ""
+    return "failed", error
+
+
+def _first_line(text: str) -> str:
+    return text.partition("\n")[0]
+
+
+def evaluations(run: RunDirectory) -> list[dict[str, float | None]]:
+    """Return the rows of `evals.csv` that are whole, oldest first; empty fields are None."""
+    return read_table(run.evals_file)
+
+
+def read_table(path: Path) -> list[dict[str, float | None]]:
+    """Return a table's rows with numbers; rows cut short by a killed process are left out."""
+    try:
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+            rows = list(csv.DictReader(file))
+    except FileNotFoundError:
+        return []
+    return [numbers for row in rows if (numbers := _numbers(row)) is not None]
+
+
+def _numbers(row: dict[str, Any]) -> dict[str, float | None] | None:
+    if None in row or None in row.values():
+        return None
+    try:
+        return {name: float(value) if value else None for name, value in row.items()}
+    except ValueError:
+        return None
+
+
+def best_row(rows: Iterable[dict[str, float | None]]) -> dict[str, float | None] | None:
+    """Return the evaluation with the best success, then return."""
+    scored = [row for row in rows if row.get("return") is not None]
+    return max(scored, key=lambda row: (_or_lowest(row.get("success")), _or_lowest(row["return"])), default=None)
+
+
+def _or_lowest(value: float | None) -> float:
+    return -float("inf") if value is None else value
+
+
+def last_row(path: Path) -> dict[str, str] | None:
+    """Return the last whole row of a table without reading the rest of it."""
+    try:
+        with path.open("rb") as file:
+            header = file.readline()
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(len(header), size - _TAIL_BYTES))
+            lines = file.read().decode(errors="replace").splitlines(keepends=True)
+    except OSError:
+        return None
+    whole = [line for line in lines if line.endswith("\n")]
+    if not whole:
+        return None
+    names, values = next(csv.reader([header.decode(errors="replace")])), next(csv.reader([whole[-1]]))
+    return dict(zip(names, values, strict=True)) if len(names) == len(values) else None

@@ -1,0 +1,77 @@
+"""Comparing runs: real policies on a small task, and what is refused."""
+
+import json
+
+import pytest
+
+from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.run.recipe import merge
+from rlctl.runs.comparison import CompareRequest, compare
+from rlctl.runs.comparison_report import as_json, format_needed
+from rlctl.runs.statistics import Verdict
+from rlctl.train.request import TrainRequest, run_training
+from tests.train.conftest import TINY
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Two recipes of two seeds each, of a few hundred steps."""
+    root = tmp_path_factory.mktemp("runs")
+    for gamma in (0.9, 0.99):
+        for seed in (0, 1):
+            settings = merge(TINY, {"seed": seed, "algo_kwargs": {"gamma": gamma}})
+            run_training(TrainRequest("reach", settings=settings, root=root / str(gamma), check=False))
+    return root
+
+
+def test_policies_are_compared_episode_by_episode(root):
+    one, two = sorted((root / "0.9/reach").iterdir())
+    result = compare(CompareRequest([str(one), str(two)], episodes=5))
+    assert not result.of_recipes
+    (candidate,) = result.candidates
+    difference = candidate.differences["return"]
+    expected = candidate.side.runs[0].values("return") - result.baseline.runs[0].values("return")
+    assert difference.mean == pytest.approx(expected.mean())
+    sides = (result.baseline, candidate.side)
+    first, second = ([episode.seed for episode in side.runs[0].evaluation.episodes] for side in sides)
+    assert first == second
+    assert candidate.recipe_changes == {}
+
+
+def test_recipes_are_compared_seed_by_seed(root):
+    result = compare(CompareRequest([str(root / "0.9/reach"), f"{root}/0.99/reach/*"], episodes=3))
+    assert result.of_recipes
+    (candidate,) = result.candidates
+    assert candidate.recipe_changes == {"algo_kwargs.gamma": (0.99, 0.9)}
+    assert candidate.verdict is Verdict.CANNOT_TELL
+    assert "smallest p-value that they can reach is 0.33" in format_needed(candidate, of_recipes=True)
+    content = json.loads(json.dumps(as_json(result)))
+    assert [len(side["runs"]) for side in (content["baseline"], *content["candidates"])] == [2, 2]
+
+
+def test_refusals(root, write_run):
+    one, _ = sorted((root / "0.9/reach").iterdir())
+    with pytest.raises(UsageError, match="two or more"):
+        compare(CompareRequest([str(one)]))
+    with pytest.raises(UsageError, match="cannot be compared with itself"):
+        compare(CompareRequest([str(one), str(one)]))
+    with pytest.raises(UsageError, match="one run beside a group"):
+        compare(CompareRequest([str(one), str(root / "0.99/reach")]))
+    with pytest.raises(ArtifactError, match="no run matches"):
+        compare(CompareRequest([str(one), f"{root}/0.5*"]))
+    other = write_run("ant/2026-01-01_00-00-00_s0")
+    with pytest.raises(UsageError, match=r"different tasks.*--task"):
+        compare(CompareRequest([str(one), str(other)]))
+
+
+def test_gate(root):
+    one, two = sorted((root / "0.9/reach").iterdir())
+    result = compare(CompareRequest([str(one), str(two)], episodes=4))
+    swapped = compare(CompareRequest([str(two), str(one)], episodes=4))
+    verdicts = {result.candidates[0].verdict, swapped.candidates[0].verdict}
+    assert verdicts in ({Verdict.BETTER, Verdict.WORSE}, {Verdict.CANNOT_TELL})
+    for each in (result, swapped):
+        if each.candidates[0].verdict is Verdict.WORSE:
+            with pytest.raises(AnswerIsNo, match="worse than"):
+                each.check()
+        else:
+            each.check()

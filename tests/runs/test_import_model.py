@@ -1,0 +1,227 @@
+"""Models of Stable-Baselines3 become policies that act the same, and nothing in the files is run."""
+
+import base64
+import io
+import json
+import pickle
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.run.policy import load_policy
+from rlctl.run.torch_policy import ALGORITHMS, policy_name
+from rlctl.runs import pickle_data
+from rlctl.runs.import_model import ImportRequest, import_model
+from rlctl.runs.pickle_data import NotPlainData, read_array
+from rlctl.runs.sb3_model import read_model, read_normalization
+
+SMALL = f"{Path(__file__).parent.parent / 'export' / 'envs.py'}:Small"
+ON_POLICY = {
+    "ppo": {"n_steps": 16, "batch_size": 16, "n_epochs": 1},
+    "a2c": {"n_steps": 16},
+    "recurrent_ppo": {"n_steps": 16, "batch_size": 16, "n_epochs": 1},
+}
+OFF_POLICY = {"learning_starts": 8, "buffer_size": 100, "batch_size": 8}
+CASES = [
+    ("ppo", "vector", "box", {}),
+    ("ppo", "vector", "box", {"use_sde": True, "policy_kwargs": {"activation_fn": torch.nn.ReLU, "net_arch": [8]}}),
+    ("ppo", "dict", "discrete", {"learning_rate": lambda left: 1e-3 * left}),
+    ("a2c", "vector", "discrete", {}),
+    ("sac", "vector", "box", {"policy_kwargs": {"net_arch": {"pi": [8], "qf": [16]}}}),
+    ("td3", "vector", "box", {}),
+    ("ddpg", "vector", "box", {}),
+    ("dqn", "vector", "discrete", {}),
+    ("tqc", "vector", "box", {"policy_kwargs": {"n_quantiles": 5, "n_critics": 3, "net_arch": [8]}}),
+    ("crossq", "vector", "box", {}),
+    ("recurrent_ppo", "vector", "box", {"policy_kwargs": {"lstm_hidden_size": 8}}),
+]
+
+
+@pytest.fixture
+def save(tmp_path):
+    """Train a little and save as SB3 does; return the model, its normalisation, and the request to import them."""
+
+    def saved(algo="ppo", observation="vector", action="box", **kwargs):
+        parameters = {"observation": observation, "action": action}
+        raw = DummyVecEnv([EnvSpec(SMALL, parameters).make])
+        parts = getattr(raw.observation_space, "spaces", {})
+        keys = [key for key, space in parts.items() if isinstance(space, spaces.Box)] or None
+        env = VecNormalize(raw, norm_reward=False, norm_obs_keys=keys)
+        settings = {**ON_POLICY.get(algo, OFF_POLICY), **kwargs}
+        model = ALGORITHMS[algo](policy_name(algo, env.observation_space), env, device="cpu", seed=0, **settings)
+        model.learn(32)
+        model.save(tmp_path / "model.zip")
+        env.save(str(tmp_path / "vecnormalize.pkl"))
+        env.training = False
+        request = ImportRequest(
+            tmp_path / "model.zip", SMALL, tmp_path / "vecnormalize.pkl", output=tmp_path / "policy.safetensors",
+            task_parameters=parameters,
+        )  # fmt: skip
+        return model, env, request
+
+    return saved
+
+
+@pytest.mark.parametrize(("algo", "observation", "action", "kwargs"), CASES, ids=lambda value: str(value)[:30])
+def test_acts_as_the_model_does(save, algo, observation, action, kwargs):
+    model, env, request = save(algo, observation, action, **kwargs)
+    imported = import_model(request)
+    assert imported.info.algo == algo
+    policy = load_policy(imported.file)
+    rng = np.random.default_rng(0)
+    space = policy.observation_space
+    space.seed(0)
+    state = None
+    for step in range(100):
+        value = space.sample()
+        if observation == "vector":
+            value = rng.normal(0, 3, space.shape).astype(np.float32)
+        expected, state = model.predict(
+            env.normalize_obs(value), state=state, episode_start=np.array([step == 0]), deterministic=True
+        )
+        np.testing.assert_allclose(policy.predict(value), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_nothing_is_unpickled(save, monkeypatch):
+    _, _, request = save("ppo", learning_rate=lambda left: 1e-3 * left)
+    found = []
+    sys.addaudithook(lambda event, arguments: found.append(arguments) if event == "pickle.find_class" else None)
+    import_model(request)
+    assert found == []
+
+
+class Attack:
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+def edit_data(path, **changes):
+    """Write a model's archive anew with other entries of its data."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    data = json.loads(members["data"])
+    data.update(changes)
+    members["data"] = json.dumps(data)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+def serialized(value):
+    return {":type:": "x", ":serialized:": base64.b64encode(pickle.dumps(value)).decode()}
+
+
+def test_a_call_that_is_not_on_the_list_is_refused_and_not_made(save, tmp_path):
+    _, _, request = save()
+    proof = tmp_path / "proof"
+    attack = Attack(Path.touch, proof)
+    for key in ("policy_kwargs", "observation_space", "action_space", "policy_class"):
+        import_model(request)
+        original = request.model.read_bytes()
+        edit_data(request.model, **{key: serialized(attack if key != "policy_kwargs" else {"net_arch": attack})})
+        with pytest.raises(ArtifactError, match="it holds what is not read"):
+            import_model(request)
+        request.model.write_bytes(original)
+    edit_data(request.model, unknown=serialized(attack))
+    import_model(request)  # what is not needed is not looked at
+    request.normalization.write_bytes(pickle.dumps(attack))
+    with pytest.raises(ArtifactError, match=r"vecnormalize.pkl: it holds what is not read"):
+        import_model(request)
+    assert not proof.exists()
+
+
+def test_other_files_are_refused(save, tmp_path):
+    _, _, request = save()
+    for name, content in {
+        "text.zip": b"not an archive",
+        "empty.zip": b"",
+        "half.zip": request.model.read_bytes()[:500],
+    }.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ArtifactError, match=name):
+            read_model(tmp_path / name)
+    with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
+        archive.writestr("one.jpg", "x")
+    with pytest.raises(ArtifactError, match=r"no 'data' in it; there is: one.jpg"):
+        read_model(tmp_path / "photos.zip")
+    with pytest.raises(ArtifactError, match="no such file"):
+        read_model(tmp_path / "nothing.zip")
+    (tmp_path / "half.pkl").write_bytes(request.normalization.read_bytes()[:200])
+    with pytest.raises(ArtifactError, match=r"half\.pkl"):
+        read_normalization(tmp_path / "half.pkl")
+
+
+def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path):
+    with zipfile.ZipFile(tmp_path / "bomb.zip", "w") as archive:
+        archive.writestr("data", b" ")
+        archive.filelist[0].file_size = 600_000_000  # written into the archive's table when it is closed
+    with pytest.raises(ArtifactError, match="600,000,000 bytes"):
+        read_model(tmp_path / "bomb.zip")
+
+
+def test_other_spaces_are_refused(save):
+    _, _, request = save()
+    other = ImportRequest(request.model, "reach", request.normalization)
+    with pytest.raises(ArtifactError, match=r"model.zip: it observes Box\(3,\), reach gives Box"):
+        import_model(other)
+    discrete = ImportRequest(request.model, SMALL, task_parameters={"observation": "vector", "action": "discrete"})
+    with pytest.raises(ArtifactError, match="its actions are Box"):
+        import_model(discrete)
+    with pytest.raises(UsageError, match="--algo pppo"):
+        import_model(ImportRequest(request.model, SMALL, algo="pppo"))
+
+
+@pytest.mark.parametrize("protocol", range(6))
+@pytest.mark.parametrize(
+    "value", [np.arange(6.0).reshape(2, 3), np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3)),
+              np.float32(3.5), np.zeros((0, 3)), np.array([True, False]), np.arange(3, dtype=">i4")],
+)  # fmt: skip
+def test_arrays_of_every_protocol(protocol, value):
+    read = read_array(pickle_data.read(pickle.dumps(value, protocol)))
+    assert read.dtype == value.dtype
+    np.testing.assert_array_equal(read, value)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"garbage", b"]", b"\x80\x04.", pickle.dumps([1, 2])[:-1], b"cos\nsystem\n(S'true'\ntRb.", b"0.", b"h\x01."],
+)
+def test_damaged_pickles_are_refused(content):
+    with pytest.raises(NotPlainData):
+        pickle_data.read(content)
+
+
+def test_objects_are_data():
+    read = pickle_data.read(pickle.dumps({"call": Attack(print, "hello"), "list": [1, (2.5, "x")], "none": None}))
+    assert str(read["call"].function) == "builtins.print"
+    assert read["call"].arguments == ("hello",)
+    assert read["list"] == [1, (2.5, "x")]
+
+
+def test_tensors_cannot_reach_out_of_their_storage(save):
+    from rlctl.runs.sb3_model import read_tensors
+
+    buffer = io.BytesIO()
+    torch.save({"a": torch.arange(6.0).reshape(2, 3).T}, buffer)
+    np.testing.assert_array_equal(read_tensors(buffer.getvalue())["a"], np.arange(6.0).reshape(2, 3).T)
+    with zipfile.ZipFile(buffer) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = next(each for each in members if each.endswith("data/0"))
+    members[name] = members[name][:8]
+    short = io.BytesIO()
+    with zipfile.ZipFile(short, "w") as archive:
+        for each, content in members.items():
+            archive.writestr(each, content)
+    with pytest.raises(NotPlainData, match="reaches out of its storage"):
+        read_tensors(short.getvalue())

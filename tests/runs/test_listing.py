@@ -1,0 +1,97 @@
+import json
+import time
+
+import pytest
+
+from rlctl.errors import UsageError
+from rlctl.runs.listing import format_changes, list_runs
+from rlctl.runs.summary import summarize
+
+
+def test_states(write_run, hold_lock):
+    done = write_run("reach/2026-01-01_00-00-00_s0")
+    running = write_run("reach/2026-01-01_00-00-01_s0", "running")
+    hold_lock(running)
+    killed = write_run("reach/2026-01-01_00-00-02_s0", "running")
+    stopped = write_run("reach/2026-01-01_00-00-03_s0", "interrupted")
+    failed = write_run("reach/2026-01-01_00-00-04_s0", "failed", error="task 'reach': it broke\nat step 3")
+    texts = [summarize(path).state_text for path in (done, running, killed, stopped, failed)]
+    assert texts[:2] == ["done", "running"]
+    assert texts[2:] == ["stopped at step 1,000", "stopped at step 1,000", "failed: task 'reach': it broke"]
+
+
+def test_best_is_by_success_then_return(write_run):
+    evals = ((10, 0.5, 9.0), (20, 0.7, 1.0), (30, 0.7, 2.0), (40, 0.1, 50.0))
+    run = write_run("reach/2026-01-01_00-00-00_s0", evals=evals)
+    summary = summarize(run)
+    assert (summary.best_step, summary.best_success, summary.best_return) == (30, 0.7, 2.0)
+    without = summarize(write_run("ant/2026-01-01_00-00-00_s0", evals=((10, None, 9.0), (20, None, 4.0))))
+    assert (without.best_step, without.best_success, without.best_return) == (10, None, 9.0)
+
+
+def test_half_a_row_is_no_row(write_run):
+    run = write_run("reach/2026-01-01_00-00-00_s0", "running", evals=())
+    with (run / "metrics.csv").open("a") as file:
+        file.write("99999,1.0")
+    with (run / "evals.csv").open("a") as file:
+        file.write("2000,20.0,100")
+    summary = summarize(run)
+    assert summary.steps == 1000
+    assert summary.best_return is None
+
+
+def test_damaged_folders_are_listed_as_such(write_run, tmp_path):
+    write_run("reach/2026-01-01_00-00-00_s0")
+    (tmp_path / "runs/reach/empty").mkdir()
+    broken = write_run("reach/2026-01-01_00-00-05_s0")
+    (broken / "run.json").write_text('{"status": "fin')
+    odd = write_run("reach/2026-01-01_00-00-06_s0")
+    (odd / "metrics.csv").write_bytes(b"steps\n\xff\x00\n")
+    states = {run.path.name: run.state for run in list_runs()}
+    assert states["empty"] == "damaged"
+    assert states[broken.name] == "damaged"
+    assert states[odd.name] == "damaged"
+    assert sorted(states.values()).count("done") == 1
+
+
+def test_order_and_selection(write_run):
+    write_run("reach/2026-01-01_00-00-00_s0", evals=((10, 0.9, 1.0),), started="2026-01-01T00:00:00+00:00")
+    write_run("ant/2026-01-02_00-00-00_s0", evals=((10, 0.1, 1.0),), started="2026-01-02T00:00:00+00:00")
+    assert [run.task for run in list_runs()] == ["ant", "reach"]
+    assert [run.task for run in list_runs(sort="score")] == ["reach", "ant"]
+    assert [run.task for run in list_runs("reach")] == ["reach"]
+    with pytest.raises(UsageError, match=r"no run of 'reech'.*Did you mean 'reach'"):
+        list_runs("reech")
+    with pytest.raises(UsageError, match="--sort stepz: give one of newest, score, steps, minutes"):
+        list_runs(sort="stepz")
+
+
+def test_no_runs_yet(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert list_runs() == []
+
+
+def test_changes_are_cut_short():
+    assert format_changes({}) == ""
+    assert format_changes({"a": 1, "b": 2}) == "a=1 b=2"
+    assert format_changes(dict.fromkeys("abcdef", 0)) == "a=0 b=0 c=0 d=0 and 2 more"
+
+
+def test_command_lists_as_text_and_json(write_run, rlctl):
+    write_run("reach/2026-01-01_00-00-00_s0", recipe_changes={"algo_kwargs.gamma": 0.9})
+    text = rlctl("runs")
+    assert text.returncode == 0
+    assert "reach/2026-01-01_00-00-00_s0" in text.stdout
+    assert "algo_kwargs.gamma=0.9" in text.stdout
+    (run,) = json.loads(rlctl("runs", "--json", "-").stdout)["runs"]
+    assert (run["state"], run["best_success"], run["changes"]) == ("done", 0.5, {"algo_kwargs.gamma": 0.9})
+
+
+@pytest.mark.slow
+def test_a_thousand_runs_are_listed_quickly(write_run):
+    for number in range(1000):
+        write_run(f"reach/2026-01-01_00-00-00_s{number}")
+    list_runs()
+    begun = time.process_time()
+    assert len(list_runs()) == 1000
+    assert time.process_time() - begun < 0.5

@@ -1,0 +1,69 @@
+import pytest
+
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.runs.removal import plan_prune, plan_removal, remove
+
+
+def test_removes_what_is_named(write_run):
+    gone, stays = write_run("reach/2026-01-01_00-00-00_s0"), write_run("reach/2026-01-01_00-00-01_s1")
+    removal = plan_removal(["reach/2026-01-01_00-00-00_s0"])
+    assert removal.bytes > 5000
+    assert remove(removal, yes=True)
+    assert not gone.exists()
+    assert stays.exists()
+    assert list(gone.parent.iterdir()) == [stays]
+
+
+def test_keeps_the_best_of_each_task(write_run):
+    best = write_run("reach/2026-01-01_00-00-00_s0", evals=((1, 0.9, 0.0),))
+    second = write_run("reach/2026-01-01_00-00-01_s0", evals=((1, 0.8, 9.0),))
+    third = write_run("reach/2026-01-01_00-00-02_s0", evals=((1, 0.7, 99.0),))
+    other = write_run("ant/2026-01-01_00-00-00_s0", evals=((1, None, 1.0),))
+    stopped = write_run("reach/2026-01-01_00-00-03_s0", "interrupted", evals=())
+    assert remove(plan_removal([], keep_best=2), yes=True)
+    assert [path.exists() for path in (best, second, third, other, stopped)] == [True, True, False, True, True]
+
+
+def test_never_removes_a_run_that_is_being_trained(write_run, hold_lock):
+    run = write_run("reach/2026-01-01_00-00-00_s0", "running")
+    hold_lock(run)
+    with pytest.raises(UsageError, match="being trained"):
+        plan_removal([str(run)])
+    assert plan_removal([], keep_best=0).paths == []
+    finished = write_run("reach/2026-01-01_00-00-01_s0")
+    removal = plan_removal([str(finished)])
+    hold_lock(finished)  # resumed between the question and the answer
+    with pytest.raises(UsageError, match="being trained"):
+        remove(removal, yes=True)
+    assert finished.exists()
+
+
+def test_refuses_what_is_not_a_run(write_run, tmp_path):
+    write_run("reach/2026-01-01_00-00-00_s0")
+    (tmp_path / "thesis" / "chapters" / "one").mkdir(parents=True)
+    for path in ("thesis", "thesis/chapters/one", "nothing", "runs", "runs/reach"):
+        with pytest.raises(ArtifactError, match="not the folder of a run"):
+            plan_removal([path])
+    with pytest.raises(UsageError, match="say what to remove"):
+        plan_removal([])
+
+
+def test_asks_only_on_a_terminal(write_run, rlctl):
+    run = write_run("reach/2026-01-01_00-00-00_s0")
+    refused = rlctl("runs", "rm", run, stdin=-3)
+    assert refused.returncode == 2
+    assert "--yes" in refused.stderr
+    assert run.exists()
+    done = rlctl("runs", "rm", run, "--yes")
+    assert done.returncode == 0
+    assert not run.exists()
+
+
+def test_prune_frees_checkpoints_of_finished_runs_only(write_run):
+    done, stopped = write_run("reach/2026-01-01_00-00-00_s0"), write_run("reach/2026-01-01_00-00-01_s0", "interrupted")
+    removal = plan_prune()
+    assert removal.bytes == 5000
+    assert remove(removal, yes=True)
+    assert not (done / "checkpoints").exists()
+    assert (done / "run.json").exists()
+    assert (stopped / "checkpoints").exists()

@@ -1,0 +1,92 @@
+"""The figures of a comparison, each with numbers from a formula or a published table."""
+
+import numpy as np
+import pytest
+
+from rlctl.runs.statistics import (
+    Verdict,
+    interquartile_mean,
+    interquartile_mean_interval,
+    return_difference,
+    seed_difference,
+    success_difference,
+)
+
+
+def successes(*groups):
+    return np.array([value for value, count in groups for _ in range(count)], np.bool_)
+
+
+def test_mcnemar_by_hand():
+    # 10 episodes gained, 2 lost: p = 2 * P(at most 2 of 12) = 2 * (1 + 12 + 66) / 4096 = 0.038574
+    baseline = successes((False, 10), (True, 2), (True, 88))
+    candidate = successes((True, 10), (False, 2), (True, 88))
+    difference = success_difference(baseline, candidate)
+    assert difference.mean == pytest.approx(0.08)
+    assert difference.p == pytest.approx(158 / 4096)
+    assert difference.verdict is Verdict.BETTER
+    assert success_difference(candidate, baseline).verdict is Verdict.WORSE
+
+
+def test_equal_policies_cannot_be_told_apart():
+    values = successes((True, 7), (False, 3))
+    difference = success_difference(values, values)
+    assert (difference.mean, difference.p, difference.needed) == (0.0, 1.0, None)
+    assert difference.verdict is Verdict.CANNOT_TELL
+    assert return_difference(values.astype(float), values.astype(float)).verdict is Verdict.CANNOT_TELL
+
+
+def test_episodes_needed_by_connors_formula():
+    # 3 gained, 1 lost of 100: (1.959964 * sqrt(0.04) + 0.841621 * sqrt(0.04 - 0.0004))^2 / 0.02^2 = 783.9
+    baseline = successes((False, 3), (True, 1), (True, 96))
+    candidate = successes((True, 3), (False, 1), (True, 96))
+    difference = success_difference(baseline, candidate)
+    assert difference.p == pytest.approx(2 * 5 / 16)  # 2 * P(at most 1 of 4)
+    assert difference.needed == pytest.approx(784, abs=1)
+
+
+def test_returns_are_paired():
+    rng = np.random.default_rng(0)
+    baseline = rng.normal(0.0, 100.0, 50)
+    # A gain of 1 that the spread of 100 between episodes would hide if they were not paired.
+    difference = return_difference(baseline, baseline + rng.normal(1.0, 0.5, 50))
+    assert difference.verdict is Verdict.BETTER
+    assert 0.8 < difference.low < difference.mean < difference.high < 1.2
+
+
+@pytest.mark.parametrize(("seeds", "smallest"), [(3, 0.1), (4, 2 / 70), (5, 2 / 252)])
+def test_smallest_p_of_so_many_seeds(seeds, smallest):
+    difference = seed_difference(np.arange(seeds, dtype=float), np.arange(seeds) + 100.0)
+    assert difference.p == pytest.approx(smallest)
+    assert difference.smallest_p == pytest.approx(smallest)
+    assert difference.probability_of_improvement == 1.0
+    assert difference.verdict is (Verdict.CANNOT_TELL if seeds == 3 else Verdict.BETTER)
+
+
+def test_probability_of_improvement_counts_ties_half():
+    # Pairs (candidate, baseline): 1-1 tie, 1-2 loss, 3-1 win, 3-2 win: (0.5 + 0 + 1 + 1) / 4
+    difference = seed_difference(np.array([1.0, 2.0]), np.array([1.0, 3.0]))
+    assert difference.probability_of_improvement == pytest.approx(0.625)
+
+
+def test_interquartile_mean_by_hand():
+    # Middle half of 0 1 2 3 4 5 6 100 is 2 3 4 5.
+    assert interquartile_mean(np.array([100.0, 0, 1, 2, 3, 4, 5, 6])) == 3.5
+    assert interquartile_mean_interval(np.full(5, 2.0)) == (2.0, 2.0)
+
+
+@pytest.mark.slow
+def test_intervals_cover_as_often_as_they_say():
+    # 95 % intervals of the mean of 40 paired differences, 100 times; at least 88 is what a binomial allows (p > 0.001).
+    rng = np.random.default_rng(3)
+    covered = 0
+    for _ in range(100):
+        difference = return_difference(np.zeros(40), rng.normal(1.0, 2.0, 40))
+        covered += difference.low <= 1.0 <= difference.high
+    assert covered >= 86
+
+
+def test_one_run_per_recipe_decides_nothing():
+    difference = seed_difference(np.array([1.0]), np.array([5.0]))
+    assert difference.verdict is Verdict.CANNOT_TELL
+    assert difference.needed is None
