@@ -108,7 +108,11 @@ def _hint_of_sizes(ours: spaces.Space[Any], theirs: spaces.Space[Any]) -> str:
 def _describe_shape(space: spaces.Space[Any]) -> Any:
     if isinstance(space, spaces.Dict):
         return {key: _describe_shape(each) for key, each in space.spaces.items()}
-    return str(space) if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) else f"{type(space).__name__}{space.shape}"
+    return (
+        str(space)
+        if isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
+        else f"{type(space).__name__}{space.shape}"
+    )
 
 
 def _collect_tensors(model: SavedModel, normalization: SavedNormalization | None) -> dict[str, NDArray[Any]]:
@@ -139,7 +143,12 @@ def show(result: ImportedPolicy, json: str | None) -> None:
 
     info = result.info
     if json is not None:
-        content = {"policy": str(result.file), "algo": info.algo, "task": info.spec.task, "normalizes": result.normalizes}
+        content = {
+            "policy": str(result.file),
+            "algo": info.algo,
+            "task": info.spec.task,
+            "normalizes": result.normalizes,
+        }
         output.write_result_json(json, {**content, "training_steps": info.training_steps, "versions": info.versions})
         return
     out = output.out()

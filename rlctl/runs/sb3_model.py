@@ -195,7 +195,9 @@ def read_normalization(path: Path) -> SavedNormalization | None:
             raise NotPlainData(f"an epsilon of {epsilon:g}, Stable-Baselines3's own is 1e-08")
         statistics = state["obs_rms"]
         parts = statistics if isinstance(statistics, dict) else {"": statistics}
-        fields = {key: _split_object(each, "stable_baselines3.common.running_mean_std.")[1] for key, each in parts.items()}
+        fields = {
+            key: _split_object(each, "stable_baselines3.common.running_mean_std.")[1] for key, each in parts.items()
+        }
         return SavedNormalization(
             mean={key: read_array(each["mean"]).astype(np.float64) for key, each in fields.items()},
             var={key: read_array(each["var"]).astype(np.float64) for key, each in fields.items()},
@@ -210,7 +212,9 @@ def read_normalization(path: Path) -> SavedNormalization | None:
 def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
     """Return the tensors, by name, of a state dict that `torch.save` wrote (torch 1.6 or newer: a zip archive)."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        prefix = next((name.removesuffix("data.pkl") for name in archive.namelist() if name.endswith("/data.pkl")), None)
+        prefix = next(
+            (name.removesuffix("data.pkl") for name in archive.namelist() if name.endswith("/data.pkl")), None
+        )
         if prefix is None:
             raise NotPlainData("policy.pth without data.pkl: written by a torch older than 1.6")
         order = _read_member(archive, f"{prefix}byteorder") if f"{prefix}byteorder" in archive.namelist() else b"little"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Any
 
 from rlctl import output
 from rlctl.run.directory import RunDirectory, find_run
@@ -51,7 +50,9 @@ def _warnings(run: RunDirectory) -> list[str]:
         "observations_cast": "observations of another dtype than their space's",
         "failed_evaluations": "evaluations that failed",
     }
-    found = [f"{count:,} {what}" for key, what in counted.items() if isinstance(count := status.get(key), int) and count]
+    found = [
+        f"{count:,} {what}" for key, what in counted.items() if isinstance(count := status.get(key), int) and count
+    ]
     return [*found, *([str(status["error"])] if status.get("error") else [])]
 
 
@@ -96,7 +97,9 @@ def plot(run: RunDescription, name: str) -> str:
     plotext.clear_figure()
     plotext.plotsize(*_PLOT_SIZE)
     plotext.title(f"{name} over steps")
-    for points, label, marker in zip(lines, ("training", "evaluations"), (("braille", "●") if is_utf8 else (".", "o")), strict=True):
+    for points, label, marker in zip(
+        lines, ("training", "evaluations"), (("braille", "●") if is_utf8 else (".", "o")), strict=True
+    ):
         if points:
             draw = plotext.plot if label == "training" else plotext.scatter
             draw(*zip(*points, strict=True), label=label, marker=marker)
@@ -104,7 +107,11 @@ def plot(run: RunDescription, name: str) -> str:
 
 
 def _points(rows: Rows, name: str) -> list[tuple[float, float]]:
-    return [(steps, value) for row in rows if (steps := row.get("steps")) is not None and (value := row.get(name)) is not None]
+    return [
+        (steps, value)
+        for row in rows
+        if (steps := row.get("steps")) is not None and (value := row.get(name)) is not None
+    ]
 
 
 def _show_evaluations(rows: Rows) -> None:

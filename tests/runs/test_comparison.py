@@ -12,6 +12,7 @@ from rlctl.runs.statistics import Verdict
 from rlctl.train.request import TrainRequest, run_training
 from tests.train.conftest import TINY
 
+
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
     """Two recipes of two seeds each, of a few hundred steps."""
