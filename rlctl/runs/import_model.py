@@ -99,9 +99,9 @@ def _check_spaces(
 
 
 def _hint_of_sizes(ours: spaces.Space[Any], theirs: spaces.Space[Any]) -> str:
-    if isinstance(ours, spaces.Box) and isinstance(theirs, spaces.Box) and len(ours.shape) == len(theirs.shape) == 1:
-        if theirs.shape[0] == ours.shape[0] + 1:
-            return "; the one more may be the time feature of rl-zoo3, which this task does not have"
+    sizes = [space.shape for space in (ours, theirs) if isinstance(space, spaces.Box) and len(space.shape) == 1]
+    if len(sizes) == 2 and sizes[1][0] == sizes[0][0] + 1:
+        return "; the one more may be the time feature of rl-zoo3, which this task does not have"
     return ""
 
 
