@@ -36,7 +36,7 @@ def rlctl(tmp_path):
             environment["PYTHONPATH"] = str(path)
         command = [sys.executable, "-m", "rlctl", *map(str, arguments)]
         return fork_server.for_commands().run(
-            command, **{"cwd": tmp_path, "timeout": 60, "env": environment, **options}
+            command, **{"cwd": tmp_path, "timeout": 120, "env": environment, **options}
         )
 
     return run

@@ -133,7 +133,13 @@ class ForkServer:
         process_group=None,
         start_new_session=False,
     ):
-        """Start `[python, "-c", code, ...]` or `[python, "-m", module, ...]` with options of `subprocess.Popen`."""
+        """Start `[python, "-c", code, ...]` or `[python, "-m", module, ...]` with options of `subprocess.Popen`.
+
+        One that is to have another hash seed is a fresh interpreter.
+        """
+        if env is not None and env.get("PYTHONHASHSEED") != os.environ.get("PYTHONHASHSEED"):
+            options = {"env": env, "cwd": cwd, "process_group": process_group, "start_new_session": start_new_session}
+            return subprocess.Popen(command, pass_fds=pass_fds, stdin=stdin, stdout=stdout, stderr=stderr, **options)
         with contextlib.ExitStack() as opened:
             standard = [
                 opened.enter_context(open(os.devnull, "r+b")).fileno() if each == subprocess.DEVNULL else each
@@ -193,9 +199,7 @@ def close():
 
 
 def start(command, **options):
-    """Start a worker as `subprocess.Popen` does: by the server of this process, unless hashes are to be others."""
-    if options.get("env", {}).get("PYTHONHASHSEED") != os.environ.get("PYTHONHASHSEED"):
-        return subprocess.Popen(command, **options)
+    """Start a worker as `subprocess.Popen` does, by the server of this process."""
     return for_workers().start(command, **options)
 
 

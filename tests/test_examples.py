@@ -5,12 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
+
+from tests import fork_server
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -22,14 +23,14 @@ def rlctl(*arguments: str, cwd: Path, path: Path | None = None) -> str:
 
 def run(*arguments: str, cwd: Path, path: Path | None = None) -> str:
     env = {**os.environ, "PYTHONPATH": str(path)} if path else None
-    done = subprocess.run([sys.executable, *arguments], cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    done = fork_server.for_commands().run([sys.executable, *arguments], cwd=cwd, env=env)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 def findings(task: str, cwd: Path) -> set[str]:
     command = [sys.executable, "-m", "rlctl", "check-env", task, "--json", "-"]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    done = fork_server.for_commands().run(command, cwd=cwd)
     return {finding["rule"] for finding in json.loads(done.stdout)["findings"]}
 
 

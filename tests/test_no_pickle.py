@@ -2,9 +2,9 @@
 
 import json
 import pickle
-import subprocess
 import sys
 
+from tests import fork_server
 from tests.train.conftest import ENVS
 
 WATCHED = """
@@ -25,13 +25,8 @@ print("@" + json.dumps([codes, found]), file=sys.stderr)
 
 def watched(folder, *commands):
     """Run commands in one process; return their exit codes and every class that was looked up for a pickle."""
-    done = subprocess.run(
-        [sys.executable, "-c", WATCHED, json.dumps([[str(word) for word in command] for command in commands])],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
+    words = json.dumps([[str(word) for word in command] for command in commands])
+    done = fork_server.for_commands().run([sys.executable, "-c", WATCHED, words], cwd=folder, timeout=240)
     told = [line for line in done.stderr.splitlines() if line.startswith("@")]
     assert told, done.stderr
     return json.loads(told[-1][1:])

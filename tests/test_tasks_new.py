@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 from rlctl import registry
 from rlctl.errors import UsageError
 from rlctl.tasks import new
+from tests import fork_server
 
 ROOT = Path(__file__).parent.parent
 FILES = {
@@ -29,7 +29,7 @@ def run(*arguments: object, cwd: Path, path: Path | None = None) -> str:
     """Run a Python module in `cwd`, with `path` before the installed packages; return its stdout."""
     env = {**os.environ, **({"PYTHONPATH": str(path)} if path else {})}
     command = [sys.executable, "-m", *map(str, arguments)]
-    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    done = fork_server.for_commands().run(command, cwd=cwd, env=env)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from rlctl.check_env.judge import Verdict, judge
 from rlctl.check_env.records import Records
 from rlctl.check_env.selection import choose_rules, find_rule
 from rlctl.errors import UsageError
+from tests import fork_server
 from tests.check_env.judging import records_of
 
 ROOT = Path(__file__).parent.parent.parent
@@ -37,7 +37,7 @@ def report_of(task, rules=tuple(RULES), experiments=PROBE, **settings):
 def rlctl(*arguments, folder=ROOT, **environment):
     command = [sys.executable, "-m", "rlctl", "check-env", *arguments]
     variables = {**os.environ, **environment}
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, check=False, env=variables)
+    return fork_server.for_commands().run(command, cwd=folder, timeout=60, env=variables)
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from rlctl.check_env.finding import RULES
 from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, UsageError
+from tests import fork_server
 
 FOLDER = Path(__file__).parent
 BROKEN = "tests/check_env/broken_envs.py"
@@ -24,7 +25,7 @@ ROOT = FOLDER.parent.parent
 
 def rlctl(*arguments):
     command = [sys.executable, "-m", "rlctl", "check-env", *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    return fork_server.for_commands().run(command, cwd=ROOT, timeout=60)
 
 
 @pytest.fixture

@@ -116,18 +116,14 @@ def test_a_gate_on_success_needs_success(tmp_path):
     assert run_evaluation(EvalRequest(str(run.path), episodes=2), Gates(min_return=-1e9)).success_rate is None
 
 
-def rlctl(*arguments, cwd):
-    return subprocess.run([sys.executable, "-m", "rlctl", *arguments], capture_output=True, text=True, cwd=cwd)
-
-
-def test_command_line_gate_and_pure_json(reach_run, tmp_path):
+def test_command_line_gate_and_pure_json(rlctl, reach_run, tmp_path):
     done = rlctl(*("eval", str(reach_run.path), "--episodes", "3", "--min-success", "1", "--json", "-"), cwd=tmp_path)
     assert done.returncode == 1
     assert json.loads(done.stdout)["policy"]["training_steps"] == 256
     assert done.stderr.strip().splitlines()[-1].startswith("error: gate missed: success rate 0")
 
 
-def test_policy_for_another_task_is_refused(reach_run, tmp_path):
+def test_policy_for_another_task_is_refused(rlctl, reach_run, tmp_path):
     done = rlctl("eval", str(reach_run.best_policy), "--task", "Pendulum-v1", "--episodes", "1", cwd=tmp_path)
     assert done.returncode == 5
     assert "this policy is not for this task: its observation space is Box(" in done.stderr
@@ -135,13 +131,13 @@ def test_policy_for_another_task_is_refused(reach_run, tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_no_run_yet(tmp_path):
+def test_no_run_yet(rlctl, tmp_path):
     done = rlctl("eval", cwd=tmp_path)
     assert done.returncode == 5
     assert done.stderr == f"error: no run yet under {tmp_path / 'runs'}; train one: rlctl train reach\n"
 
 
-def test_a_run_without_a_best_policy(reach_run, tmp_path):
+def test_a_run_without_a_best_policy(rlctl, reach_run, tmp_path):
     run = tmp_path / "runs" / "reach" / "2026-01-01_00-00-00_s0"
     run.mkdir(parents=True)
     (run / "run.json").write_text('{"task": "reach"}')

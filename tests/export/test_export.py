@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import onnx
@@ -23,12 +21,6 @@ from rlctl.run.torch_policy import TorchPolicy
 
 def export(path, output=None):
     return export_onnx(str(path), checkpoint="best", output=output)
-
-
-def rlctl(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "rlctl", *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=120
-    )
 
 
 def assert_verified(report):
@@ -207,7 +199,7 @@ def test_onnx_file_is_not_exported_again(tmp_path):
         export(tmp_path / "policy.onnx")
 
 
-def test_command_line(small, train, write, tmp_path):
+def test_command_line(rlctl, small, train, write, tmp_path):
     spec = small()
     path = write(train("ppo", spec), "ppo", spec)
     done = rlctl("export", path.name, "--onnx", "-o", "x.onnx", cwd=tmp_path)
@@ -228,7 +220,7 @@ def test_command_line(small, train, write, tmp_path):
     assert result["inputs"] == [{"name": "obs", "dtype": "float", "shape": ["batch", 3]}]
 
 
-def test_command_line_when_the_answer_is_no(small, train, write, tmp_path):
+def test_command_line_when_the_answer_is_no(rlctl, small, train, write, tmp_path):
     spec = small(noise=0.1)
     path = write(train("ppo", spec, steps=0), "ppo", spec)
     done = rlctl("export", path.name, "--onnx", cwd=tmp_path)

@@ -58,6 +58,11 @@ CASES = {
     "tqc": ("Line", settings("tqc")),
     "crossq": ("Line", settings("crossq")),
 }
+# A kind of state each: noise matrices, stages, a world of PyBullet, hidden states, whole episodes with their goals and
+# statistics, a target network. Killed trainings of plain ppo and sac are in tests/crash.
+QUICK = {
+    *("ppo with gSDE", "ppo, curriculum", "ppo, on reach", "recurrent_ppo", "sac, hindsight, normalised", "dqn"),
+}
 
 
 @pytest.fixture
@@ -79,7 +84,9 @@ def kill_after(monkeypatch):
     return kill
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
 @pytest.mark.usefixtures("every_boundary")
 def test_killed_and_resumed(train, resume, kill_after, case):
     env, given = CASES[case]
@@ -106,7 +113,7 @@ def newest_other_than(run):
     return RunDirectory(other)
 
 
-@pytest.mark.parametrize("case", ["ppo", "dqn"])
+@pytest.mark.parametrize("case", ["ppo", pytest.param("dqn", marks=pytest.mark.slow)])
 def test_an_evaluation_after_the_last_checkpoint(train, resume, kill_after, monkeypatch, case):
     monkeypatch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e-9)
     env, given = CASES[case]

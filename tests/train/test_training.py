@@ -1,15 +1,18 @@
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 from rlctl.errors import DivergedError, RecipeError, TaskError, UsageError
 from rlctl.run import recipe as recipes
+from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.run.policy import load_policy
 from rlctl.train import checkpoint
-from tests.train.conftest import ENVS, SMALL
+from rlctl.train.request import TrainRequest, TrainResult, run_training
+from tests.train.conftest import ENVS, SMALL, SMALL_PPO
 
 
 def rows(path):
@@ -17,8 +20,21 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-def test_run_folder_holds_everything(train, small_ppo):
-    result = train("Line", small_ppo)
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> TrainResult:
+    """A training that has ended; nobody writes to its run."""
+    root = tmp_path_factory.mktemp("finished")
+    return run_training(TrainRequest(f"{ENVS}:Line", settings=SMALL_PPO, root=root))
+
+
+@pytest.fixture
+def copied(finished, tmp_path) -> RunDirectory:
+    """A copy of that run."""
+    return RunDirectory(shutil.copytree(finished.run.path, tmp_path / "runs" / "Line" / finished.run.path.name))
+
+
+def test_run_folder_holds_everything(finished):
+    result = finished
     run = result.run
     status = run.status()
     assert status["status"] == "finished"
@@ -37,15 +53,14 @@ def test_run_folder_holds_everything(train, small_ppo):
     assert {float(row["success"]) for row in evals} == {1.0}
 
 
-def test_best_policy_is_that_of_the_best_evaluation(train, small_ppo):
-    result = train("Line", small_ppo)
+def test_best_policy_is_that_of_the_best_evaluation(finished):
+    result = finished
     best = max(rows(result.run.evals_file), key=lambda row: float(row["return"]))
     assert load_policy(result.run.best_policy).info.training_steps == int(best["steps"]) == result.best_step
 
 
-def test_kept_episodes_are_the_first_and_the_worst(train, small_ppo):
-    result = train("Line", small_ppo)
-    files = sorted(result.run.episodes.glob("*.npz"))
+def test_kept_episodes_are_the_first_and_the_worst(finished):
+    files = sorted(finished.run.episodes.glob("*.npz"))
     assert 2 <= len(files) <= 4
     episode = load_episode(files[0])
     assert episode.actions.shape == (10, 1)
@@ -74,15 +89,16 @@ def test_every_algorithm_trains_resumes_and_loads(train, resume, algo, env):
     kwargs = {"n_steps": 16} if algo in recipes.ON_POLICY else {"learning_starts": 32, "batch_size": 16}
     if algo == "ppo":
         kwargs["batch_size"] = 32
-    result = train(env, {**SMALL, "algo": algo, "algo_kwargs": kwargs})
-    assert result.steps == 256
-    longer = resume(result, total_timesteps=384)
-    assert longer.steps == 384
+    network = {} if env == "Image" else {"policy_kwargs": {"net_arch": [16]}}
+    result = train(env, {**SMALL, "algo": algo, "algo_kwargs": kwargs, "total_timesteps": 128, **network})
+    assert result.steps == 128
+    longer = resume(result, total_timesteps=192)
+    assert longer.steps == 192
     steps = [int(row["steps"]) for row in rows(result.run.evals_file)]
     assert steps == sorted(set(steps))
     policy = load_policy(result.run.last_policy)
     assert policy.info.algo == algo
-    assert policy.info.training_steps == 384
+    assert policy.info.training_steps == 192
     assert policy.action_space.contains(policy.predict(policy.observation_space.sample()))
 
 
@@ -106,32 +122,29 @@ def test_resume_goes_on_with_weights_optimiser_normalisation_and_counters(train,
     assert after.tensors["environments/steps"].tolist() == [0] * 4
 
 
-def test_resuming_a_finished_run_does_nothing(train, resume, small_ppo):
-    first = train("Line", small_ppo)
-    again = resume(first)
+def test_resuming_a_finished_run_does_nothing(copied, resume):
+    again = resume(copied)
     assert again.steps == 256
     assert "nothing to do" in again.note
 
 
-def test_resume_takes_no_other_recipe(train, resume, small_ppo):
-    first = train("Line", small_ppo)
+def test_resume_takes_no_other_recipe(copied, resume):
     with pytest.raises(UsageError, match="algo cannot be changed, only -n"):
-        resume(first, algo="sac")
+        resume(copied, algo="sac")
 
 
-def test_resume_falls_back_to_the_checkpoint_before_a_damaged_one(train, resume, small_ppo, capsys):
-    first = train("Line", small_ppo)
-    newest = first.run.checkpoints()[-1] / "state.safetensors"
+def test_resume_falls_back_to_the_checkpoint_before_a_damaged_one(copied, resume, capsys):
+    newest = copied.checkpoints()[-1] / "state.safetensors"
     content = bytearray(newest.read_bytes())
     content[-1] ^= 1
     newest.write_bytes(bytes(content))
-    resume(first)
+    resume(copied)
     assert f"warning: {newest}: damaged: its sha256 is not the one it was saved with; going on from step " in (
         capsys.readouterr().err
     )
     assert (newest.parent.parent / "000000256.damaged").is_dir()
-    assert [int(row["steps"]) for row in rows(first.run.metrics_file)] == [64, 128, 192, 256]
-    assert [int(row["steps"]) for row in rows(first.run.evals_file)] == [128, 256]
+    assert [int(row["steps"]) for row in rows(copied.metrics_file)] == [64, 128, 192, 256]
+    assert [int(row["steps"]) for row in rows(copied.evals_file)] == [128, 256]
 
 
 def test_stop_success_takes_two_evaluations_in_a_row(train, small_ppo):
@@ -208,8 +221,6 @@ def test_recipe_errors_name_the_key(train, small_ppo, settings, told):
 
 
 def test_task_and_resume_exclude_each_other():
-    from rlctl.train.request import TrainRequest, run_training
-
     for request in (TrainRequest(None), TrainRequest("reach", resume="latest")):
         with pytest.raises(UsageError, match="give a task to train, or --resume RUN"):
             run_training(request)
@@ -222,10 +233,9 @@ def test_defaults_for_an_environment_without_a_recipe():
     assert 2048 <= resolved.n_envs * resolved.algo_kwargs["n_steps"] <= 16384
 
 
-def test_live_policy_and_saved_policy_act_the_same(train, small_ppo):
-    result = train("Line", small_ppo)
-    policy = load_policy(result.run.last_policy)
-    episode = load_episode(sorted(result.run.episodes.glob("*.npz"))[-1])
+def test_live_policy_and_saved_policy_act_the_same(finished):
+    policy = load_policy(finished.run.last_policy)
+    episode = load_episode(sorted(finished.run.episodes.glob("*.npz"))[-1])
     if episode.info.policy != "training step 256":
         pytest.fail(f"the newest episode is of {episode.info.policy}")
     actions = np.stack([policy.predict(observation) for observation in episode.observations[:-1]])
