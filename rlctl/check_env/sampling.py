@@ -23,8 +23,6 @@ from pathlib import Path
 from types import CodeType, FrameType, ModuleType
 from typing import Any
 
-from rlctl.check_env.results import TimedCall
-
 INTERVAL_S = 0.0005
 _FOLDER = f"{Path(__file__).parent}/"
 _SCHEDULER = Path("/proc/thread-self/schedstat")
@@ -51,6 +49,22 @@ class Stopwatch:
         value = function(*arguments, **keywords)
         self.seconds.append(max(0.0, clock() - started))
         return value
+
+
+@dataclasses.dataclass(frozen=True)
+class TimedCall:
+    """The calls of one function in all steps, or in all resets."""
+
+    name: str
+    """`pybullet.stepSimulation`."""
+    place: str
+    """Where in the environment's code most of its time goes, `file.py:12`; empty if that is not known."""
+    share: float
+    """Its part of the time of all steps, or of all resets."""
+    kind: str = ""
+    """`rendering`, `sleeping`, `loading` or `connecting`, for what is suspicious."""
+    inside: str = ""
+    """Another suspicious function that it calls itself."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -10,13 +10,11 @@ import time
 
 import pytest
 
+from rlctl.check_env.families.speed import Speed, format_speed, kind_of, typical
 from rlctl.check_env.judge import judge
 from rlctl.check_env.records import Records
-from rlctl.check_env.results import Speed, TimedCall
-from rlctl.check_env.rules import speed as rules
-from rlctl.check_env.sampling import Sampler, Samples, Stopwatch
+from rlctl.check_env.sampling import Sampler, Samples, Stopwatch, TimedCall
 from rlctl.check_env.selection import choose_rules
-from rlctl.check_env.studies.speed import kind_of, typical
 from tests.check_env.judging import case, check_case, records_of
 
 CASES = [
@@ -40,7 +38,7 @@ def measured(task):
 def with_speed(**changes):
     """`Clean`, whose episodes have 50 steps, with another speed."""
     result = dataclasses.replace(NOTHING, **changes)
-    return dataclasses.replace(measured("broken_envs.py:Clean"), facts={"Speed": result})
+    return dataclasses.replace(measured("broken_envs.py:Clean"), facts={"speed": result})
 
 
 def findings(evidence):
@@ -61,7 +59,7 @@ def test_finds_the_mistake_and_only_that(case):
 )  # fmt: skip
 def test_what_is_fast_has_no_finding(task):
     assert findings(measured(task)) == []
-    assert "steps/s: a million steps take " in rules.speed_line(measured(task))
+    assert "steps/s: a million steps take " in format_speed(measured(task))
 
 
 def test_slow_has_hours_and_the_slowest_calls():
@@ -123,7 +121,7 @@ def test_connecting_in_reset_is_named_however_fast_it_is():
 
 def test_a_task_that_says_that_it_reloads_is_only_told_the_price():
     evidence = measured("broken_speed.py:ReloadingTask")
-    assert evidence.facts["Speed"].rebuilds
+    assert evidence.facts["speed"].rebuilds
     (finding,) = findings(evidence)
     assert (finding.rule, finding.severity) == ("RL902", "info")
     assert "pybullet.loadURDF" in finding.message
@@ -151,11 +149,11 @@ def test_waiting_in_reset_is_said_once():
 
 def test_line_for_the_report():
     # 50 steps of 66 us and a reset of 52 us: 3.352 ms, of which the reset is 1.6 %; 14,916 steps/s, 67 s.
-    assert rules.speed_line(with_speed()) == (
+    assert format_speed(with_speed()) == (
         "step 66 us, reset 52 us (1.6% of an episode), 15,000 steps/s: a million steps take 1.1 minutes; "
         "slowest: pybullet.stepSimulation 61% (world.py:10)"
     )
-    assert rules.speed_line(Records("any")) == ""
+    assert format_speed(Records("any")) == ""
 
 
 def test_a_step_that_takes_longer_now_and_then_counts_and_a_disturbance_does_not():

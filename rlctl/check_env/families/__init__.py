@@ -56,6 +56,7 @@ from rlctl.check_env.families import (
     rewards,
     search,
     spaces,
+    speed,
     success,
 )
 from rlctl.check_env.finding import RULES
@@ -63,7 +64,6 @@ from rlctl.check_env.legacy import old_experiment
 from rlctl.check_env.rules import (
     physics,
     physics_source,
-    speed,
 )
 
 PROCESS_S = 18.0
@@ -84,7 +84,7 @@ PROCESSES = {
             loading.build,
             determinism.compare_repetitions,
             determinism.compare_generators,
-            old_experiment("speed"),
+            speed.measure_speed,
             episodes.record_episodes,
             success.record_starts,
             search.search,

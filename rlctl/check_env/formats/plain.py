@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl import output
 from rlctl.check_env.check import Report
+from rlctl.check_env.families.speed import format_speed
 from rlctl.check_env.finding import FAMILIES, RULES, Finding, Severity
 from rlctl.check_env.formats.ranges import Row, action_rows, observation_rows
-from rlctl.check_env.rules.speed import speed_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -116,7 +116,7 @@ def _facts(report: Report) -> Iterator[str]:
         yield f"action {built.action_space}"
         if len(built.action_leaves) > 1:
             yield from _table(action_rows(report.records))
-        yield f"speed {speed_line(report.records) or 'not measured'}"
+        yield f"speed {format_speed(report.records) or 'not measured'}"
     if verdict.crashed:
         yield f"crashed: {', '.join(verdict.crashed)}; what they would find is not known"
     if built is None:

@@ -10,9 +10,9 @@ from typing import Any
 
 from rlctl import __version__
 from rlctl.check_env.check import Report
+from rlctl.check_env.families.speed import Speed
 from rlctl.check_env.finding import Finding
 from rlctl.check_env.formats.ranges import Row, action_rows, observation_rows
-from rlctl.check_env.results import Speed
 
 SCHEMA = Path(__file__).parent.parent / "report.schema.json"
 
@@ -91,7 +91,7 @@ def _environment(report: Report) -> dict[str, Any] | None:
 
 def _speed(report: Report) -> Any:
     """What one process does; null where no step could be timed."""
-    speed: Speed | None = report.records.facts.get(Speed.__name__)
+    speed: Speed | None = report.records.facts.get("speed")
     if speed is None or speed.step_s is None:
         return None
     return plain({**dataclasses.asdict(speed), "steps_per_second": 1 / speed.step_s})

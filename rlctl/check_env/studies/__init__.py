@@ -42,10 +42,7 @@ class Study:
         return run(context)
 
 
-STUDIES = (
-    Study("speed", "probe", 1.5, "speed:speed"),
-    Study("worlds", "instances", 4.0, "worlds:worlds"),
-)
+STUDIES = (Study("worlds", "instances", 4.0, "worlds:worlds"),)
 
 LIVES = ("comparisons", "episodes", "instances")
 """The studies that record whole lives of an environment."""

@@ -1,0 +1,357 @@
+"""RL9: speed. Training takes millions of steps; what each of them costs decides what can be done at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import re
+import statistics
+import sys
+import sysconfig
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rlctl.check_env.context import Context
+from rlctl.check_env.episode import Episode
+from rlctl.check_env.experiment import check, experiment
+from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.instance import Instance
+from rlctl.check_env.messages import Fact, Message
+from rlctl.check_env.records import Records
+from rlctl.check_env.sampling import Sampler, Samples, Stopwatch, TimedCall
+
+FIRST_SPEED_SEED = 5000
+TIMED_STEPS = 200
+TIMED_RESETS = 5
+SAMPLED_S = 0.25
+"""How long steps are sampled, and resets: some hundred samples each [s]."""
+MOST_STEPS = 20_000
+"""So many steps, or resets, are enough."""
+BATCH = 25
+"""The time of a step is the median of the means over so many: a disturbance is left out, a step that takes longer every
+now and then is not."""
+LONGEST_S = 2.0
+"""So much time is enough, however much there is: an environment that takes longer for these steps is slow [s]."""
+MOST_CALLS = 5
+
+MILLION = 1_000_000
+SLOW_STEPS_PER_S = 100.0
+"""Below it a million steps, a small training, take about three hours on one core [steps/s]."""
+SLOW_RESET_S = 0.005
+"""A reset, or loading in it, below this is not worth a word, whatever its share of short episodes: PyBullet's
+resetSimulation of an empty world alone takes half a millisecond [s]."""
+MOST_RESET = 0.5
+"""Share of an episode that reset takes from which most of training is spent in reset."""
+LITTLE_LOADING = 0.05
+"""Share of an episode below which loading in reset for more than `SLOW_RESET_S` is only worth knowing: environments
+that are stepped together wait for the one that resets, but rarely."""
+MOST_LOADING = 0.2
+"""Share of a step that loading or reading files takes from which that is worth the work to change."""
+LEAST_DRAWING = 0.05
+"""Share of a step, or of a reset, below which drawing and waiting are not worth a word: a `render` that returns at
+once because there is nothing to show."""
+SMALLEST_IMAGE = 8
+"""An observation with two axes at least this long is an image, so a camera is part of the task [pixels]."""
+NAMED_CALLS = 3
+LEAST_SHARE = 0.01
+"""Calls that take less are not named among the slowest."""
+
+KINDS = {
+    "rendering": r"pybullet\.(getCameraImage|addUserDebug\w+)$|(matplotlib|pyglet|OpenGL|PIL\.ImageDraw)\.|"
+    r"pygame\.(draw|gfxdraw|display|font|transform|surface|Surface)\b|"
+    r"cv2\.(imshow|imwrite|line|circle|rectangle|polylines|fillPoly|putText|arrowedLine)$|"
+    r"mujoco\.(mjr_render|renderer\.)|gymnasium\.envs\.mujoco\.mujoco_rendering\.",
+    "sleeping": r"time\.sleep$|pygame\.time\.(wait|delay|Clock\.tick\w*)$|cv2\.waitKey\w*$",
+    "connecting": r"pybullet\.connect$",
+    "loading": r"pybullet\.(load(URDF|MJCF|SDF|SoftBody|Bullet|Texture|Plugin)|create(Collision|Visual)Shape\w*|"
+    r"createMultiBody|createSoftBody\w*|resetSimulation)$|mujoco\..*from_(xml|binary)\w*$|"
+    r"open$|(TextIOWrapper|Buffered\w+|FileIO)\.read\w*$",
+}
+"""What step and reset should not do, by the names of functions."""
+_KINDS = {kind: re.compile(pattern) for kind, pattern in KINDS.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Speed:
+    """How long steps and resets take, and what takes that long."""
+
+    step_s: float | None
+    """A step with a random action, with nothing measured but time [s]; None where none could be taken."""
+    reset_s: float | None
+    steps: int
+    """How many were timed."""
+    resets: int
+    slowest_in_step: list[TimedCall]
+    """By their own time, what they call left out; the slowest first."""
+    slowest_in_reset: list[TimedCall]
+    suspicious_in_step: list[TimedCall]
+    """Calls that step should not make, with what they call; none is inside another."""
+    suspicious_in_reset: list[TimedCall]
+    rebuilds: bool
+    """Whether it is a task of rlctl that declares that every reset loads the world anew."""
+
+
+@experiment("speed", share=1.5)
+def measure_speed(context: Context) -> Iterator[Message]:
+    """Play random episodes: first with nothing but a clock, then sampled."""
+    instance, seconds = context.instance, min(LONGEST_S, context.budget.seconds_left)
+    steps, resets = Stopwatch(), Stopwatch()
+    deadline = time.monotonic() + seconds / 2
+    _play(instance, steps, resets, TIMED_STEPS, deadline)
+    _play(instance, steps, resets, TIMED_RESETS, deadline, only_reset=True)
+    sampler = Sampler(own_code(instance.env), kind_of)
+    in_step, in_reset = Samples(sampler), Samples(sampler)
+    with sampler.running():
+        for only_reset in (False, True):
+            deadline = time.monotonic() + min(seconds / 4, SAMPLED_S)
+            _play(instance, in_step, in_reset, MOST_STEPS, deadline, only_reset=only_reset)
+    yield Fact(
+        "speed",
+        Speed(
+            step_s=typical(steps.seconds, BATCH),
+            reset_s=typical(resets.seconds, 1),
+            steps=len(steps.seconds),
+            resets=len(resets.seconds),
+            slowest_in_step=in_step.slowest()[:MOST_CALLS],
+            slowest_in_reset=in_reset.slowest()[:MOST_CALLS],
+            suspicious_in_step=in_step.suspicious(),
+            suspicious_in_reset=in_reset.suspicious(),
+            rebuilds=_rebuilds(instance.env),
+        ),
+    )
+
+
+def _play(
+    instance: Instance, of_step: Any, of_reset: Any, calls: int, deadline: float, *, only_reset: bool = False
+) -> None:
+    """Play random episodes for so many steps, or resets, each called by `of_step` or `of_reset`."""
+
+    def timer(function: Any, *arguments: Any, **keywords: Any) -> Any:
+        return (of_reset if function == instance.env.reset else of_step)(function, *arguments, **keywords)
+
+    number = 0
+    while calls > 0 and time.monotonic() < deadline:
+        steps = 0 if only_reset else calls
+        seed = FIRST_SPEED_SEED + number
+        episode = Episode(instance, seed, number=number, max_steps=steps, deadline=deadline, timer=timer)
+        for _ in episode:
+            pass
+        number += 1
+        calls -= max(1, episode.steps)
+
+
+def typical(seconds: Sequence[float], batch: int) -> float | None:
+    """Return the median of the means of batches; those left over count only where there is no whole one."""
+    if not seconds:
+        return None
+    batch = min(batch, len(seconds))
+    starts = range(0, len(seconds) - batch + 1, batch)
+    return statistics.median(statistics.fmean(seconds[start : start + batch]) for start in starts)
+
+
+def own_code(env: Any) -> Callable[[str], bool]:
+    """Return what decides of a file whether it is the environment's own code, and no library's."""
+    import rlctl
+
+    paths = sysconfig.get_paths()
+    libraries = [str(Path(rlctl.__file__).parent), *(paths[name] for name in ("stdlib", "purelib", "platlib"))]
+    author = sys.modules.get(type(_find_author(env)).__module__)
+    folder = str(Path(getattr(author, "__file__", None) or "/nowhere/at.all").parent)
+
+    @functools.cache
+    def is_own(file: str) -> bool:
+        if file.startswith(f"{folder}/"):
+            return True
+        return not file.startswith(("<", *(f"{each}/" for each in libraries))) and "site-packages" not in file
+
+    return is_own
+
+
+def kind_of(name: str, own: bool) -> str:
+    """Return what is suspicious about a function: a key of `KINDS`, or nothing."""
+    if own:
+        return "rendering" if name.rpartition(".")[2] in ("render", "_render") else ""
+    return next((kind for kind, pattern in _KINDS.items() if pattern.match(name)), "")
+
+
+def _find_author(env: Any) -> Any:
+    """Return the object whose class somebody wrote: a task's environment is rlctl's."""
+    inner = getattr(env, "unwrapped", env)
+    return inner.task if _is_task(inner) else inner
+
+
+def _is_task(inner: Any) -> bool:
+    task_env = sys.modules.get("rlctl.task.env")
+    return task_env is not None and isinstance(inner, task_env.TaskEnv)
+
+
+def _rebuilds(env: Any) -> bool:
+    inner = getattr(env, "unwrapped", env)
+    return _is_task(inner) and not inner.task.fast_reset
+
+
+@check("RL901", "speed")
+def find_slow_step(records: Records) -> Iterator[Finding]:
+    speed = _require_speed(records)
+    if speed.step_s is None:
+        raise NotJudged("no step could be timed")
+    left = speed.step_s * (1 - _share(_explained(records, speed, "step")))
+    if left * SLOW_STEPS_PER_S <= 1:
+        return
+    per_s, hours = 1 / speed.step_s, MILLION * speed.step_s / 3600
+    calls = _list(speed.slowest_in_step)
+    yield Finding(
+        "RL901",
+        f"{per_s:,.3g} steps/s: a million steps take {hours:,.3g} hours per process on this machine; slowest: {calls}",
+        {"value": per_s, "expected": SLOW_STEPS_PER_S, "step_ms": 1e3 * speed.step_s, "steps": speed.steps},
+    )
+
+
+@check("RL902", "speed", "episodes")
+def find_slow_reset(records: Records) -> Iterator[Finding]:
+    speed, step_s, reset_s, steps = _require_times(records)
+    left = reset_s * (1 - _share(_explained(records, speed, "reset")))
+    if left <= SLOW_RESET_S or left / (left + steps * step_s) <= MOST_RESET:
+        return
+    share = reset_s / (reset_s + steps * step_s)
+    yield Finding(
+        "RL902",
+        f"reset takes {_time(reset_s)}, {share:.0%} of an episode of {steps:.0f} steps of {_time(step_s)} each; "
+        f"slowest: {_list(speed.slowest_in_reset)}",
+        {"value": share, "expected": MOST_RESET, "reset_ms": 1e3 * reset_s, "steps": steps},
+        Severity.INFO if speed.rebuilds else Severity.WARNING,
+        "If every episode repeats exactly without it (RL303), set fast_reset = True." if speed.rebuilds else "",
+    )
+
+
+@check("RL903", "speed")
+def find_drawing_and_waiting(records: Records) -> Iterator[Finding]:
+    speed = _require_speed(records)
+    for call, seconds in (("step", speed.step_s), ("reset", speed.reset_s)):
+        for each in _idle(records, speed, call):
+            lost = _time(each.share * seconds) if seconds else "?"
+            inside = f", there {each.inside}" if each.inside else ""
+            yield Finding(
+                "RL903",
+                f"{call} calls {each.name}{_at(each)}{inside}: {lost} per {call}, {each.share:.0%} of its time",
+                {"call": call, "value": each.name, "place": each.place, "share": each.share},
+            )
+
+
+@check("RL904", "speed", "episodes")
+def find_loading(records: Records) -> Iterator[Finding]:
+    speed, step_s, reset_s, steps = _require_times(records)
+    for call, call_s, part, whole_s in (
+        ("reset", reset_s, "an episode", reset_s + steps * step_s),
+        ("step", step_s, "its time", step_s),
+    ):
+        if not (calls := _loading(speed, call)):
+            continue
+        seconds = call_s * _share(calls)
+        share = seconds / whole_s if whole_s else 0.0
+        connects = any(each.kind == "connecting" for each in calls)
+        named = sorted(calls, key=lambda each: (each.kind != "connecting", -each.share))
+        more = f" and {len(named) - NAMED_CALLS} more" if len(named) > NAMED_CALLS else ""
+        is_rare = call == "reset" and not connects and share < LITTLE_LOADING
+        yield Finding(
+            "RL904",
+            f"{call} calls {', '.join(f'{each.name}{_at(each)}' for each in named[:NAMED_CALLS])}{more}: "
+            f"{_time(seconds)} per {call}, {share:.0%} of {part}",
+            {"call": call, "value": [each.name for each in named], "ms": 1e3 * seconds, "share": share},
+            Severity.INFO if is_rare else Severity.WARNING,
+        )
+
+
+def format_speed(records: Records) -> str:
+    """Return what a report says about speed in a line; empty where nothing was timed."""
+    try:
+        speed, step_s, reset_s, steps = _require_times(records)
+    except NotJudged:
+        return ""
+    episode_s = reset_s + steps * step_s
+    per_s = float(f"{steps / episode_s:.2g}")
+    calls = f"; slowest: {_list(speed.slowest_in_step)}" if speed.slowest_in_step else ""
+    return (
+        f"step {_time(step_s)}, reset {_time(reset_s)} ({reset_s / episode_s:.1%} of an episode), "
+        f"{per_s:,.{0 if per_s >= 10 else 1}f} steps/s: a million steps take {_duration(MILLION / per_s)}{calls}"
+    )
+
+
+def episode_steps(records: Records) -> float | None:
+    """Return the mean length of an episode with random actions, or of any, cut ones only if there are no others."""
+    episodes = [each for each in records.episodes if each.steps]
+    whole = [each for each in episodes if each.has_ended] or episodes
+    random = [each for each in whole if each.actions == "random"] or whole
+    return statistics.fmean(each.steps for each in random) if random else None
+
+
+def _require_speed(records: Records) -> Speed:
+    speed: Speed = records.require_fact("speed", "speed")
+    return speed
+
+
+def _require_times(records: Records) -> tuple[Speed, float, float, float]:
+    """Return the speed, the time of a step and of a reset [s], and the steps of an episode."""
+    speed, steps = _require_speed(records), episode_steps(records)
+    if not speed.step_s or speed.reset_s is None or steps is None:
+        raise NotJudged("no step or no reset could be timed")
+    return speed, speed.step_s, speed.reset_s, steps
+
+
+def _suspicious(speed: Speed, call: str, kinds: Sequence[str]) -> list[TimedCall]:
+    calls = speed.suspicious_in_step if call == "step" else speed.suspicious_in_reset
+    return [each for each in calls if each.kind in kinds]
+
+
+def _idle(records: Records, speed: Speed, call: str) -> list[TimedCall]:
+    """Return the calls that RL903 finds."""
+    shapes = [leaf.shape for leaf in records.require_built().leaves]
+    has_image = any(sum(size >= SMALLEST_IMAGE for size in shape) >= 2 for shape in shapes)
+    kinds = ("sleeping",) if has_image else ("sleeping", "rendering")
+    return [each for each in _suspicious(speed, call, kinds) if each.share >= LEAST_DRAWING]
+
+
+def _loading(speed: Speed, call: str) -> list[TimedCall]:
+    """Return the calls that RL904 finds."""
+    if call == "reset" and speed.rebuilds:
+        return []
+    calls = _suspicious(speed, call, ("loading", "connecting"))
+    share = _share(calls)
+    seconds = share * ((speed.step_s if call == "step" else speed.reset_s) or 0.0)
+    is_much = seconds > SLOW_RESET_S or (call == "step" and share > MOST_LOADING)
+    return calls if is_much or any(each.kind == "connecting" for each in calls) else []
+
+
+def _explained(records: Records, speed: Speed, call: str) -> list[TimedCall]:
+    """Return the calls whose time RL903 or RL904 names."""
+    return _idle(records, speed, call) + _loading(speed, call)
+
+
+def _share(calls: Sequence[TimedCall]) -> float:
+    return min(1.0, sum(each.share for each in calls))
+
+
+def _list(calls: Sequence[TimedCall]) -> str:
+    return ", ".join(
+        f"{each.name} {each.share:.0%}{_at(each)}" for each in calls[:NAMED_CALLS] if each.share >= LEAST_SHARE
+    )
+
+
+def _at(call: TimedCall) -> str:
+    return f" ({call.place})" if call.place else ""
+
+
+def _time(seconds: float) -> str:
+    for unit, size in (("s", 1.0), ("ms", 1e-3)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds * 1e6:.3g} us"
+
+
+def _duration(seconds: float) -> str:
+    for unit, size in (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0)):
+        if seconds >= size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.2g} seconds"
