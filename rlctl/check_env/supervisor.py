@@ -1,4 +1,7 @@
-"""Starts the child processes, two at a time, and passes on what they send; deaths and hangs become failures."""
+"""Starts the child processes, two at a time, and passes on what they send; deaths and hangs become failures.
+
+What a process had left to do when it died or hung is done in another one, so that most rules are judged even then.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,8 @@ TOTAL_S = 26.0
 """What is left of this is for the libraries' checkers, the last to start [s]."""
 LEAST_CHECKERS_S = 8.0
 """They get this much in any case: loading torch is part of it [s]."""
+LEAST_REST_S = 4.0
+"""A process that goes on for another one gets this much in any case [s]."""
 BUILD_TIMEOUT_S = 60.0
 """How long importing and building may take, unless a step may take longer."""
 FIRST_CALL_TIMEOUT_S = 30.0
@@ -43,7 +48,8 @@ class Child:
     def __init__(self, name: str, spec: EnvSpec, experiments: Sequence[str], seconds: float) -> None:
         self.name = name
         self.experiments = list(experiments)
-        """Those that it has not finished."""
+        """Those that it has not finished; the first is running."""
+        self.has_finished_one = False
         self.printed = 0
         """Lines that were written to stdout."""
         self.first_line = ""
@@ -150,6 +156,8 @@ class Supervisor:
         self._waiting: dict[str, list[str]] = {}
         self._active: dict[Connection, Child] = {}
         self._has_built = False
+        self._seconds_left: dict[str, float] = {}
+        """Of the processes that were started again."""
         self.children: list[Child] = []
         """Those that were started, the first process first."""
 
@@ -175,7 +183,7 @@ class Supervisor:
     def _start(self) -> None:
         while self._waiting and len(self._active) < AT_ONCE:
             name = next(iter(self._waiting))
-            seconds = self._budget_s
+            seconds = self._seconds_left.get(name, self._budget_s)
             if name == "checkers":
                 seconds = max(LEAST_CHECKERS_S, TOTAL_S - (time.monotonic() - self._started))
             child = Child(name, self._spec, self._waiting.pop(name), seconds)
@@ -198,7 +206,8 @@ class Supervisor:
         if isinstance(message, Mistake):
             self._waiting.clear()
         if isinstance(message, Finished):
-            child.experiments = [each for each in child.experiments if each != message.experiment]
+            child.experiments.remove(message.experiment)
+            child.has_finished_one = True
         self._receive(message)
 
     def _check(self, child: Child) -> None:
@@ -216,5 +225,13 @@ class Supervisor:
     def _end(self, child: Child, failure: Failure | None = None, grace_s: float = 0.0) -> None:
         if failure is not None:
             self._receive(failure)
+            self._start_again(child)
         del self._active[child.process.connection]
         child.close(grace_s)
+
+    def _start_again(self, child: Child) -> None:
+        """Have a new process do what is left of one that died or hung, once, if the environment worked before."""
+        rest = child.experiments[1:]
+        if rest and child.has_finished_one and child.name not in (*self._seconds_left, "checkers"):
+            self._seconds_left[child.name] = max(LEAST_REST_S, child.ends_at - time.monotonic())
+            self._waiting = {child.name: rest, **self._waiting}
