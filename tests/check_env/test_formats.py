@@ -14,7 +14,7 @@ import sarif_pydantic
 from rlctl.check_env import families
 from rlctl.check_env.check import Report
 from rlctl.check_env.finding import FAMILIES, RULES
-from rlctl.check_env.formats import FORMATS, choose, github, plain, sarif, structured
+from rlctl.check_env.formats import FORMATS, choose, github, plain, rules, sarif, structured
 from rlctl.check_env.judge import Verdict, judge
 from rlctl.check_env.records import Records
 from rlctl.check_env.selection import choose_rules, find_rule
@@ -264,3 +264,8 @@ def test_command_refuses_a_waiver_without_a_reason():
     run = rlctl(f"{HERE}/broken_waivers.py:NoReason", "--select", "RL106")
     assert (run.returncode, run.stdout) == (2, "")
     assert "RL106 is waived without a reason" in run.stderr
+
+
+def test_the_page_of_the_rules_is_current():
+    page = (ROOT / "docs" / "rules.md").read_text()
+    assert page == rules.render_page(), "write it again: python -m rlctl.check_env.formats.rules > docs/rules.md"
