@@ -218,7 +218,7 @@ class TrainingLoop(BaseCallback):
         for name in terms:
             if (value := row[f"term/{name}"]) is not None:
                 self.logger.record(f"reward_terms/{name}", value)
-        self.display.metrics(steps, row["fps"], row["return"], row["success"])
+        self.display.metrics(row)
 
     def evaluate(self, *, at_end: bool = False) -> None:
         """Play the evaluation episodes, save the best policy, and write the row and the episodes.
@@ -227,6 +227,7 @@ class TrainingLoop(BaseCallback):
         """
         steps, began = self.model.num_timesteps, time.monotonic()
         packed = self._pack()
+        self.display.phase("evaluating")
         try:
             self._record_evaluation(self._evaluator.run(self.model, *packed, self._raise_if_stop_requested), packed)
         except _StopRequested:

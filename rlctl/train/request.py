@@ -103,6 +103,7 @@ def _run(request: TrainRequest, start: Start, signals: StopSignals) -> TrainResu
     specs = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")
     title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
     with make_display(title, start.recipe.total_timesteps) as display:
+        display.phase(f"building {start.recipe.n_envs} environments, importing PyTorch")
         # The workers build their environments, and the check runs, while this process imports torch.
         workers = _workers(specs[start.stage - 1], start.recipe.n_envs, request, display)
         precheck = Precheck(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
@@ -152,6 +153,7 @@ def _train(
     recipe = start.recipe
     learner = _learner(request, start, specs, workers, display)
     if precheck is not None:
+        display.phase("checking the environment")
         precheck.refuse_errors(display)
     run = start.run or directory.create(start.task, recipe.seed, request.root)
     with start.lock or run.lock() as lock:
@@ -162,6 +164,7 @@ def _train(
             recipe, lambda: _workers(specs[-1], min(recipe.eval.episodes, _EVAL_ENVS), request, display)
         )
         loop = TrainingLoop(run, recipe, learner, evaluator, saver, display, start.checkpoint)
+        display.run_folder(run.path, run.metrics_file, run.evals_file)
         try:
             recordings = _learn_to_the_end(loop, request, signals, display)
         except BaseException as error:
@@ -224,6 +227,7 @@ def _learn_to_the_end(loop: TrainingLoop, request: TrainRequest, signals: StopSi
     if loop.recipe.stages:
         display.stage(loop.curriculum.title)
     signals.begin(loop)
+    display.phase("first steps")
     with silence_writer_thread():
         _learn(loop)
     signals.end()
