@@ -1,4 +1,16 @@
-"""Robot learning in simulation, end to end: check an environment, train, evaluate, export, replay."""
+"""Robot learning in simulation, end to end: check an environment, train, evaluate, export, replay.
+
+    cli           the command line: parse, call one function, print
+    check_env  train  eval  export  replay    the five verbs, a folder each
+    tasks         list, show and begin tasks
+    rollout       many environments in worker processes; seeds; episodes
+    run           what is on disk: recipes, run folders, policies, episodes
+    task          for authors of tasks: Task, Sim, Body, Event, rewards
+    env_spec      what an environment is made from; registry: from a task's name to its class
+    errors        every error that a user can cause, with its exit code
+
+From Python: `rlctl.make`, `rlctl.load_policy`; `docs/architecture.md` has the whole picture.
+"""
 
 from __future__ import annotations
 

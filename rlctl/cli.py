@@ -68,7 +68,7 @@ NEnvs = Annotated[Optional[int], typer.Option(help="Environments stepped side by
 Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]
 
 
-def _version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         print(f"rlctl {__version__}")
         raise typer.Exit
@@ -77,7 +77,7 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version and exit.", callback=_version, is_eager=True)
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     pass
@@ -512,7 +512,7 @@ def run(arguments: list[str]) -> int:
         _flush()
         return code if isinstance(code, int) else 0
     except RlctlError as error:
-        return _tell(error)
+        return _report(error)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -525,7 +525,7 @@ def run(arguments: list[str]) -> int:
             return 141
         raise
     except Exception as error:
-        return _tell_unexpected(error)
+        return _report_unexpected(error)
 
 
 def _flush() -> None:
@@ -547,7 +547,7 @@ def _close_stdout() -> None:
         os.dup2(nowhere, output.results().fileno())
 
 
-def _tell(error: RlctlError) -> int:
+def _report(error: RlctlError) -> int:
     if error.details:
         print(error.details.rstrip(), file=sys.stderr)
     first, *rest = str(error).splitlines()
@@ -555,7 +555,7 @@ def _tell(error: RlctlError) -> int:
     return error.exit_code
 
 
-def _tell_unexpected(error: Exception) -> int:
+def _report_unexpected(error: Exception) -> int:
     usage = getattr(error, "exit_code", None)
     show = getattr(error, "show", None)
     if usage is not None and show is not None:  # Typer's own usage errors

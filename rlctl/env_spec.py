@@ -79,7 +79,7 @@ class EnvSpec:
         from rlctl.task.task import check_parameters
 
         check_parameters(constructor)
-        parameters = _task_parameters(constructor, self.parameters)
+        parameters = _check_parameters(constructor, self.parameters)
         env: TaskEnv = call_plugin(
             self.task,
             lambda: TaskEnv(
@@ -99,7 +99,7 @@ class EnvSpec:
             parameters["render_mode"] = render_mode
         env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
         if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
-            raise TaskError(f"{self.task}: {type(env).__name__} is no Gymnasium environment (reset, step, spaces)")
+            raise TaskError(f"{self.task}: {type(env).__name__} is not a Gymnasium environment (reset, step, spaces)")
         return env
 
 
@@ -137,16 +137,16 @@ def _check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) 
         return
     for key in parameters:
         if key not in signature.parameters:
-            raise _no_parameter(task, key, list(signature.parameters))
+            raise _unknown_parameter(task, key, list(signature.parameters))
 
 
-def _no_parameter(task: str, key: str, known: list[str]) -> RecipeError:
+def _unknown_parameter(task: str, key: str, known: list[str]) -> RecipeError:
     return RecipeError(
         f"task.{key}: {task} has no parameter {key!r}.{did_you_mean(key, known)} It has: {', '.join(known) or 'none'}."
     )
 
 
-def _task_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+def _check_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     """Check the parameters of a `Task` against its fields: names and types."""
     import typing
 
@@ -157,13 +157,13 @@ def _task_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     checked = {}
     for key, value in given.items():
         if key not in fields:
-            raise _no_parameter(task.__name__, key, list(fields))
+            raise _unknown_parameter(task.__name__, key, list(fields))
         _check_number(key, hints[key], value)
         try:
             checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
         except pydantic.ValidationError as error:
-            told = error.errors()[0]["msg"].removeprefix("Input ")
-            raise RecipeError(f"task.{key}: {told}, got {short_repr(repr(value))}") from None
+            problem = error.errors()[0]["msg"].removeprefix("Input ")
+            raise RecipeError(f"task.{key}: {problem}, got {short_repr(repr(value))}") from None
     return checked
 
 

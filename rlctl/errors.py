@@ -57,7 +57,7 @@ class TaskError(RlctlError):
 
 
 class EpisodeFailed(TaskError):
-    """An environment failed in an episode that is known: to be lived again, as `hint` says."""
+    """An environment failed in an episode that can be reproduced, as `hint` says."""
 
     def __init__(self, what: str, env: int, seed: int, step: int, *, hint: str, details: str | None = None) -> None:
         super().__init__(f"{what}\nin environment {env}, episode seed {seed}, step {step}; {hint}", details=details)
@@ -100,7 +100,7 @@ def describe_exception(error: BaseException) -> str:
     try:
         text = " ".join(str(error).split())
     except Exception as another:
-        text = f"(its text cannot be had: {type(another).__name__})"
+        text = f"(message unavailable: {type(another).__name__})"
     if len(text) > _LONGEST:
         text = f"{text[:_LONGEST]}..."
     return f"{name}: {text}" if text else name

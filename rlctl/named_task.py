@@ -29,16 +29,16 @@ _LARGEST = 10 * 2**20  # [bytes] of a source file that is looked into
 def load(task: str, named_by: str) -> Callable[..., Any]:
     """Import a task that `named_by` names, as `registry.load` does; raises `ArtifactError` unless it is one."""
     if not task.isprintable():
-        raise _refused(task, named_by, "that is no name")
+        raise _make_error(task, named_by, "that is no name")
     if registry.find(task) is None and ":" in task:
         _look_before_import(task, named_by)
     constructor = registry.load(task)
     if not _may_be_called(task, constructor):
-        raise _refused(task, named_by, "that is no environment's class")
+        raise _make_error(task, named_by, "that is no environment's class")
     return constructor
 
 
-def _refused(task: str, named_by: str, why: str) -> ArtifactError:
+def _make_error(task: str, named_by: str, why: str) -> ArtifactError:
     shown = task if len(task) <= 80 else f"{task[:80]}..."
     hint = "; if you know what it is, name it yourself with --task" if named_by == POLICY else ""
     return ArtifactError(
@@ -53,16 +53,16 @@ def _look_before_import(task: str, named_by: str) -> None:
     file = registry.find_source_file(f"{place}:_")  # of a Gymnasium id, the module that registers it
     if file is None or not file.is_file():
         if place.partition(".")[0] in sys.stdlib_module_names:
-            raise _refused(task, named_by, "that is a part of Python")
+            raise _make_error(task, named_by, "that is a part of Python")
         return  # nothing to import: the registry says so
     if file.suffix != ".py" or _is_of_python(file):
-        raise _refused(task, named_by, "that is a part of Python or of rlctl")
-    source = _source(file)
+        raise _make_error(task, named_by, "that is a part of Python or of rlctl")
+    source = _read_source(file)
     if by_id is not None:
         if "gymnasium" not in source:
-            raise _refused(task, named_by, "its module does not speak of Gymnasium")
+            raise _make_error(task, named_by, "its module does not speak of Gymnasium")
     elif not _defines(source, name.partition(".")[0]):
-        raise _refused(task, named_by, f"{file.name} does not define it")
+        raise _make_error(task, named_by, f"{file.name} does not define it")
 
 
 def _is_of_python(file: Path) -> bool:
@@ -77,7 +77,7 @@ def _is_installed(file: Path) -> bool:
     return bool({"site-packages", "dist-packages"} & set(file.resolve().parts))
 
 
-def _source(file: Path) -> str:
+def _read_source(file: Path) -> str:
     with file.open("rb") as opened:
         return opened.read(_LARGEST).decode(errors="replace")
 
@@ -112,10 +112,12 @@ def _may_be_called(task: str, constructor: Any) -> bool:
     except (TypeError, OSError):
         return False
     own = file.is_file() and not _is_installed(file) and not _is_of_python(file)
-    return own and constructor.__module__ == _module_of(task) and bool(re.search("gymnasium|rlctl", _source(file)))
+    return (
+        own and constructor.__module__ == _find_module(task) and bool(re.search("gymnasium|rlctl", _read_source(file)))
+    )
 
 
-def _module_of(task: str) -> str | None:
+def _find_module(task: str) -> str | None:
     """Return the name of the module that a task's own file is loaded as."""
     file = registry.find_source_file(task)
     if file is None:

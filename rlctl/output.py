@@ -48,16 +48,16 @@ def leave_closed_terminal() -> None:
 @functools.cache
 def out() -> Console:
     """Return the console for results."""
-    return _console(results())
+    return _make_console(results())
 
 
 @functools.cache
 def err() -> Console:
     """Return the console for progress, logs and errors."""
-    return _console(sys.stderr)
+    return _make_console(sys.stderr)
 
 
-def _console(stream: TextIO) -> Console:
+def _make_console(stream: TextIO) -> Console:
     from rich.console import Console
 
     width = None if stream.isatty() else _PIPED_WIDTH

@@ -43,7 +43,7 @@ class TaskEntry:
     @property
     def module_file(self) -> Path | None:
         """The module's file, found without importing it or its packages."""
-        return _module_file(self.target.partition(":")[0])
+        return _find_module_file(self.target.partition(":")[0])
 
     @property
     def recipe_file(self) -> Path | None:
@@ -51,7 +51,7 @@ class TaskEntry:
         file = self.module_file
         if file is None:
             return None
-        return _existing(file.with_name(f"{self.name}.yaml")) or _existing(file.with_suffix(".yaml"))
+        return _keep_existing(file.with_name(f"{self.name}.yaml")) or _keep_existing(file.with_suffix(".yaml"))
 
 
 def list_installed() -> list[TaskEntry]:
@@ -109,10 +109,10 @@ def check_import(entry: TaskEntry, timeout_s: float = 60.0) -> str | None:
         )
     except subprocess.TimeoutExpired:
         return f"import did not end within {timeout_s:.0f} s"
-    told = [line[1:] for line in child.stdout.splitlines() if line.startswith("@")]
-    if not told:
+    lines = [line[1:] for line in child.stdout.splitlines() if line.startswith("@")]
+    if not lines:
         return f"import ended the process with exit code {child.returncode}"
-    return told[-1] or None
+    return lines[-1] or None
 
 
 def load(task: str) -> Callable[..., Any]:
@@ -147,7 +147,7 @@ def find_recipe_file(task: str) -> Path | None:
     if entry := find(task):
         return entry.recipe_file
     file = find_source_file(task)
-    return _existing(file.with_suffix(".yaml")) if file else None
+    return _keep_existing(file.with_suffix(".yaml")) if file else None
 
 
 def find_source_file(task: str) -> Path | None:
@@ -158,10 +158,10 @@ def find_source_file(task: str) -> Path | None:
     if _GYMNASIUM_ID.match(task) or ":" not in task:
         return None
     place = task.rpartition(":")[0]
-    return Path(place) if place.endswith(".py") else _module_file(place)
+    return Path(place) if place.endswith(".py") else _find_module_file(place)
 
 
-def _existing(file: Path) -> Path | None:
+def _keep_existing(file: Path) -> Path | None:
     return file if file.is_file() else None
 
 
@@ -182,7 +182,7 @@ def _put_current_folder_on_path() -> None:
         sys.path.insert(0, os.getcwd())
 
 
-def _module_file(module: str) -> Path | None:
+def _find_module_file(module: str) -> Path | None:
     """Find a module's file; unlike `find_spec` on a dotted name this imports no parent package."""
     head, *rest = module.split(".")
     try:
@@ -220,13 +220,13 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
 
 
 def _import_module(task: str, name: str) -> Any:
-    if _module_file(name) is None and name not in sys.modules:
+    if _find_module_file(name) is None and name not in sys.modules:
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
     return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 
 def _import_file(task: str, file: Path) -> Any:
-    file = _where_it_was(file.expanduser())
+    file = _find_loaded(file.expanduser())
     if not file.is_file():
         raise UsageError(f"task {task!r}: no file {file}")
     for loaded, known in list(sys.modules.items()):
@@ -252,7 +252,7 @@ def _import_file(task: str, file: Path) -> Any:
     return module
 
 
-def _where_it_was(file: Path) -> Path:
+def _find_loaded(file: Path) -> Path:
     """Return a file's whole path, even if the working directory is not the one any more in which it was loaded."""
     loaded = (getattr(module, "__file__", None) or "" for module in list(sys.modules.values()))
     before = None if file.exists() else next((path for path in loaded if Path(path).match(str(file))), None)
@@ -267,7 +267,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
             return gymnasium.make(task, disable_env_checker=True, **parameters)
         except gymnasium.error.UnregisteredEnv:
             name = task.rpartition(":")[2]
-            if _of_old_gym(name):
+            if _is_in_old_gym(name):
                 raise OldGymError(f"{name} is registered with the old gym, where Gymnasium does not find it") from None
             close = did_you_mean(name, gymnasium.registry)
             raise UsageError(f"Gymnasium has no environment {task!r}.{close}") from None
@@ -283,7 +283,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
     return constructor
 
 
-def _of_old_gym(name: str) -> bool:
+def _is_in_old_gym(name: str) -> bool:
     """Say whether the old gym, if something has imported it, knows an id."""
     old = getattr(sys.modules.get("gym"), "envs", None)
     known = getattr(old, "registry", {})

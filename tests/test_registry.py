@@ -129,7 +129,7 @@ def test_places_that_are_not_there(my_env, tmp_path):
     )
     assert error(UsageError, "my_env.py:number") == "my_env.py:number: number is a int, not a class or a function"
     assert error(TaskError, "my_env.py:NoEnv") == (
-        "my_env.py:NoEnv: NoEnv is no Gymnasium environment (reset, step, spaces)"
+        "my_env.py:NoEnv: NoEnv is not a Gymnasium environment (reset, step, spaces)"
     )
 
 

@@ -75,11 +75,11 @@ class Gates:
         missed = []
         for result in results:
             stage = f"stage {result.spec.stage}: " if len(results) > 1 else ""
-            missed += [stage + each for each in self._missed(result)]
+            missed += [stage + each for each in self._list_missed(result)]
         if missed:
             raise AnswerIsNo("gate missed: " + "; ".join(missed))
 
-    def _missed(self, result: Evaluation) -> list[str]:
+    def _list_missed(self, result: Evaluation) -> list[str]:
         rate, interval = result.success_rate, result.success_interval
         missed = []
         if self.min_success is not None and rate is not None and rate < self.min_success:
@@ -92,7 +92,7 @@ class Gates:
 
 
 def run_evaluation(request: EvalRequest, gates: Gates) -> Evaluation:
-    """Find the policy, live its episodes, and return their statistics."""
+    """Find the policy, run its episodes, and return their statistics."""
     (evaluation,) = run_evaluations(request, gates)
     return evaluation
 
@@ -105,10 +105,10 @@ def run_evaluations(request: EvalRequest, gates: Gates) -> list[Evaluation]:
 
         pin_threads()
     policy = load_policy(path)
-    return [_evaluate(path, policy, spec, request, gates) for spec in _specs(policy.info, request)]
+    return [_evaluate(path, policy, spec, request, gates) for spec in _choose_specs(policy.info, request)]
 
 
-def _specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
+def _choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
     if request.stage is None:
         return [info.derive_spec(request.task, request.parameters)]
     if request.task is not None and request.task != info.spec.task:
@@ -135,13 +135,13 @@ def _evaluate(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, g
         policy.info.check_fits(workers.info, path)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
-        episodes = _live(workers, policy, request)
-    evaluation = _statistics(path, policy, spec, request, episodes)
+        episodes = _run_episodes(workers, policy, request)
+    evaluation = _summarize(path, policy, spec, request, episodes)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
 
 
-def _live(workers: Workers, policy: Policy, request: EvalRequest) -> list[Episode]:
+def _run_episodes(workers: Workers, policy: Policy, request: EvalRequest) -> list[Episode]:
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
     actor = BatchActor(policy, workers.n_envs, deterministic=request.deterministic)
     if not request.deterministic and "torch" in sys.modules:
@@ -157,7 +157,7 @@ def _live(workers: Workers, policy: Policy, request: EvalRequest) -> list[Episod
         )
 
 
-def _statistics(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, episodes: list[Episode]) -> Evaluation:
+def _summarize(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, episodes: list[Episode]) -> Evaluation:
     results = [episode.result for episode in episodes]
     distances = [result.final_distance for result in results if result.final_distance is not None]
     return Evaluation(

@@ -41,12 +41,12 @@ def _show_stages(results: Sequence[Evaluation]) -> None:
             "-" if interval is None else f"{interval[0]:.1%} to {interval[1]:.1%}",
             f"{result.returns.mean:.4g}",
             f"{result.lengths.mean:.4g}",
-            _differing(result.spec, [each.spec for each in results]),
+            _describe_changes(result.spec, [each.spec for each in results]),
         )
     out.print(table)
 
 
-def _differing(spec: EnvSpec, specs: Sequence[EnvSpec]) -> str:
+def _describe_changes(spec: EnvSpec, specs: Sequence[EnvSpec]) -> str:
     """Name what is not the same in all stages."""
     parts = []
     for field in ("parameters", "reward_weights", "events"):
@@ -77,10 +77,10 @@ def show(result: Evaluation, json: str | None) -> None:
     table.add_column("")
     for column in ("mean", "IQM", "std", "min", "max"):
         table.add_column(column, justify="right", header_style="bold")
-    table.add_row("return", *_numbers(result.returns))
-    table.add_row("length", *_numbers(result.lengths))
+    table.add_row("return", *_format_spread(result.returns))
+    table.add_row("length", *_format_spread(result.lengths))
     if result.final_distance is not None:
-        table.add_row("final distance", *_numbers(result.final_distance))
+        table.add_row("final distance", *_format_spread(result.final_distance))
     for name, mean in result.terms.items():
         table.add_row(f"term {name}", f"{mean:.4g}")
     out.print(table)
@@ -93,7 +93,7 @@ def _show_head(result: Evaluation) -> None:
     out.print(f"{len(result.episodes)} episodes, seed {result.seed}{mode}")
 
 
-def _numbers(spread: Spread) -> list[str]:
+def _format_spread(spread: Spread) -> list[str]:
     return [f"{value:.4g}" for value in (spread.mean, spread.iqm, spread.std, spread.min, spread.max)]
 
 

@@ -25,6 +25,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
+        """Describe values, one per episode."""
         from scipy.stats import trim_mean
 
         array = np.asarray(values, np.float64)

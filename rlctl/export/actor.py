@@ -27,41 +27,41 @@ def build(info: PolicyInfo, network: Any, tensors: Tensors) -> onnx.ModelProto:
     _, action_space = info.env.spaces()
     value, *state = _ACTORS[info.algo](graph, Observations(graph, info, tensors), network)
     if isinstance(action_space, spaces.Box):
-        value, dtype = _continuous(graph, value, action_space, bool(network.squash_output))
+        value, dtype = _emit_continuous(graph, value, action_space, bool(network.squash_output))
     else:
-        value, dtype = _discrete(graph, value, action_space), np.dtype(np.int64)
+        value, dtype = _emit_discrete(graph, value, action_space), np.dtype(np.int64)
     shape: tuple[int | str, ...] = (BATCH, *(action_space.shape or ()))
     graph.output(value, ACTION, dtype, shape, info.env.action_meaning or "action, as the environment takes it")
     for name, part in zip(STATE_OUTPUTS, state, strict=False):
-        graph.output(part, name, np.float32, _state_shape(network), "LSTM state for the next step")
+        graph.output(part, name, np.float32, _find_state_shape(network), "LSTM state for the next step")
     return graph.model(metadata(info), describe(info))
 
 
-def _actor_critic(graph: Graph, observations: Observations, network: Any) -> list[str]:
+def _emit_actor_critic(graph: Graph, observations: Observations, network: Any) -> list[str]:
     """PPO, A2C: the mean of the distribution, or the logits."""
     value = observations.features(network.pi_features_extractor, scale_images=network.normalize_images)
-    return [_action_net(graph, value, network)]
+    return [_emit_action_net(graph, value, network)]
 
 
-def _recurrent(graph: Graph, observations: Observations, network: Any) -> list[str]:
+def _emit_recurrent(graph: Graph, observations: Observations, network: Any) -> list[str]:
     value = observations.features(network.pi_features_extractor, scale_images=network.normalize_images)
-    hidden, cell = (graph.input(name, np.float32, _state_shape(network), _STATE_MEANING) for name in STATE_INPUTS)
+    hidden, cell = (graph.input(name, np.float32, _find_state_shape(network), _STATE_MEANING) for name in STATE_INPUTS)
     value, after = emit_lstm(graph, value, (hidden, cell), network.lstm_actor, "lstm_actor")
-    return [_action_net(graph, value, network), *after]
+    return [_emit_action_net(graph, value, network), *after]
 
 
-def _state_shape(network: Any) -> tuple[int, str, int]:
+def _find_state_shape(network: Any) -> tuple[int, str, int]:
     return network.lstm_actor.num_layers, BATCH, network.lstm_actor.hidden_size
 
 
-def _action_net(graph: Graph, value: str, network: Any) -> str:
+def _emit_action_net(graph: Graph, value: str, network: Any) -> str:
     value = emit(graph, value, network.mlp_extractor.policy_net, "mlp_extractor.policy_net")
     value = emit(graph, value, network.action_net, "action_net")
     # gSDE with bounded actions; the noise itself has no part in a deterministic action.
     return graph.add("Tanh", value) if network.squash_output else value
 
 
-def _squashed_gaussian(graph: Graph, observations: Observations, network: Any) -> list[str]:
+def _emit_squashed_gaussian(graph: Graph, observations: Observations, network: Any) -> list[str]:
     """SAC, TQC, CrossQ, with gSDE or without: tanh of the mean."""
     actor = network.actor
     value = observations.features(actor.features_extractor, scale_images=actor.normalize_images)
@@ -69,14 +69,14 @@ def _squashed_gaussian(graph: Graph, observations: Observations, network: Any) -
     return [graph.add("Tanh", emit(graph, value, actor.mu, "actor.mu"))]
 
 
-def _deterministic(graph: Graph, observations: Observations, network: Any) -> list[str]:
+def _emit_deterministic(graph: Graph, observations: Observations, network: Any) -> list[str]:
     """TD3, DDPG: the network ends with its own tanh."""
     actor = network.actor
     value = observations.features(actor.features_extractor, scale_images=actor.normalize_images)
     return [emit(graph, value, actor.mu, "actor.mu")]
 
 
-def _q_values(graph: Graph, observations: Observations, network: Any) -> list[str]:
+def _emit_q_values(graph: Graph, observations: Observations, network: Any) -> list[str]:
     q_net = network.q_net
     value = observations.features(q_net.features_extractor, scale_images=q_net.normalize_images)
     return [emit(graph, value, q_net.q_net, "q_net.q_net")]
@@ -84,19 +84,19 @@ def _q_values(graph: Graph, observations: Observations, network: Any) -> list[st
 
 # Each returns the end of the network's own computation and, if recurrent, the next state.
 _ACTORS = {
-    "ppo": _actor_critic,
-    "a2c": _actor_critic,
-    "recurrent_ppo": _recurrent,
-    "sac": _squashed_gaussian,
-    "tqc": _squashed_gaussian,
-    "crossq": _squashed_gaussian,
-    "td3": _deterministic,
-    "ddpg": _deterministic,
-    "dqn": _q_values,
+    "ppo": _emit_actor_critic,
+    "a2c": _emit_actor_critic,
+    "recurrent_ppo": _emit_recurrent,
+    "sac": _emit_squashed_gaussian,
+    "tqc": _emit_squashed_gaussian,
+    "crossq": _emit_squashed_gaussian,
+    "td3": _emit_deterministic,
+    "ddpg": _emit_deterministic,
+    "dqn": _emit_q_values,
 }
 
 
-def _continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool) -> tuple[str, np.dtype[Any]]:
+def _emit_continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool) -> tuple[str, np.dtype[Any]]:
     if not np.issubdtype(space.dtype, np.floating):
         raise unsupported(f"an action of type {space.dtype}")
     # As numpy promotes it in SB3: float32 stays, bounds in float64 make the action float64.
@@ -116,7 +116,7 @@ def _continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool) -> 
     return graph.add("Min", value, graph.constant("action/high", high)), dtype
 
 
-def _discrete(graph: Graph, value: str, space: spaces.Space[Any]) -> str:
+def _emit_discrete(graph: Graph, value: str, space: spaces.Space[Any]) -> str:
     """The most likely, or most valuable, choice. Counted from 0: SB3 takes no notice of a space's `start`."""
     if isinstance(space, spaces.Discrete):
         return graph.add("ArgMax", value, axis=1, keepdims=0)

@@ -31,6 +31,7 @@ class Agreement:
 
     @property
     def agrees(self) -> bool:
+        """Whether no action differs by more than the limit."""
         return self.beyond_limit == 0
 
 
@@ -69,7 +70,7 @@ class Comparison:
     def _is_near_tie(self, row: int, expected: NDArray[Any], action: NDArray[Any]) -> bool:
         return all(
             margin <= MAX_DIFFERENCE * max(1.0, size)
-            for margin, size in _margins(self._space, self._logits[row], expected, action)
+            for margin, size in _list_margins(self._space, self._logits[row], expected, action)
         )
 
     def result(self) -> Agreement:
@@ -79,7 +80,7 @@ class Comparison:
         return Agreement(self.observations, self._max_difference, self._beyond_limit, self._near_ties)
 
 
-def _margins(
+def _list_margins(
     space: spaces.Space[Any], logits: NDArray[np.float32], expected: NDArray[Any], action: NDArray[Any]
 ) -> list[tuple[float, float]]:
     """By how much, per choice, the logit of the expected one is ahead, and the size of that logit."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
-from rlctl.export.report import ExportReport, Port, agreement_line, closed_loop_line
+from rlctl.export.report import ExportReport, Port, format_agreement, format_closed_loop
 from rlctl.rollout.workers import Workers
 from rlctl.run import directory, files, onnx_file
 from rlctl.run.policy import PolicyInfo, read_policy
@@ -52,7 +52,7 @@ def _export(policy_file: Path, target: Path) -> ExportReport:
 
         def write(part: Path) -> None:
             part.write_bytes(onnx_file.encode(model))
-            reports.append(_verified(policy_file, target, part, policy, model, workers))
+            reports.append(_verify(policy_file, target, part, policy, model, workers))
 
         files.write_with(target, write)
     return reports[0]
@@ -71,7 +71,7 @@ def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) ->
         )
 
 
-def _verified(
+def _verify(
     policy_file: Path, target: Path, part: Path, policy: Any, model: onnx.ModelProto, workers: Workers
 ) -> ExportReport:
     from rlctl.export.latency import measure
@@ -81,7 +81,7 @@ def _verified(
     exported = OnnxPolicy.load(part)
     seen = verify(policy, exported, workers)
     if not seen.passed:
-        raise AnswerIsNo(_why_not(policy_file, target, policy.info.spec.task, seen))
+        raise AnswerIsNo(_explain_failure(policy_file, target, policy.info.spec.task, seen))
     info = policy.info
     return ExportReport(
         path=target,
@@ -91,24 +91,24 @@ def _verified(
         training_steps=info.training_steps,
         size=part.stat().st_size,
         opset=model.opset_import[0].version,
-        inputs=_ports(exported.session.get_inputs()),
-        outputs=_ports(exported.session.get_outputs()),
+        inputs=_list_ports(exported.session.get_inputs()),
+        outputs=_list_ports(exported.session.get_outputs()),
         agreement=seen.agreement,
         closed_loop=seen.closed_loop,
         latency=measure(policy, exported),
     )
 
 
-def _why_not(policy_file: Path, target: Path, task: str, seen: Verification) -> str:
+def _explain_failure(policy_file: Path, target: Path, task: str, seen: Verification) -> str:
     why = f"the ONNX file does not act as {policy_file} does"
     if seen.agreement.agrees:
         why = (
             "every action agrees, but the episodes do not: the environment is not reproducible, or magnifies "
-            f"differences of {seen.agreement.max_difference:.0e}; rlctl check-env {task} tells"
+            f"differences of {seen.agreement.max_difference:.0e}; see rlctl check-env {task}"
         )
-    numbers = f"{agreement_line(seen.agreement)}\n{closed_loop_line(seen.closed_loop)}"
+    numbers = f"{format_agreement(seen.agreement)}\n{format_closed_loop(seen.closed_loop)}"
     return f"{target}: not verified, not kept: {why}\n{numbers}"
 
 
-def _ports(found: Any) -> list[Port]:
+def _list_ports(found: Any) -> list[Port]:
     return [Port(each.name, each.type[len("tensor(") : -1], tuple(each.shape)) for each in found]

@@ -37,7 +37,7 @@ class Graph:
         """Add an input; raises `UsageError` if its name is taken, as a dict observation may have any key."""
         if not name or name.startswith("/") or name in (each.name for each in self._inputs):
             raise UsageError(f"export: an observation cannot be named {name!r} in an ONNX file")
-        self._inputs.append(helper.make_tensor_value_info(name, _type(dtype), list(shape), meaning))
+        self._inputs.append(helper.make_tensor_value_info(name, _find_type(dtype), list(shape), meaning))
         return name
 
     def constant(self, name: str, value: Any) -> str:
@@ -60,7 +60,7 @@ class Graph:
 
     def cast(self, value: str, dtype: Any) -> str:
         """Add a conversion to a numpy dtype."""
-        return self.add("Cast", value, to=_type(dtype))
+        return self.add("Cast", value, to=_find_type(dtype))
 
     def output(self, value: str, name: str, dtype: Any, shape: Sequence[int | str], meaning: str) -> None:
         """Make a value an output, under a name."""
@@ -69,7 +69,7 @@ class Graph:
         for node in self._nodes:
             for names in (node.input, node.output):
                 names[:] = [name if each == value else each for each in names]
-        self._outputs.append(helper.make_tensor_value_info(name, _type(dtype), list(shape), meaning))
+        self._outputs.append(helper.make_tensor_value_info(name, _find_type(dtype), list(shape), meaning))
 
     def model(self, metadata: Mapping[str, str], meaning: str) -> onnx.ModelProto:
         """Return the checked model; raises onnx's `ValidationError` if the graph makes no sense."""
@@ -93,5 +93,5 @@ def unsupported(what: str) -> UsageError:
     return UsageError(f"export: {what} cannot be written as ONNX yet")
 
 
-def _type(dtype: Any) -> int:
+def _find_type(dtype: Any) -> int:
     return int(helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))

@@ -28,6 +28,7 @@ class Latency:
 
     @property
     def speedup(self) -> float:
+        """How many times as fast as SB3 the file is."""
         return self.sb3_us / self.onnx_us
 
 
@@ -37,22 +38,22 @@ def measure(torch_policy: TorchPolicy, onnx_policy: OnnxPolicy) -> Latency:
     space.seed(0)
     observation = space.sample()
     normalized: Any = torch_policy.normalizer(observation)
-    state, starts = _one_row_of_state(torch_policy), np.array([False])
+    state, starts = _take_state_row(torch_policy), np.array([False])
     onnx_policy.reset()
     return Latency(
-        onnx_us=_median_us(lambda: onnx_policy.predict(observation)),
-        sb3_us=_median_us(
+        onnx_us=_measure_median_us(lambda: onnx_policy.predict(observation)),
+        sb3_us=_measure_median_us(
             lambda: torch_policy.network.predict(normalized, state=state, episode_start=starts, deterministic=True)
         ),
     )
 
 
-def _one_row_of_state(policy: TorchPolicy) -> Any:
+def _take_state_row(policy: TorchPolicy) -> Any:
     state = policy.initial_state()
     return None if state is None else tuple(part[:, :1] for part in state)
 
 
-def _median_us(call: Callable[[], Any]) -> float:
+def _measure_median_us(call: Callable[[], Any]) -> float:
     for _ in range(WARM_UP):
         call()
     times = []

@@ -39,14 +39,14 @@ def array(tensor: torch.Tensor) -> NDArray[Any]:
     return result
 
 
-def _linear(graph: Graph, value: str, module: Any, name: str) -> str:
+def _emit_linear(graph: Graph, value: str, module: Any, name: str) -> str:
     inputs = [value, graph.constant(f"{name}.weight", array(module.weight))]
     if module.bias is not None:
         inputs.append(graph.constant(f"{name}.bias", array(module.bias)))
     return graph.add("Gemm", *inputs, transB=1)
 
 
-def _conv(graph: Graph, value: str, module: Any, name: str) -> str:
+def _emit_conv(graph: Graph, value: str, module: Any, name: str) -> str:
     if module.padding_mode != "zeros" or isinstance(module.padding, str):
         raise unsupported(f"layer {name}, which pads with {module.padding_mode!r},")
     inputs = [value, graph.constant(f"{name}.weight", array(module.weight))]
@@ -63,7 +63,7 @@ def _conv(graph: Graph, value: str, module: Any, name: str) -> str:
     )
 
 
-def _batch_renorm(graph: Graph, value: str, module: Any, name: str) -> str:
+def _emit_batch_renorm(graph: Graph, value: str, module: Any, name: str) -> str:
     # Step by step as sb3-contrib computes it: folded into one multiplication and addition, a mean that is large
     # against its deviation would cost digits.
     deviation = (module.ra_var + module.eps).sqrt()
@@ -75,11 +75,11 @@ def _batch_renorm(graph: Graph, value: str, module: Any, name: str) -> str:
     return graph.add("Add", value, graph.constant(f"{name}.bias", array(module.bias)))
 
 
-def _silu(graph: Graph, value: str, module: Any, name: str) -> str:
+def _emit_silu(graph: Graph, value: str, module: Any, name: str) -> str:
     return graph.add("Mul", value, graph.add("Sigmoid", value))
 
 
-def _gelu(graph: Graph, value: str, module: Any, name: str) -> str:
+def _emit_gelu(graph: Graph, value: str, module: Any, name: str) -> str:
     # 0.5 x (1 + erf(x / sqrt(2))); ONNX has an operator for it from opset 20 only.
     if module.approximate != "none":
         raise unsupported(f"layer {name}, GELU with approximate={module.approximate!r},")
@@ -89,33 +89,33 @@ def _gelu(graph: Graph, value: str, module: Any, name: str) -> str:
     return graph.add("Mul", graph.add("Mul", value, graph.add("Add", erf, one)), half)
 
 
-def _hard_tanh(graph: Graph, value: str, module: Any, name: str) -> str:
+def _emit_hard_tanh(graph: Graph, value: str, module: Any, name: str) -> str:
     low = graph.constant(f"{name}.low", np.float32(module.min_val))
     return graph.add("Clip", value, low, graph.constant(f"{name}.high", np.float32(module.max_val)))
 
 
-def _flatten(graph: Graph, value: str, module: Any, name: str) -> str:
+def _emit_flatten(graph: Graph, value: str, module: Any, name: str) -> str:
     return graph.add("Flatten", value, axis=1)
 
 
-def _simple(operator: str) -> Emit:
+def _emit_operator(operator: str) -> Emit:
     return lambda graph, value, module, name: graph.add(operator, value)
 
 
 # By the name of the class: every layer here is torch's or sb3-contrib's own, and neither needs to be imported.
 _LAYERS: dict[str, Emit] = {
-    "Linear": _linear,
-    "Conv2d": _conv,
-    "BatchRenorm1d": _batch_renorm,
-    "Flatten": _flatten,
-    "FlattenExtractor": _flatten,
-    "Tanh": _simple("Tanh"),
-    "ReLU": _simple("Relu"),
+    "Linear": _emit_linear,
+    "Conv2d": _emit_conv,
+    "BatchRenorm1d": _emit_batch_renorm,
+    "Flatten": _emit_flatten,
+    "FlattenExtractor": _emit_flatten,
+    "Tanh": _emit_operator("Tanh"),
+    "ReLU": _emit_operator("Relu"),
     "ELU": lambda graph, value, module, name: graph.add("Elu", value, alpha=float(module.alpha)),
     "LeakyReLU": lambda graph, value, module, name: graph.add("LeakyRelu", value, alpha=float(module.negative_slope)),
-    "SiLU": _silu,
-    "GELU": _gelu,
-    "Hardtanh": _hard_tanh,
+    "SiLU": _emit_silu,
+    "GELU": _emit_gelu,
+    "Hardtanh": _emit_hard_tanh,
 }
 
 
@@ -135,7 +135,7 @@ def emit_lstm(
     sequence = graph.add("Unsqueeze", value, time)
     after: list[list[str]] = [[], []]
     for layer in range(layers):
-        constants = _lstm_constants(graph, module, layer, name)
+        constants = _add_lstm_constants(graph, module, layer, name)
         outputs, hidden, cell = graph.add_with_outputs(
             "LSTM",
             [sequence, *constants, "", before[0][layer], before[1][layer]],
@@ -149,12 +149,12 @@ def emit_lstm(
     return graph.add("Squeeze", sequence, time), (joined[0], joined[1])
 
 
-def _lstm_constants(graph: Graph, module: torch.nn.LSTM, layer: int, name: str) -> list[str]:
+def _add_lstm_constants(graph: Graph, module: torch.nn.LSTM, layer: int, name: str) -> list[str]:
     """Input weights, recurrent weights and biases of a layer, with a leading dimension for ONNX's directions."""
     parameters = dict(module.named_parameters())
-    weights = [_gates(array(parameters[f"weight_{part}_l{layer}"])) for part in ("ih", "hh")]
+    weights = [_reorder_gates(array(parameters[f"weight_{part}_l{layer}"])) for part in ("ih", "hh")]
     if module.bias:
-        biases = [_gates(array(parameters[f"bias_{part}_l{layer}"])) for part in ("ih", "hh")]
+        biases = [_reorder_gates(array(parameters[f"bias_{part}_l{layer}"])) for part in ("ih", "hh")]
     else:
         biases = [np.zeros(4 * module.hidden_size, np.float32)] * 2
     return [
@@ -164,7 +164,7 @@ def _lstm_constants(graph: Graph, module: torch.nn.LSTM, layer: int, name: str) 
     ]
 
 
-def _gates(values: NDArray[Any]) -> NDArray[Any]:
+def _reorder_gates(values: NDArray[Any]) -> NDArray[Any]:
     """From torch's order of gates, input forget cell output, to ONNX's, input output forget cell."""
     i, f, c, o = np.split(values, 4)
     return np.concatenate([i, o, f, c])

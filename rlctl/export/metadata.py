@@ -24,7 +24,7 @@ def metadata(info: PolicyInfo) -> dict[str, str]:
         "observation_units": ",".join(env.observation_units.get(name, "") for name in env.observation_sizes),
         "frame_stack": str(info.spec.frame_stack),
         "action_meaning": env.action_meaning,
-        **_bounds(info),
+        **_format_bounds(info),
         "control_dt": "" if env.control_dt is None else f"{env.control_dt!r} s",
         "robot": env.robot,
         "state": "state_h and state_c: zeros when an episode begins" if info.algo == "recurrent_ppo" else "",
@@ -33,7 +33,7 @@ def metadata(info: PolicyInfo) -> dict[str, str]:
     return {METADATA_KEY: info.model_dump_json(), **{key: value for key, value in plain.items() if value.strip(",")}}
 
 
-def _bounds(info: PolicyInfo) -> dict[str, str]:
+def _format_bounds(info: PolicyInfo) -> dict[str, str]:
     space = info.env.spaces()[1]
     if not isinstance(space, spaces.Box):
         return {"action_space": str(space)}

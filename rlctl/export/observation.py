@@ -34,38 +34,38 @@ class Observations:
         """
         space, _ = self.info.env.spaces()
         if not isinstance(space, spaces.Dict):
-            value = self._input(SINGLE_INPUT, space, self._meaning())
-            return self._extracted(self._prepared(value, "", space, scale_images), extractor, "features_extractor")
+            value = self._add_input(SINGLE_INPUT, space, self._describe_input())
+            return self._extract(self._prepare(value, "", space, scale_images), extractor, "features_extractor")
         if type(extractor).__name__ != "CombinedExtractor":
             raise unsupported(f"features extractor {type(extractor).__name__}")
-        inputs = {key: self._input(key, each, f"observation {key!r}") for key, each in space.spaces.items()}
+        inputs = {key: self._add_input(key, each, f"observation {key!r}") for key, each in space.spaces.items()}
         parts = []
         for key, each in extractor.extractors.items():  # in the order the network was trained with
-            value = self._prepared(inputs[key], key, space[key], scale_images)
-            parts.append(self._extracted(value, each, f"features_extractor.{key}"))
-        return self._joined(parts)
+            value = self._prepare(inputs[key], key, space[key], scale_images)
+            parts.append(self._extract(value, each, f"features_extractor.{key}"))
+        return self._concatenate(parts)
 
-    def _joined(self, parts: list[str]) -> str:
+    def _concatenate(self, parts: list[str]) -> str:
         return self.graph.add("Concat", *parts, axis=1) if len(parts) > 1 else parts[0]
 
-    def _meaning(self) -> str:
+    def _describe_input(self) -> str:
         sizes, units = self.info.env.observation_sizes, self.info.env.observation_units
         parts = [
             f"{name} ({size}) [{units[name]}]" if name in units else f"{name} ({size})" for name, size in sizes.items()
         ]
         return ", ".join(parts) or "observation"
 
-    def _input(self, name: str, space: spaces.Space[Any], meaning: str) -> str:
+    def _add_input(self, name: str, space: spaces.Space[Any], meaning: str) -> str:
         if space.shape is None or space.dtype is None:
             raise unsupported(f"observation {name!r}, a {type(space).__name__} space,")
         return self.graph.input(name, space.dtype, (BATCH, *space.shape), meaning)
 
-    def _prepared(self, value: str, key: str, space: spaces.Space[Any], scale_images: bool) -> str:
+    def _prepare(self, value: str, key: str, space: spaces.Space[Any], scale_images: bool) -> str:
         """From the environment's observation to what SB3's networks get: normalised, float32, one-hot."""
         if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-            return self._one_hot(value, key, space)
+            return self._encode_one_hot(value, key, space)
         if key in self.info.normalized_keys:
-            value = self._normalized(value, key)
+            value = self._normalize(value, key)
         elif space.dtype != np.float32:
             value = self.graph.cast(value, np.float32)
         if space.shape != network_space(space).shape:  # an image with its channels last, which torch wants first
@@ -74,7 +74,7 @@ class Observations:
             value = self.graph.add("Div", value, self.graph.constant(f"image/{key}", np.float32(255.0)))
         return value
 
-    def _normalized(self, value: str, key: str) -> str:
+    def _normalize(self, value: str, key: str) -> str:
         # As VecNormalize, in float64: an element that hardly varies is multiplied by up to 10,000, and so would be
         # the rounding of float32.
         name, clip = f"normalize/{key}", float(self.info.clip_observation or np.inf)
@@ -87,7 +87,7 @@ class Observations:
         value = graph.add("Clip", value, low, graph.constant(f"{name}/high", np.float64(clip)))
         return graph.cast(value, np.float32)
 
-    def _one_hot(self, value: str, key: str, space: spaces.Discrete | spaces.MultiDiscrete) -> str:
+    def _encode_one_hot(self, value: str, key: str, space: spaces.Discrete | spaces.MultiDiscrete) -> str:
         graph, name = self.graph, f"one_hot/{key}"
         levels = graph.constant(f"{name}/levels", np.array([0.0, 1.0], np.float32))
         if isinstance(space, spaces.Discrete):
@@ -97,9 +97,9 @@ class Observations:
             column = graph.add("Gather", value, graph.constant(f"{name}/{index}", np.int64(index)), axis=1)
             depth = graph.constant(f"{name}/{index}/depth", np.int64(size))
             parts.append(graph.add("OneHot", column, depth, levels))
-        return self._joined(parts)
+        return self._concatenate(parts)
 
-    def _extracted(self, value: str, extractor: Any, name: str) -> str:
+    def _extract(self, value: str, extractor: Any, name: str) -> str:
         if type(extractor).__name__ == "NatureCNN":
             value = emit(self.graph, value, extractor.cnn, f"{name}.cnn")
             return emit(self.graph, value, extractor.linear, f"{name}.linear")

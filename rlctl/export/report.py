@@ -1,4 +1,4 @@
-"""What an export tells: the file, how it was verified, what goes in and comes out."""
+"""What an export reports: the file, how it was verified, what goes in and comes out."""
 
 from __future__ import annotations
 
@@ -67,20 +67,20 @@ def show(report: ExportReport, json: str | None) -> None:
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
-    for name, text in _lines(report):
+    for name, text in _list_rows(report):
         table.add_row(name, Text(text))
     output.out().print(table)
 
 
-def _lines(report: ExportReport) -> list[tuple[str, str]]:
+def _list_rows(report: ExportReport) -> list[tuple[str, str]]:
     latency = report.latency
     return [
         ("exported", f"{report.path} ({report.size / 1000:,.1f} kB, opset {report.opset})"),
         ("policy", f"{report.algo} for {report.task}, {report.training_steps:,} steps, from {report.policy}"),
         ("inputs", ", ".join(map(str, report.inputs))),
         ("outputs", ", ".join(map(str, report.outputs))),
-        ("verified", agreement_line(report.agreement)),
-        ("closed loop", closed_loop_line(report.closed_loop)),
+        ("verified", format_agreement(report.agreement)),
+        ("closed loop", format_closed_loop(report.closed_loop)),
         (
             "latency",
             f"{latency.onnx_us:.1f} us for one observation; SB3 {latency.sb3_us:.1f} us, {latency.speedup:.1f}x",
@@ -89,7 +89,7 @@ def _lines(report: ExportReport) -> list[tuple[str, str]]:
     ]
 
 
-def agreement_line(agreement: Agreement) -> str:
+def format_agreement(agreement: Agreement) -> str:
     """Return the comparison on observations, in a line."""
     sizes = " and ".join(str(size) for size in agreement.batch_sizes)
     text = (
@@ -103,7 +103,7 @@ def agreement_line(agreement: Agreement) -> str:
     return text
 
 
-def closed_loop_line(loop: ClosedLoop) -> str:
+def format_closed_loop(loop: ClosedLoop) -> str:
     """Return the comparison of whole episodes, in a line."""
     return (
         f"{loop.episodes} episodes: success same in {loop.same_success}, length in {loop.same_length}, "

@@ -22,13 +22,13 @@ MAX_RETURN_DIFFERENCE = 1e-3
 """Largest difference of an episode's return, relative."""
 MIN_OBSERVATIONS = 1000
 EPISODES = 20
-"""Episodes lived in closed loop by each of the two policies."""
+"""Episodes run in closed loop by each of the two policies."""
 N_ENVS = 10
 
 
 @dataclasses.dataclass(frozen=True)
 class ClosedLoop:
-    """The same episodes, lived once by each policy."""
+    """The same episodes, run once by each policy."""
 
     episodes: int
     same_success: int
@@ -54,29 +54,30 @@ class Verification:
 
     @property
     def passed(self) -> bool:
+        """Whether actions and episodes agree."""
         return self.agreement.agrees and self.closed_loop.agrees
 
 
 def verify(torch_policy: TorchPolicy, onnx_policy: OnnxPolicy, workers: Workers) -> Verification:
-    """Live the same episodes with both policies; on every observation of either, ask both.
+    """Run the same episodes with both policies; on every observation of either, ask both.
 
     Rollouts go on until `MIN_OBSERVATIONS` were seen. Raises `TaskError` if the environment fails.
     """
     comparison = Comparison(torch_policy)
 
-    def live(seeds: Sequence[int], *, torch_drives: bool) -> list[Episode]:
+    def run(seeds: Sequence[int], *, torch_drives: bool) -> list[Episode]:
         actor = _SideBySide(torch_policy, onnx_policy, workers.n_envs, comparison, torch_drives=torch_drives)
         return run_episodes(workers, actor, seeds)
 
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
-    expected = live(seeds, torch_drives=True)
-    done = live(seeds, torch_drives=False)
-    lived = EPISODES
+    expected = run(seeds, torch_drives=True)
+    done = run(seeds, torch_drives=False)
+    done_so_far = EPISODES
     while comparison.observations < MIN_OBSERVATIONS:
         missing = MIN_OBSERVATIONS / comparison.observations - 1.0
-        wanted = lived + max(1, round(1.1 * missing * lived))
-        live(episode_seeds(0, Stream.VERIFY, wanted)[lived:], torch_drives=True)
-        lived = wanted
+        wanted = done_so_far + max(1, round(1.1 * missing * done_so_far))
+        run(episode_seeds(0, Stream.VERIFY, wanted)[done_so_far:], torch_drives=True)
+        done_so_far = wanted
     return Verification(comparison.result(), compare_episodes(expected, done))
 
 

@@ -32,38 +32,47 @@ class RunDirectory:
 
     @property
     def recipe_file(self) -> Path:
+        """The resolved recipe."""
         return self.path / "recipe.yaml"
 
     @property
     def status_file(self) -> Path:
+        """Status, versions, command line, times."""
         return self.path / "run.json"
 
     @property
     def metrics_file(self) -> Path:
+        """A row per update."""
         return self.path / "metrics.csv"
 
     @property
     def evals_file(self) -> Path:
+        """A row per evaluation."""
         return self.path / "evals.csv"
 
     @property
     def best_policy(self) -> Path:
+        """The policy of the best evaluation."""
         return self.path / "policies" / "best.safetensors"
 
     @property
     def last_policy(self) -> Path:
+        """The policy at the end, or at the last checkpoint."""
         return self.path / "policies" / "last.safetensors"
 
     @property
     def episodes(self) -> Path:
+        """The folder of recorded episodes and recordings."""
         return self.path / "episodes"
 
     @property
     def tensorboard(self) -> Path:
+        """The folder of TensorBoard files."""
         return self.path / "tensorboard"
 
     @property
     def onnx_file(self) -> Path:
+        """Where an export goes by default."""
         return self.path / "exports" / "policy.onnx"
 
     def checkpoint(self, steps: int) -> Path:
@@ -248,14 +257,14 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
     """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing."""
     if text is None or text == "latest":
         # The link first: names go by a clock, which may have been set back since.
-        newest = _linked(root) or _newest(root)
+        newest = _read_latest(root) or _find_newest(root)
         if newest is None:
             raise ArtifactError(f"no run yet under {root.resolve()}; train one: rlctl train reach")
         return newest
     if (Path(text) / "run.json").is_file():
         return RunDirectory(Path(text))
     folder = root / registry.make_slug(text)
-    if (newest := _newest(folder, depth=1)) is not None:
+    if (newest := _find_newest(folder, depth=1)) is not None:
         return newest
     if Path(text).is_dir():
         raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
@@ -277,7 +286,7 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> tup
     return run.policy_file(which), run
 
 
-def _linked(root: Path) -> RunDirectory | None:
+def _read_latest(root: Path) -> RunDirectory | None:
     with contextlib.suppress(OSError, ValueError):  # no link, or one that leads elsewhere
         run = root / os.readlink(root / "latest")
         if (root / "latest").resolve().is_relative_to(root.resolve()) and (run / "run.json").is_file():
@@ -288,7 +297,7 @@ def _linked(root: Path) -> RunDirectory | None:
 _RUN_NAME = re.compile(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_s\d+(_\d+)?$")
 
 
-def _newest(root: Path, depth: int = 2) -> RunDirectory | None:
+def _find_newest(root: Path, depth: int = 2) -> RunDirectory | None:
     pattern = "*/run.json" if depth == 1 else "*/*/run.json"
     runs = [file.parent for file in root.glob(pattern) if _RUN_NAME.match(file.parent.name)]
     if not runs:

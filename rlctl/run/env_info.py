@@ -46,13 +46,12 @@ class EnvInfo(pydantic.BaseModel):
         for name in ("observation", "action"):
             ours, theirs = getattr(self, f"{name}_space"), getattr(other, f"{name}_space")
             if ours != theirs:
-                return (
-                    f"its {name} space is {_short(space_from_json(ours))}, {whose} is {_short(space_from_json(theirs))}"
-                )
+                own, foreign = _shorten(space_from_json(ours)), _shorten(space_from_json(theirs))
+                return f"its {name} space is {own}, {whose} is {foreign}"
         return None
 
 
-def _short(space: spaces.Space[Any]) -> str:
+def _shorten(space: spaces.Space[Any]) -> str:
     text = " ".join(str(space).split())
     return text if len(text) <= 120 else f"{type(space).__name__}{space.shape or ''}"
 
@@ -92,8 +91,8 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
     if isinstance(space, spaces.Box):
         return {
             "type": "Box",
-            "low": _bound(space.low),
-            "high": _bound(space.high),
+            "low": _encode_bounds(space.low),
+            "high": _encode_bounds(space.high),
             "shape": list(space.shape),
             "dtype": str(space.dtype),
         }
@@ -110,13 +109,13 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
     )
 
 
-def _bound(values: Any) -> Any:
+def _encode_bounds(values: Any) -> Any:
     # One number where all are equal: images have many thousand bounds. Text, because JSON has no infinity.
     flat = [repr(float(v)) for v in np.unique(values)]
     return flat[0] if len(flat) == 1 else [repr(float(v)) for v in values.ravel()]
 
 
-def _unbound(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+def _decode_bounds(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
     if isinstance(value, str):
         return np.full(shape, np.float64(value).astype(dtype))
     return np.array([float(v) for v in value]).reshape(shape).astype(dtype)
@@ -125,68 +124,68 @@ def _unbound(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
 def space_from_json(data: dict[str, Any]) -> spaces.Space[Any]:
     """Return the space that `space_to_json` wrote; raises `ArtifactError` if it is not one, before it takes memory."""
     try:
-        if (count := _elements(data)) > LARGEST_SPACE:
+        if (count := _count_elements(data)) > LARGEST_SPACE:
             raise ValueError(f"{count:,} elements, at most {LARGEST_SPACE:,} are supported")
-        return _built(data)
+        return _build(data)
     except (KeyError, TypeError, ValueError, AttributeError, AssertionError, OverflowError, RecursionError) as error:
         raise ArtifactError(f"not a space: {short_repr(str(error) or error)}") from None
 
 
-def _elements(data: dict[str, Any]) -> int:
+def _count_elements(data: dict[str, Any]) -> int:
     if data["type"] == "Dict":
-        return sum(_elements(each) for each in data["spaces"].values())
+        return sum(_count_elements(each) for each in data["spaces"].values())
     if data["type"] == "Box":
-        return math.prod(_shape(data["shape"]))
+        return math.prod(_check_shape(data["shape"]))
     if data["type"] == "MultiBinary":
-        return math.prod(_shape(data["n"]))
+        return math.prod(_check_shape(data["n"]))
     # Networks want them one-hot, as numbers of eight bytes, for a whole batch.
     alternatives = [data["n"]] if data["type"] == "Discrete" else data["nvec"]
-    return _ONE_HOT * sum(_whole(each) for each in alternatives)
+    return _ONE_HOT * sum(_check_whole(each) for each in alternatives)
 
 
-def _built(data: dict[str, Any]) -> spaces.Space[Any]:
+def _build(data: dict[str, Any]) -> spaces.Space[Any]:
     return _SPACES[data["type"]](data)
 
 
-def _box(data: dict[str, Any]) -> spaces.Space[Any]:
-    shape, dtype = _shape(data["shape"]), np.dtype(data["dtype"])
+def _build_box(data: dict[str, Any]) -> spaces.Space[Any]:
+    shape, dtype = _check_shape(data["shape"]), np.dtype(data["dtype"])
     if dtype.kind not in "biuf":
         raise ValueError(f"a Box of {dtype}")
-    low, high = _unbound(data["low"], shape, dtype), _unbound(data["high"], shape, dtype)
+    low, high = _decode_bounds(data["low"], shape, dtype), _decode_bounds(data["high"], shape, dtype)
     return spaces.Box(low, high, shape, dtype.type)
 
 
-def _discrete(data: dict[str, Any]) -> spaces.Space[Any]:
-    return spaces.Discrete(_whole(data["n"]), start=_whole(data["start"]))
+def _build_discrete(data: dict[str, Any]) -> spaces.Space[Any]:
+    return spaces.Discrete(_check_whole(data["n"]), start=_check_whole(data["start"]))
 
 
-def _multi_binary(data: dict[str, Any]) -> spaces.Space[Any]:
-    shape = _shape(data["n"])
+def _build_multi_binary(data: dict[str, Any]) -> spaces.Space[Any]:
+    shape = _check_shape(data["n"])
     return spaces.MultiBinary(list(shape) if isinstance(data["n"], list) else shape[0])
 
 
-def _dict(data: dict[str, Any]) -> spaces.Space[Any]:
+def _build_dict(data: dict[str, Any]) -> spaces.Space[Any]:
     # Pairs: a mapping would be sorted by key, and the order is part of the space.
-    return spaces.Dict([(key, _built(value)) for key, value in data["spaces"].items()])
+    return spaces.Dict([(key, _build(value)) for key, value in data["spaces"].items()])
 
 
 _SPACES: dict[str, Callable[[dict[str, Any]], spaces.Space[Any]]] = {
-    "Box": _box,
-    "Discrete": _discrete,
+    "Box": _build_box,
+    "Discrete": _build_discrete,
     "MultiDiscrete": lambda data: spaces.MultiDiscrete(data["nvec"]),
-    "MultiBinary": _multi_binary,
-    "Dict": _dict,
+    "MultiBinary": _build_multi_binary,
+    "Dict": _build_dict,
 }
 
 
-def _whole(value: Any) -> int:
+def _check_whole(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool):
         raise TypeError(f"expected a whole number, got {short_repr(value)}")
     return value
 
 
-def _shape(sizes: Any) -> tuple[int, ...]:
-    shape = tuple(_whole(size) for size in (sizes if isinstance(sizes, list) else [sizes]))
+def _check_shape(sizes: Any) -> tuple[int, ...]:
+    shape = tuple(_check_whole(size) for size in (sizes if isinstance(sizes, list) else [sizes]))
     if min(shape, default=0) < 0 or len(shape) > _DIMENSIONS:
         raise ValueError(f"shape {short_repr(list(shape))}")
     return shape

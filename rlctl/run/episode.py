@@ -86,12 +86,12 @@ def load_episode(path: Path) -> RecordedEpisode:
     parts = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
     observations: Observations = parts or arrays["observations"]
     episode = RecordedEpisode(info, arrays["actions"], observations, arrays["rewards"], arrays["terms"])
-    if (problem := _mismatch(episode)) is not None:
+    if (problem := _find_mismatch(episode)) is not None:
         raise ArtifactError(f"{path}: damaged: {problem}")
     return episode
 
 
-def _mismatch(episode: RecordedEpisode) -> str | None:
+def _find_mismatch(episode: RecordedEpisode) -> str | None:
     """Say which array is not what an episode of as many steps as it has rewards would have; None if all are."""
     observations, rewards = episode.observations, episode.rewards
     if rewards.ndim != 1 or rewards.dtype != np.float64:

@@ -228,7 +228,7 @@ def remove(path: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):  # the error that led here is the one to tell
+    with contextlib.suppress(OSError):  # the error that led here is the one to report
         os.unlink(path)
 
 

@@ -13,7 +13,7 @@ _CGROUPS = Path("/sys/fs/cgroup")
 
 def available() -> int | None:
     """Return how many bytes this process may still take: of the machine and of its control group; None if unknown."""
-    found = [value for value in (_of_machine(), *_of_control_groups()) if value is not None]
+    found = [value for value in (_read_machine(), *_read_control_groups()) if value is not None]
     return max(min(found), 0) if found else None
 
 
@@ -26,7 +26,7 @@ def format_bytes(size: float) -> str:
     return f"{size:.0f} bytes"
 
 
-def _of_machine() -> int | None:
+def _read_machine() -> int | None:
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
@@ -38,7 +38,7 @@ def _of_machine() -> int | None:
         return None
 
 
-def _of_control_groups() -> list[int]:
+def _read_control_groups() -> list[int]:
     """What the limits of containers and jobs leave; the limit of a group holds for all groups below it."""
     try:
         entries = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
@@ -47,12 +47,12 @@ def _of_control_groups() -> list[int]:
     own = next((entry[3:] for entry in entries if entry.startswith("0::")), "/")
     folder = _CGROUPS / own.strip("/")
     groups = [each for each in (folder, *folder.parents) if each.is_relative_to(_CGROUPS)]
-    found = [_left(group, "memory.max", "memory.current", "file") for group in groups]
-    found.append(_left(_CGROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "cache"))
+    found = [_read_group(group, "memory.max", "memory.current", "file") for group in groups]
+    found.append(_read_group(_CGROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "cache"))
     return [value for value in found if value is not None]
 
 
-def _left(group: Path, limit: str, used: str, given_back: str) -> int | None:
+def _read_group(group: Path, limit: str, used: str, given_back: str) -> int | None:
     try:
         ceiling = int((group / limit).read_text(encoding="ascii"))  # "max" where there is none
         taken = int((group / used).read_text(encoding="ascii"))

@@ -50,7 +50,7 @@ class OnnxPolicy(Policy):
             if math.prod(self._state_size) > LARGEST_SPACE:
                 raise ValueError(f"a state of {layers} layers of {hidden}")
         self._outputs = [ACTION, *STATE_OUTPUTS] if self._recurrent else [ACTION]
-        self._state = self._zeros(1)
+        self._state = self._make_state(1)
 
     @classmethod
     def load(cls, path: Path) -> OnnxPolicy:
@@ -67,16 +67,18 @@ class OnnxPolicy(Policy):
             policy = cls(info, session)
             policy.try_once()
         except (ArtifactError, ValueError, TypeError, LookupError, MemoryError) as error:
-            told = short_repr(str(error), 200)
-            raise ArtifactError(f"{path}: its graph does not fit its description: {told}; export it again") from None
+            problem = short_repr(str(error), 200)
+            raise ArtifactError(f"{path}: its graph does not fit its description: {problem}; export it again") from None
         return policy
 
     def initial_state(self) -> State | None:
-        return self._zeros(ROWS)
+        """Return zeros for `ROWS` episodes; None for a policy without a state."""
+        return self._make_state(ROWS)
 
     def forward(
         self, observations: Observations, state: State | None, deterministic: bool
     ) -> tuple[NDArray[Any], State | None]:
+        """Return the actions for `ROWS` observations and the next state; deterministic only."""
         parts = {key or SINGLE_INPUT: part for key, part in split(observations).items()}
         batch = {name: np.asarray(parts[name], dtype) for name, (_, dtype) in self._fields.items()}
         return self._run(batch, state, deterministic)
@@ -99,7 +101,7 @@ class OnnxPolicy(Policy):
 
     def reset(self) -> None:
         """Begin an episode: forget the recurrent state."""
-        self._state = self._zeros(1)
+        self._state = self._make_state(1)
 
     def _run(
         self, batch: dict[str, NDArray[Any]], state: State | None, deterministic: bool
@@ -114,7 +116,7 @@ class OnnxPolicy(Policy):
             raise ArtifactError(f"the exported policy cannot act: {short_repr(str(error), 200)}") from None
         return actions, tuple(after) or None
 
-    def _zeros(self, rows: int) -> State | None:
+    def _make_state(self, rows: int) -> State | None:
         if not self._recurrent:
             return None
         layers, hidden = self._state_size
@@ -130,7 +132,7 @@ def _open_session(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, s
         raise ArtifactError(f"{path}: damaged, or not an ONNX file of rlctl: {error}") from None
     try:
         _limit_memory()
-        session = onnxruntime.InferenceSession(content, _options(), providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(content, _make_options(), providers=["CPUExecutionProvider"])
         return session, session.get_modelmeta().custom_metadata_map
     except Exception as error:  # onnxruntime's own errors have no public base class
         raise ArtifactError(
@@ -156,7 +158,7 @@ def _limit_memory() -> None:
     onnxruntime.create_and_register_allocator(place, onnxruntime.OrtArenaCfg({"max_mem": limit, **settings}))
 
 
-def _options() -> onnxruntime.SessionOptions:
+def _make_options() -> onnxruntime.SessionOptions:
     options = onnxruntime.SessionOptions()
     # These networks are too small to share among threads, and the result must not depend on the machine's cores.
     options.intra_op_num_threads = 1

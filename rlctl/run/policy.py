@@ -93,11 +93,11 @@ class PolicyInfo(pydantic.BaseModel):
 
 def collect_versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
-    return dict(_versions())
+    return dict(_read_versions())
 
 
 @functools.cache  # each is read from a file, and every checkpoint wants them
-def _versions() -> dict[str, str]:
+def _read_versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "rlctl": rlctl.__version__}
     for name in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet"):
         try:

@@ -195,10 +195,10 @@ def read(path: Path) -> dict[str, Any]:
         text = untrusted.read_bytes(path, _LONGEST).decode()
     except UnicodeDecodeError as error:
         raise RecipeError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start:,}; save it as UTF-8") from None
-    return _mapping(yaml_text.load(text, str(path)), path)
+    return _check_mapping(yaml_text.load(text, str(path)), path)
 
 
-def _mapping(content: Any, path: Path) -> dict[str, Any]:
+def _check_mapping(content: Any, path: Path) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, dict):

@@ -23,14 +23,14 @@ def find_depth(root: Schema, path: Sequence[str | int]) -> int:
 def _descend(root: Schema, path: Sequence[str | int]) -> tuple[Schema, int]:
     node = root
     for depth, part in enumerate(path):
-        inner = next((each for each in (_inside(one, part) for one in _alternatives(root, node)) if each), None)
+        inner = next((each for each in (_find_part(one, part) for one in _list_alternatives(root, node)) if each), None)
         if inner is None:
             return node, depth
         node = inner
     return node, len(path)
 
 
-def _inside(node: Schema, part: str | int) -> Schema | None:
+def _find_part(node: Schema, part: str | int) -> Schema | None:
     if isinstance(part, int):
         return node.get("items")
     own: Schema | None = node.get("properties", {}).get(part)
@@ -40,20 +40,20 @@ def _inside(node: Schema, part: str | int) -> Schema | None:
 
 def list_keys(root: Schema, node: Schema) -> list[str]:
     """Return the keys that a mapping may have; none if `node` describes no mapping, or one of any keys."""
-    return next((list(each["properties"]) for each in _alternatives(root, node) if "properties" in each), [])
+    return next((list(each["properties"]) for each in _list_alternatives(root, node) if "properties" in each), [])
 
 
 def describe_value(root: Schema, node: Schema) -> str:
     """Return what a value must be: `a number in (0, 1]`, `a whole number in [1, 1e9] or -1`."""
-    return " or ".join(dict.fromkeys(_describe(root, each) for each in _alternatives(root, node)))
+    return " or ".join(dict.fromkeys(_describe(root, each) for each in _list_alternatives(root, node)))
 
 
-def _alternatives(root: Schema, node: Schema) -> Iterator[Schema]:
+def _list_alternatives(root: Schema, node: Schema) -> Iterator[Schema]:
     if "$ref" in node:
-        yield from _alternatives(root, root["$defs"][node["$ref"].rpartition("/")[2]])
+        yield from _list_alternatives(root, root["$defs"][node["$ref"].rpartition("/")[2]])
     elif "anyOf" in node:
         for each in node["anyOf"]:
-            yield from _alternatives(root, each)
+            yield from _list_alternatives(root, each)
     else:
         yield node
 
@@ -69,7 +69,7 @@ def _describe(root: Schema, node: Schema) -> str:
         return f"[{', '.join(describe_value(root, each) for each in node['prefixItems'])}]"
     kind = node.get("type")
     if kind in ("integer", "number"):
-        return f"{'a whole number' if kind == 'integer' else 'a number'}{_range(node)}"
+        return f"{'a whole number' if kind == 'integer' else 'a number'}{_describe_range(node)}"
     if kind == "array":
         return f"a list, each element {describe_value(root, node['items'])}"
     if kind == "object":
@@ -78,11 +78,11 @@ def _describe(root: Schema, node: Schema) -> str:
     return {"boolean": "true or false", "null": "null", "string": "text"}.get(str(kind), "any value")
 
 
-def _range(node: Schema) -> str:
+def _describe_range(node: Schema) -> str:
     low, above = node.get("minimum", node.get("ge")), node.get("exclusiveMinimum", node.get("gt"))
     high, below = node.get("maximum", node.get("le")), node.get("exclusiveMaximum", node.get("lt"))
-    left = f"[{_number(low)}" if low is not None else f"({_number(above)}" if above is not None else ""
-    right = f"{_number(high)}]" if high is not None else f"{_number(below)})" if below is not None else ""
+    left = f"[{_format_number(low)}" if low is not None else f"({_format_number(above)}" if above is not None else ""
+    right = f"{_format_number(high)}]" if high is not None else f"{_format_number(below)})" if below is not None else ""
     if left and right:
         return f" in {left}, {right}"
     if left:
@@ -90,6 +90,6 @@ def _range(node: Schema) -> str:
     return ""
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     short = f"{value:.0e}".replace("e+0", "e").replace("e+", "e")
     return short if value >= 1e6 and float(short) == value else str(value)

@@ -28,7 +28,7 @@ class Promotion(pydantic.BaseModel):
     """Environment steps that a stage lasts at least, all environments together."""
 
     @pydantic.model_validator(mode="after")
-    def _one_measure(self) -> Promotion:
+    def _check_measure(self) -> Promotion:
         if (self.success is None) == (self.mean_return is None):
             raise ValueError("give success or return, one of the two: promote: {success: 0.8, window: 100}")
         return self
@@ -81,5 +81,5 @@ def check_promotions(stages: Sequence[Stage]) -> None:
 
 
 def format_title(number: int, stages: Sequence[Stage]) -> str:
-    """Return what people are told: `stage 2 of 3: tolerance 0.1`."""
+    """Return a stage for people: `stage 2 of 3: tolerance 0.1`."""
     return f"stage {number} of {len(stages)}: {stages[number - 1]}"

@@ -19,7 +19,7 @@ class Table:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.size = _size(path)
+        self.size = _read_size(path)
         self._waiting: list[dict[str, Any]] = []
 
     def cut_back(self, size: int) -> bool:
@@ -41,20 +41,20 @@ class Table:
         """Write the rows that wait; with `sync` down to the disk itself. All of them, or `OSError` and none."""
         if self._waiting:
             # Whoever edits or removes the file while a training runs loses rows, but no more than that.
-            size = self._whole_rows()
-            columns = self._columns() if size else None
+            size = self._count_whole_rows()
+            columns = self._read_columns() if size else None
             if size and columns is None:
                 files.set_aside(self.path)
                 size = 0
-            content = self._text(columns).encode()
+            content = self._format_rows(columns).encode()
             files.append(self.path, content, size)
             self.size, self._waiting = size + len(content), []
         if sync and self.size:
             files.sync(self.path)
 
-    def _whole_rows(self) -> int:
+    def _count_whole_rows(self) -> int:
         """Return how many bytes of the file are rows of ours: fewer than `size` if somebody has cut or edited it."""
-        size = min(self.size, _size(self.path))
+        size = min(self.size, _read_size(self.path))
         if not size:
             return 0
         with self.path.open("rb") as file:
@@ -64,7 +64,7 @@ class Table:
             file.seek(0)
             return file.read(size).rfind(b"\n") + 1
 
-    def _columns(self) -> list[str] | None:
+    def _read_columns(self) -> list[str] | None:
         """Return the file's header; None if it is not the one of these rows any more."""
         with self.path.open(newline="", encoding="utf-8", errors="replace") as file:
             try:
@@ -73,7 +73,7 @@ class Table:
                 return None
         return columns if next(iter(self._waiting[0])) in columns else None
 
-    def _text(self, columns: list[str] | None) -> str:
+    def _format_rows(self, columns: list[str] | None) -> str:
         text = io.StringIO()
         names = columns or list(self._waiting[0])
         writer = csv.DictWriter(text, names, restval="", extrasaction="ignore", lineterminator="\n")
@@ -83,7 +83,7 @@ class Table:
         return text.getvalue()
 
 
-def _size(path: Path) -> int:
+def _read_size(path: Path) -> int:
     """Return a file's size in bytes; 0 if it is not there."""
     try:
         return path.stat().st_size

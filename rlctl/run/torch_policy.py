@@ -100,7 +100,7 @@ def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
 def describe_network(policy: BasePolicy) -> dict[str, Any]:
     """Return the constructor's arguments of a network as plain data, for `build_network`."""
     described = {}
-    for name, value in {**policy._get_constructor_parameters(), **_not_told(policy)}.items():
+    for name, value in {**policy._get_constructor_parameters(), **_list_left_out(policy)}.items():
         if name in _NOT_KEPT or value is None:
             continue
         if name == "activation_fn":
@@ -109,7 +109,7 @@ def describe_network(policy: BasePolicy) -> dict[str, Any]:
     return described
 
 
-def _not_told(policy: BasePolicy) -> dict[str, Any]:
+def _list_left_out(policy: BasePolicy) -> dict[str, Any]:
     """Arguments that change a network and that its own `_get_constructor_parameters` leaves out."""
     left_out: dict[str, Any] = {}
     if hasattr(policy, "share_features_extractor"):
@@ -218,7 +218,7 @@ class TorchPolicy(Policy):
         """Read a policy file; raises `ArtifactError` if it is not one or does not fit together."""
         info, tensors = read_policy(path)
         try:
-            return cls._fitted(info, tensors)
+            return cls._build(info, tensors)
         except ArtifactError as error:
             raise ArtifactError(f"{path}: {error}") from None
         except Exception as error:  # whatever torch and SB3 raise for a description that nobody has checked
@@ -227,7 +227,7 @@ class TorchPolicy(Policy):
             ) from None
 
     @classmethod
-    def _fitted(cls, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> TorchPolicy:
+    def _build(cls, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> TorchPolicy:
         """Build the network that a description asks for, and try it; never one larger than its tensors."""
         with _NoLargerThan(sum(value.size for value in tensors.values())):
             network = build_network(info)
@@ -248,6 +248,7 @@ class TorchPolicy(Policy):
         return policy
 
     def initial_state(self) -> State | None:
+        """Return zeros for `ROWS` episodes; None for a policy without a state."""
         if self.info.algo != "recurrent_ppo":
             return None
         lstm: Any = self.network.lstm_actor
@@ -257,6 +258,7 @@ class TorchPolicy(Policy):
     def forward(
         self, observations: Observations, state: State | None, deterministic: bool
     ) -> tuple[NDArray[Any], State | None]:
+        """Normalise `ROWS` observations and return the actions for them and the next state."""
         if not deterministic and self._uses_sde:
             self.network.reset_noise(ROWS)  # type: ignore[operator]
         actions, after = self.network.predict(

@@ -76,8 +76,8 @@ def check_safetensors(path: Path) -> None:
             raise ArtifactError(f"{path}: too large: {problem}")
         header = int.from_bytes(file.read(8), "little")  # the format: a length, and as much JSON
     if header > JSON_LIMIT:
-        told = f"{memory.format_bytes(header)}, at most {memory.format_bytes(JSON_LIMIT)} are read"
-        raise ArtifactError(f"{path}: damaged, or not a .safetensors file: header too large: {told}")
+        sizes = f"{memory.format_bytes(header)}, at most {memory.format_bytes(JSON_LIMIT)} are read"
+        raise ArtifactError(f"{path}: damaged, or not a .safetensors file: header too large: {sizes}")
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -93,13 +93,13 @@ def parse_json(text: str | bytes) -> Any:
 def _check_depth(content: Any) -> None:
     level = [content]
     for _ in range(_DEPTH):
-        level = [each for value in level if isinstance(value, dict | list) for each in _within(value)]
+        level = [each for value in level if isinstance(value, dict | list) for each in _list_values(value)]
         if not level:
             return
     raise ValueError("nested too deeply")
 
 
-def _within(value: dict[str, Any] | list[Any]) -> Any:
+def _list_values(value: dict[str, Any] | list[Any]) -> Any:
     return value.values() if isinstance(value, dict) else value
 
 
@@ -140,7 +140,7 @@ def _check_archive(members: list[zipfile.ZipInfo]) -> None:
         if name.startswith("/") or ".." in name.split("/"):
             raise ValueError(f"{name!r} leads out of it")
         if not name.endswith(".npy") or each.is_dir():
-            raise ValueError(f"{name!r} is no array")
+            raise ValueError(f"{name!r} is not an array")
         if each.compress_type not in _PACKED:
             raise ValueError(f"{name!r} is not packed as numpy does it")
 

@@ -31,9 +31,9 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
         if getattr(event, "anchor", None) is not None:  # of an alias too
-            raise _problem("anchors and aliases (&name, *name) are not supported: write the values out", event)
+            raise _make_error("anchors and aliases (&name, *name) are not supported: write the values out", event)
         if self.depth >= _DEEPEST:
-            raise _problem(f"nested more than {_DEEPEST} deep", event)
+            raise _make_error(f"nested more than {_DEEPEST} deep", event)
         self.depth += 1
         node = super().compose_node(parent, index)
         self.depth -= 1
@@ -41,12 +41,12 @@ class _Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         if not isinstance(node, yaml.MappingNode):  # text or a list with an explicit tag
-            raise _problem("expected a mapping here", node)
+            raise _make_error("expected a mapping here", node)
         seen: set[Any] = set()
         for key_node, _ in node.value:
-            key = _text_of_key(key_node)
+            key = _check_key(key_node)
             if key in seen:
-                raise _problem(f"key {key!r} is there twice", key_node)
+                raise _make_error(f"key {key!r} is there twice", key_node)
             seen.add(key)
         return super().construct_mapping(node, deep)
 
@@ -55,9 +55,9 @@ class _Loader(yaml.SafeLoader):
         try:
             number = int(text, 0) if text.lstrip("+-").startswith(("0x", "0o")) else int(text)
         except ValueError:  # text with an explicit tag, or thousands of digits
-            raise _problem(f"{short_repr(text)} is not a whole number that can be read", node) from None
+            raise _make_error(f"{short_repr(text)} is not a whole number that can be read", node) from None
         if abs(number) >= 2**63:
-            raise _problem(f"{short_repr(text)} is too large a number", node)
+            raise _make_error(f"{short_repr(text)} is too large a number", node)
         return number
 
     def construct_float(self, node: yaml.ScalarNode) -> float:
@@ -65,31 +65,31 @@ class _Loader(yaml.SafeLoader):
         try:
             return float(text.replace(".inf", "inf").replace(".nan", "nan"))
         except ValueError:
-            raise _problem(f"{short_repr(text)!r} is not a number", node) from None
+            raise _make_error(f"{short_repr(text)!r} is not a number", node) from None
 
     def construct_bool(self, node: yaml.ScalarNode) -> bool:
         text = self.construct_scalar(node).lower()
         if text not in ("true", "false"):
-            raise _problem(f"{short_repr(text)!r} is not true or false", node)
+            raise _make_error(f"{short_repr(text)!r} is not true or false", node)
         return text == "true"
 
     def construct_text(self, node: yaml.ScalarNode) -> str:
         text: str = self.construct_scalar(node)
         if any("\ud800" <= character <= "\udfff" for character in text):
-            raise _problem(f"{short_repr(ascii(text))} has an unpaired surrogate, which no file can hold", node)
+            raise _make_error(f"{short_repr(ascii(text))} has an unpaired surrogate, which no file can hold", node)
         return text
 
 
-def _problem(message: str, node: Any) -> yaml.YAMLError:
+def _make_error(message: str, node: Any) -> yaml.YAMLError:
     return yaml.constructor.ConstructorError(problem=message, problem_mark=node.start_mark)
 
 
-def _text_of_key(node: yaml.Node) -> str:
+def _check_key(node: yaml.Node) -> str:
     if node.tag != f"{_PREFIX}str" or not isinstance(node.value, str):
         given = short_repr(node.value) if isinstance(node.value, str) else "a list or a mapping"
-        raise _problem(f"{given} cannot be a key: keys are text, numbers in quotes", node)
+        raise _make_error(f"{given} cannot be a key: keys are text, numbers in quotes", node)
     if node.value == "<<":
-        raise _problem("merge keys (<<) are not supported: write the values out", node)
+        raise _make_error("merge keys (<<) are not supported: write the values out", node)
     return node.value
 
 

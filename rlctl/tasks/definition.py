@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from rlctl.tasks.plain_data import plain
+from rlctl.tasks.plain_data import to_plain
 
 if TYPE_CHECKING:
     from rlctl.task.env import TaskEnv
@@ -60,7 +60,7 @@ class Definition:
     """Links of its URDFs whose mass or inertia is missing or impossible."""
 
 
-def definition_of(env: TaskEnv) -> Definition:
+def describe_definition(env: TaskEnv) -> Definition:
     """Read a task's definition off the environment that was built for it."""
     from rlctl.task.inertia import find_inertia_faults
 
@@ -76,27 +76,27 @@ def definition_of(env: TaskEnv) -> Definition:
         rewards=[
             RewardTerm(name, weight, float(task.reward_weights[name])) for name, weight in env.reward_weights.items()
         ],
-        events=[_event(name, event, env.events.get(name)) for name, event in task.events.items()],
+        events=[_describe_event(name, event, env.events.get(name)) for name, event in task.events.items()],
         model_faults=[fault for body in env.sim.bodies.values() for fault in find_inertia_faults(body)],
     )
 
 
-def _event(name: str, offered: Any, acting: Any) -> OfferedEvent:
+def _describe_event(name: str, offered: Any, acting: Any) -> OfferedEvent:
     event = getattr(acting, "event", acting) or offered  # with the parameters of the recipe, where it acts
     settings = {
         key: value
         for key, value in vars(event).items()
-        if not key.startswith("_") and key not in _ALWAYS and _means_something(key, value, event.when)
+        if not key.startswith("_") and key not in _ALWAYS and _is_set(key, value, event.when)
     }
     return OfferedEvent(
         name=name,
         when=str(event.when),
-        function=str(plain(event.function)),
-        parameters=plain({**event.parameters, **settings}),
+        function=str(to_plain(event.function)),
+        parameters=to_plain({**event.parameters, **settings}),
         enabled=bool(offered.enabled),
         acts=acting is not None,
     )
 
 
-def _means_something(key: str, value: Any, when: str) -> bool:
+def _is_set(key: str, value: Any, when: str) -> bool:
     return _WHERE_IT_MEANS_SOMETHING.get(key, when) == when and value not in (None, (), [], "")

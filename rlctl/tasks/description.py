@@ -14,7 +14,7 @@ from rlctl.check_env.leaves import Leaf, leaves_of
 from rlctl.errors import TaskError
 from rlctl.run import recipe as recipes
 from rlctl.tasks import parameters
-from rlctl.tasks.definition import Definition, definition_of
+from rlctl.tasks.definition import Definition, describe_definition
 from rlctl.tasks.parameters import Parameter
 from rlctl.tasks.plain_data import highest, lowest
 
@@ -78,7 +78,7 @@ def describe(task: str) -> Description:
     env = spec.make()
     # Guarded: attributes of an environment are a plugin's code too.
     try:
-        description: Description = registry.call_plugin(task, lambda: _described(task, constructor, recipe, env))
+        description: Description = registry.call_plugin(task, lambda: _describe(task, constructor, recipe, env))
     except TaskError:
         with contextlib.suppress(TaskError):
             registry.call_plugin(task, lambda: env.close())
@@ -87,42 +87,42 @@ def describe(task: str) -> Description:
     return description
 
 
-def _described(task: str, constructor: Any, recipe: recipes.Recipe, env: gymnasium.Env[Any, Any]) -> Description:
+def _describe(task: str, constructor: Any, recipe: recipes.Recipe, env: gymnasium.Env[Any, Any]) -> Description:
     from rlctl.task.env import TaskEnv
 
     built = env.unwrapped
     cls = type(built.task if isinstance(built, TaskEnv) else built)
     target = f"{cls.__module__}:{cls.__qualname__}"
-    distribution, version = _origin(task, target)
+    distribution, version = _find_origin(task, target)
     recipe_file = registry.find_recipe_file(task)
     max_steps: int | None
     if isinstance(built, TaskEnv):
-        observations, accepted, max_steps = _observations(built), parameters.of_task(cls), built.max_steps
+        observations, accepted, max_steps = _list_observations(built), parameters.list_of_task(cls), built.max_steps
     else:
-        observations = _quantities(env.observation_space)
+        observations = _list_quantities(env.observation_space)
         # Gymnasium's constructor of an id takes anything; the class behind it does not.
-        accepted = parameters.of_call(cls if hasattr(constructor, "gymnasium_id") else constructor)
+        accepted = parameters.list_of_call(cls if hasattr(constructor, "gymnasium_id") else constructor)
         max_steps = env.spec.max_episode_steps if env.spec else None
     return Description(
         task=task,
         target=target,
-        summary=_summary(cls),
+        summary=_find_summary(cls),
         distribution=distribution,
         version=version,
-        file=_file(cls),
-        observation_space=_one_line(env.observation_space),
+        file=_find_file(cls),
+        observation_space=_format_space(env.observation_space),
         observations=observations,
-        action_space=_one_line(env.action_space),
-        actions=_quantities(env.action_space),
+        action_space=_format_space(env.action_space),
+        actions=_list_quantities(env.action_space),
         parameters=accepted,
         max_steps=max_steps,
-        definition=definition_of(built) if isinstance(built, TaskEnv) else None,
+        definition=describe_definition(built) if isinstance(built, TaskEnv) else None,
         recipe=recipe,
         recipe_file=str(recipe_file) if recipe_file else None,
     )
 
 
-def _origin(task: str, target: str) -> tuple[str | None, str | None]:
+def _find_origin(task: str, target: str) -> tuple[str | None, str | None]:
     entry = registry.find(task) or next((each for each in registry.list_installed() if each.target == target), None)
     if entry is not None:
         return entry.distribution, entry.version
@@ -132,7 +132,7 @@ def _origin(task: str, target: str) -> tuple[str | None, str | None]:
     return (names[0], importlib.metadata.version(names[0])) if names else (None, None)
 
 
-def _summary(cls: type) -> str:
+def _find_summary(cls: type) -> str:
     # Of the class itself, not inherited; a dataclass without a docstring gets its signature for one.
     text = (cls.__dict__.get("__doc__") or "").strip()
     if text.startswith(f"{cls.__name__}("):
@@ -140,36 +140,36 @@ def _summary(cls: type) -> str:
     return next((line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
 
 
-def _file(cls: type) -> str | None:
+def _find_file(cls: type) -> str | None:
     try:
         return str(Path(inspect.getfile(cls)).resolve())
     except (TypeError, OSError):  # built in, or made in a session
         return None
 
 
-def _one_line(space: Any) -> str:
+def _format_space(space: Any) -> str:
     return " ".join(str(space).split())
 
 
-def _observations(env: TaskEnv) -> list[Quantity]:
+def _list_observations(env: TaskEnv) -> list[Quantity]:
     """Return the parts of a task's observation by the names that the task gives them."""
     units = env.task.observation_units
-    parts = _quantities(env.observation_space)
+    parts = _list_quantities(env.observation_space)
     if env.task.observation_layout == "flat":
         (whole,) = leaves_of(env.observation_space)
         parts, start = [], 0
         for name, size in env.observation_sizes.items():
             end = start + size
-            parts.append(_quantity(name, whole, [size], slice(start, end)))
+            parts.append(_describe_part(name, whole, [size], slice(start, end)))
             start = end
     return [dataclasses.replace(part, unit=units.get(part.name)) for part in parts]
 
 
-def _quantities(space: Any) -> list[Quantity]:
-    return [_quantity(".".join(map(str, leaf.path)), leaf, list(leaf.shape)) for leaf in leaves_of(space)]
+def _list_quantities(space: Any) -> list[Quantity]:
+    return [_describe_part(".".join(map(str, leaf.path)), leaf, list(leaf.shape)) for leaf in leaves_of(space)]
 
 
-def _quantity(name: str, leaf: Leaf, shape: list[int], part: Any = ...) -> Quantity:
+def _describe_part(name: str, leaf: Leaf, shape: list[int], part: Any = ...) -> Quantity:
     low = lowest(leaf.low[part]) if leaf.low is not None else None
     high = highest(leaf.high[part]) if leaf.high is not None else None
     return Quantity(name, leaf.kind, shape, leaf.dtype, low, high)

@@ -25,7 +25,7 @@ def list_tasks(*, check: bool = False) -> list[ListedTask]:
         problem = entry.problem
         algo = None
         try:
-            algo = _algorithm(entry)
+            algo = _read_algorithm(entry)
         except RecipeError as error:
             problem = problem or str(error)
         except (OSError, UnicodeDecodeError) as error:
@@ -36,7 +36,7 @@ def list_tasks(*, check: bool = False) -> list[ListedTask]:
     return listed
 
 
-def _algorithm(entry: registry.TaskEntry) -> str | None:
+def _read_algorithm(entry: registry.TaskEntry) -> str | None:
     """Read the algorithm off the packaged recipe; the full check of a recipe would cost its imports."""
     file = entry.recipe_file
     if file is None:
@@ -53,7 +53,7 @@ def show(listed: list[ListedTask], json: str | None) -> None:
     from rlctl import output
 
     if json is not None:
-        output.write_result_json(json, {"tasks": [_as_json(each) for each in listed]})
+        output.write_result_json(json, {"tasks": [_to_json(each) for each in listed]})
         return
     out = output.out()
     if not listed:
@@ -75,7 +75,7 @@ def show(listed: list[ListedTask], json: str | None) -> None:
     out.print(table)
 
 
-def _as_json(each: ListedTask) -> dict[str, Any]:
+def _to_json(each: ListedTask) -> dict[str, Any]:
     entry = each.entry
     return {
         "name": entry.name,

@@ -49,8 +49,8 @@ def create(name: str) -> NewPlugin:
     folder = Path(name)
     if os.path.lexists(folder):
         raise UsageError(f"{folder} exists already; choose another name, or go to another folder")
-    sources = _sources()
-    cls = _class_name(name, "".join(sources.values()))
+    sources = _read_sources()
+    cls = _make_class_name(name, "".join(sources.values()))
     content = {
         Path(*(package if part == "package" else part for part in path.parts)): string.Template(text).substitute(
             name=name, package=package, cls=cls
@@ -119,14 +119,14 @@ def _is_installed(distribution: str) -> bool:
     return True
 
 
-def _sources() -> dict[Path, str]:
+def _read_sources() -> dict[Path, str]:
     files = sorted(TEMPLATE.rglob(f"*{_SUFFIX}"))
     if not files:
         raise ArtifactError(f"{TEMPLATE}: the template is missing; install rlctl again")
     return {file.relative_to(TEMPLATE).with_suffix(""): file.read_text(encoding="utf-8") for file in files}
 
 
-def _class_name(name: str, used: str) -> str:
+def _make_class_name(name: str, used: str) -> str:
     """`my-arm` -> `MyArm`; with `Task` behind it where the template itself uses the word, or Python does."""
     cls = "".join(part[:1].upper() + part[1:] for part in re.split("[-_]+", name))
     return f"{cls}Task" if keyword.iskeyword(cls) or re.search(rf"\b{cls}\b", used) else cls

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from rlctl.tasks.plain_data import plain
+from rlctl.tasks.plain_data import to_plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,19 +22,19 @@ class Parameter:
     required: bool
 
 
-def of_task(cls: Any) -> list[Parameter]:
+def list_of_task(cls: Any) -> list[Parameter]:
     """Return the parameters of a `Task` class: its dataclass fields."""
-    return [_of_field(field) for field in cls.parameters().values()]
+    return [_describe_field(field) for field in cls.parameters().values()]
 
 
-def _of_field(field: dataclasses.Field[Any]) -> Parameter:
+def _describe_field(field: dataclasses.Field[Any]) -> Parameter:
     made = field.default_factory
     default = made() if made is not dataclasses.MISSING else field.default
     required = default is dataclasses.MISSING
-    return Parameter(field.name, _annotation(field.type), None if required else plain(default), required)
+    return Parameter(field.name, _format_annotation(field.type), None if required else to_plain(default), required)
 
 
-def of_call(constructor: Callable[..., Any]) -> list[Parameter]:
+def list_of_call(constructor: Callable[..., Any]) -> list[Parameter]:
     """Return the parameters of anything that is called to make an environment, where Python can tell.
 
     Without `render_mode`, which is not the user's to set.
@@ -47,13 +47,13 @@ def of_call(constructor: Callable[..., Any]) -> list[Parameter]:
     return [
         Parameter(
             p.name,
-            "" if p.annotation is p.empty else _annotation(p.annotation),
-            None if p.default is p.empty else plain(p.default),
+            "" if p.annotation is p.empty else _format_annotation(p.annotation),
+            None if p.default is p.empty else to_plain(p.default),
             p.default is p.empty,
         )
         for p in named
     ]
 
 
-def _annotation(annotation: Any) -> str:
+def _format_annotation(annotation: Any) -> str:
     return annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)

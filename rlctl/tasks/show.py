@@ -10,7 +10,7 @@ from rlctl import output
 from rlctl.run.stages import Stage
 from rlctl.tasks.definition import Definition, OfferedEvent
 from rlctl.tasks.description import Description, Quantity
-from rlctl.tasks.plain_data import plain
+from rlctl.tasks.plain_data import to_plain
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -29,42 +29,46 @@ def show(description: Description, json: str | None) -> None:
 
     out = output.out()
     out.print(Text.assemble((description.task, "bold"), f"  {description.summary}".rstrip()))
-    _rows(out, _facts(description), indent=0)
+    _print_rows(out, _list_facts(description), indent=0)
     definition = description.definition
-    _section(out, f"observation  {_short(description.observation_space)}", _quantities(description.observations))
-    _section(out, f"action  {_short(description.action_space)}", _actions(description))
-    _section(out, "parameters  --set task.NAME=VALUE", _parameters(description), none="none")
+    _print_section(
+        out, f"observation  {_shorten(description.observation_space)}", _list_quantities(description.observations)
+    )
+    _print_section(out, f"action  {_shorten(description.action_space)}", _list_actions(description))
+    _print_section(out, "parameters  --set task.NAME=VALUE", _list_parameters(description), none="none")
     if definition is not None:
-        _section(out, "reward terms", _rewards(definition))
-        _section(out, "events", [_event(each) for each in definition.events], none="none")
+        _print_section(out, "reward terms", _list_rewards(definition))
+        _print_section(out, "events", [_format_event(each) for each in definition.events], none="none")
         if definition.model_faults:
-            _section(out, "model files", [(fault,) for fault in definition.model_faults])
+            _print_section(out, "model files", [(fault,) for fault in definition.model_faults])
     if description.recipe.stages:
-        _section(out, "stages", [_stage(number, each) for number, each in enumerate(description.recipe.stages, 1)])
-    _section(out, f"recipe  {description.recipe_file or 'none packaged; the defaults'}", ())
+        _print_section(
+            out, "stages", [_format_stage(number, each) for number, each in enumerate(description.recipe.stages, 1)]
+        )
+    _print_section(out, f"recipe  {description.recipe_file or 'none packaged; the defaults'}", ())
     for line in description.recipe.to_yaml().splitlines():
         out.print(Text(f"  {line}"))
 
 
 def as_json(description: Description) -> dict[str, Any]:
     """Return a description as plain data."""
-    content: dict[str, Any] = plain(
+    content: dict[str, Any] = to_plain(
         {**dataclasses.asdict(description), "recipe": description.recipe.model_dump(by_alias=True)}
     )
     return content
 
 
-def _section(out: Console, title: str, rows: Iterable[Row], none: str = "") -> None:
+def _print_section(out: Console, title: str, rows: Iterable[Row], none: str = "") -> None:
     from rich.text import Text
 
     name, _, rest = title.partition("  ")
     found = list(rows)
     out.print()
     out.print(Text.assemble((name, "bold"), f"  {rest if found or not none else none}".rstrip()))
-    _rows(out, found, indent=2)
+    _print_rows(out, found, indent=2)
 
 
-def _rows(out: Console, rows: list[Row], indent: int) -> None:
+def _print_rows(out: Console, rows: list[Row], indent: int) -> None:
     """Print a table without a head: in columns that fold on a terminal, and as lines without an end elsewhere."""
     from rich.padding import Padding
     from rich.table import Table
@@ -83,7 +87,7 @@ def _rows(out: Console, rows: list[Row], indent: int) -> None:
         out.print(Padding(table, (0, 0, 0, indent)))
 
 
-def _facts(description: Description) -> list[Row]:
+def _list_facts(description: Description) -> list[Row]:
     facts = [("class", description.target)]
     if description.distribution:
         facts.append(("origin", f"{description.distribution} {description.version}"))
@@ -97,55 +101,55 @@ def _facts(description: Description) -> list[Row]:
         facts.append(("robot", definition.robot))
     return [
         *facts,
-        ("control", f"{_number(definition.control_dt)} s per action, {definition.substeps} physics steps each"),
-        ("episode", f"{_number(definition.episode_s)} s, {steps:,} steps"),
+        ("control", f"{_format_number(definition.control_dt)} s per action, {definition.substeps} physics steps each"),
+        ("episode", f"{_format_number(definition.episode_s)} s, {steps:,} steps"),
         ("success", "is_success, at the end of an episode" if definition.has_success else "not defined"),
     ]
 
 
-def _short(space: str) -> str:
+def _shorten(space: str) -> str:
     """Leave out the bounds of a large space, or the parts, which the rows below it have."""
     return space if len(space) <= _LONGEST_SPACE else f"{space.partition('(')[0]}(...)"
 
 
-def _quantities(quantities: list[Quantity]) -> list[Row]:
+def _list_quantities(quantities: list[Quantity]) -> list[Row]:
     return [
-        (each.name, _size(each), each.unit or "", _bounds(each))
+        (each.name, _format_size(each), each.unit or "", _format_bounds(each))
         for each in quantities
         if each.name  # without one it is the whole space, which the title has
     ]
 
 
-def _size(quantity: Quantity) -> str:
+def _format_size(quantity: Quantity) -> str:
     return "x".join(map(str, quantity.shape)) if quantity.kind == "Box" else quantity.kind
 
 
-def _bounds(quantity: Quantity) -> str:
+def _format_bounds(quantity: Quantity) -> str:
     if quantity.low is None and quantity.high is None:
         return "unbounded"
-    low, high = ("-inf" if quantity.low is None else _number(quantity.low)), quantity.high
-    return f"{low} to {'inf' if high is None else _number(high)}"
+    low, high = ("-inf" if quantity.low is None else _format_number(quantity.low)), quantity.high
+    return f"{low} to {'inf' if high is None else _format_number(high)}"
 
 
-def _actions(description: Description) -> list[Row]:
+def _list_actions(description: Description) -> list[Row]:
     meaning = description.definition.action_meaning if description.definition else ""
-    return [(meaning,)] if meaning else _quantities(description.actions)
+    return [(meaning,)] if meaning else _list_quantities(description.actions)
 
 
-def _parameters(description: Description) -> list[Row]:
+def _list_parameters(description: Description) -> list[Row]:
     trained = description.recipe.task
     return [
         (
             each.name,
             each.type,
-            "required" if each.required else _text(each.default),
-            f"{_text(trained[each.name])} in the recipe" if each.name in trained else "",
+            "required" if each.required else _format_value(each.default),
+            f"{_format_value(trained[each.name])} in the recipe" if each.name in trained else "",
         )
         for each in description.parameters
     ]
 
 
-def _rewards(definition: Definition) -> list[Row]:
+def _list_rewards(definition: Definition) -> list[Row]:
     return [
         (
             term.name,
@@ -156,38 +160,38 @@ def _rewards(definition: Definition) -> list[Row]:
     ]
 
 
-def _event(event: OfferedEvent) -> Row:
+def _format_event(event: OfferedEvent) -> Row:
     parameters = dict(event.parameters)
     when = event.when
     if "every_s" in parameters:
-        when = f"every {_text(parameters.pop('every_s'))} s"
-    arguments = ", ".join(f"{name} {_range(value)}" for name, value in parameters.items())
+        when = f"every {_format_value(parameters.pop('every_s'))} s"
+    arguments = ", ".join(f"{name} {_format_range(value)}" for name, value in parameters.items())
     acts = "always" if event.enabled else "with this recipe" if event.acts else "with randomize=true"
     return event.name, when, event.function, arguments, acts
 
 
-def _stage(number: int, stage: Stage) -> Row:
+def _format_stage(number: int, stage: Stage) -> Row:
     rule = stage.promote.model_dump(by_alias=True, exclude_none=True, exclude_defaults=True) if stage.promote else {}
-    until = ", ".join(f"{name} {_text(value)}" for name, value in rule.items())
+    until = ", ".join(f"{name} {_format_value(value)}" for name, value in rule.items())
     return str(number), str(stage), f"until {until}" if until else "the last, which is evaluated"
 
 
-def _range(value: Any) -> str:
+def _format_range(value: Any) -> str:
     """Write what an event draws from: `0.8..1.2`, or `0.9..1.1 -> 0.8..1.2` for a range that widens."""
     if isinstance(value, Mapping) and value.keys() == {"from", "to"}:
-        return f"{_range(value['from'])} -> {_range(value['to'])}"
+        return f"{_format_range(value['from'])} -> {_format_range(value['to'])}"
     if isinstance(value, list) and len(value) == 2 and all(isinstance(each, int | float) for each in value):
-        return f"{_number(value[0])}..{_number(value[1])}"
-    return _text(value)
+        return f"{_format_number(value[0])}..{_format_number(value[1])}"
+    return _format_value(value)
 
 
-def _text(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, float):
-        return _number(value)
+        return _format_number(value)
     if isinstance(value, list):
-        return f"[{', '.join(map(_text, value))}]"
+        return f"[{', '.join(map(_format_value, value))}]"
     return str(value)
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"{value:.6g}"

@@ -30,6 +30,7 @@ def sparkline(values: list[float], low: float | None = None, high: float | None 
 
 
 def percent(rate: float | None) -> str:
+    """Return a rate as text: `98.5%`, `-` for none."""
     return "-" if rate is None else f"{rate:.0%}" if rate in (0, 1) else f"{rate:.1%}"
 
 
@@ -81,10 +82,12 @@ class Display(abc.ABC):
 
 
 def stage_line(title: str, why: str) -> str:
+    """Return the line of a stage that begins."""
     return f"{title}  ({why})" if why else title
 
 
 def evaluation_line(steps: int, success: float | None, mean_return: float, best: bool) -> str:
+    """Return the line of an evaluation."""
     rate = "" if success is None else f"success {percent(success)}  "
     return f"eval at {steps:,}: {rate}return {mean_return:.2f}{'  best' if best else ''}"
 

@@ -73,7 +73,7 @@ def test_what_is_returned(fault, told):
     ("fault", "told"),
     [
         ("raise", "RuntimeError: the gripper fell off"),
-        ("unprintable", "Unprintable: (its text cannot be had: ZeroDivisionError)"),
+        ("unprintable", "Unprintable: (message unavailable: ZeroDivisionError)"),
         ("local class", "Local: nobody can import this"),
         ("long text", f"RuntimeError: one line and another {'x' * 379}..."),
         ("interrupt", "KeyboardInterrupt"),

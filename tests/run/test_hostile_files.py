@@ -67,7 +67,7 @@ def test_a_pickle_in_a_member(name, episode, tmp_path):
 @pytest.mark.parametrize(
     ("members", "told"),
     [
-        ([("evil.pkl", b"")], "'evil.pkl' is no array"),
+        ([("evil.pkl", b"")], "'evil.pkl' is not an array"),
         ([("../../x.npy", array_file(np.zeros(3)))], "'../../x.npy' leads out of it"),
         ([("/tmp/x.npy", array_file(np.zeros(3)))], "'/tmp/x.npy' leads out of it"),
         ([("a.npy", header((10**12,)) + b"\0" * 80)], "'a.npy' is not as large as its header says"),

@@ -36,7 +36,7 @@ def whole(tmp_path_factory):
 # The same faults without a training, and many more, are in tests/rollout/test_returned.py.
 ENDS = {
     "raise": "RuntimeError: the gripper fell off",
-    "unprintable": "Unprintable: (its text cannot be had: ZeroDivisionError)",
+    "unprintable": "Unprintable: (message unavailable: ZeroDivisionError)",
     "exit": "SystemExit: 0",
     "nan reward": "ValueError: reward is nan",
     "_exit": "worker 1 died while stepping (exit code 0)",
