@@ -124,7 +124,7 @@ def load(task: str) -> Callable[..., Any]:
         return _load_target(task, entry.target)
     if _GYMNASIUM_ID.match(task):
         package = task.rpartition(":")[0]
-        if package and _module_file(package) is not None:
+        if package and _find_module_file(package) is not None:
             _import_module(task, package)  # here, so that what it raises is known as an import's
         return _load_gymnasium(task)
     if ":" in task:
