@@ -62,6 +62,7 @@ CASES = [
     case("broken_checkers.py:RewardOfNoGoal", ("RL291", "error")),
     case("broken_checkers.py:OtherReward", ("RL614", "error"), twin="broken_checkers.py:Goal"),
     case("broken_checkers.py:OneByOne", ("RL614", "error"), twin="broken_checkers.py:RoundedReward"),
+    case("broken_checkers.py:ArrayReward", ("RL614", "warning")),
     case("broken_checkers.py:NumberlessReward", ("RL614", "error"), twin="broken_checkers.py:NestedGoal"),
 ]
 

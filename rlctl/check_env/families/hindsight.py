@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.messages import FIRST_SEED, Message
 
 STEPS = 50
@@ -38,13 +39,17 @@ def recompute_rewards(context: Context) -> Iterator[Message]:
     what = "a single reward"
     try:
         pairs = zip(*goals, infos, strict=True)
-        singles = np.array([instance.call("compute_reward", _call, float, compute, *pair) for pair in pairs])
+        alone = [instance.call("compute_reward", _call, np.asarray, compute, *pair) for pair in pairs]
+        singles = np.array([instance.call("compute_reward", _to_number, each) for each in alone])
         what = "all rewards at once"
         batch = instance.call("compute_reward", _call, np.asarray, compute, *goals, infos)
     except EnvironmentRaised as error:
         raised = describe(error.__cause__ or error)
         yield Finding("RL614", f"compute_reward: {what} raises {raised}", {"steps": len(taken)})
         return
+    if shape := alone[0].shape:
+        message = f"compute_reward: of one goal it returns an array of shape {shape}, not a number"
+        yield Finding("RL614", message, {"steps": len(taken)}, Severity.WARNING)
     if batch.shape != given.shape:
         shapes = f"of {len(taken)} goals at once it returns shape {batch.shape}, not {given.shape}"
         yield Finding("RL614", f"compute_reward: {shapes}", {"steps": len(taken)})
@@ -57,6 +62,10 @@ def recompute_rewards(context: Context) -> Iterator[Message]:
         message = f"the reward of step {step + 1} is {given[step]:.6g}, and compute_reward says {singles[step]:.6g}"
         evidence = {"step": step + 1, "value": float(singles[step]), "expected": float(given[step])}
         yield Finding("RL614", message, evidence)
+
+
+def _to_number(value: NDArray[Any]) -> float:
+    return float(value.item())
 
 
 def _call(convert: Callable[[Any], Any], compute: Callable[..., Any], *arguments: Any) -> Any:
