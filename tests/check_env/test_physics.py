@@ -2,7 +2,7 @@
 
 import pytest
 
-from rlctl.check_env.studies.source import calls_without_client
+from rlctl.check_env.client_calls import calls_without_client
 from tests.check_env.judging import case, check_case, findings, found
 
 RULES = {f"RL{number}" for number in range(801, 809)}
@@ -111,7 +111,7 @@ def test_calls_are_read_as_they_are_meant(tmp_path):
     names = {}
     exec(compile(SOURCE, str(file), "exec"), names)
     lines = {
-        name: [place.line for place in calls_without_client(names[name].__code__, names)]
+        name: [call.line for call in calls_without_client(names[name].__code__, names)]
         for name in ("wrong", "imports", "right", "rebound", "argument")
     }
     assert lines == {"wrong": [7, 8, 9], "imports": [13], "right": [], "rebound": [], "argument": []}

@@ -52,6 +52,7 @@ from rlctl.check_env.families import (
     library_checkers,
     loading,
     observations,
+    physics,
     resources,
     rewards,
     search,
@@ -60,11 +61,6 @@ from rlctl.check_env.families import (
     success,
 )
 from rlctl.check_env.finding import RULES
-from rlctl.check_env.legacy import old_experiment
-from rlctl.check_env.rules import (
-    physics,
-    physics_source,
-)
 
 PROCESS_S = 18.0
 """How long the experiments of one process may take together [s]; importing and building comes on top."""
@@ -96,7 +92,7 @@ PROCESSES = {
     "instances": Process(
         (
             isolation.compare_instances,
-            old_experiment("worlds"),
+            physics.watch_worlds,
             actions.compare_actions,
             attributes.read_attributes,
             resources.build_in_worker,
@@ -117,7 +113,7 @@ CHECKERS = ("gymnasium checker", "sb3 checker")
 MODULES = (
     *(loading, observations, spaces, features, hidden_goal, interface, attributes, determinism, isolation),
     *(resources, episodes, rewards, incentives, success, hindsight, actions),
-    *(physics, physics_source, speed),
+    *(physics, speed),
 )
 
 CHECKS = {each.rule: each for module in MODULES for each in vars(module).values() if isinstance(each, Check)}

@@ -1,4 +1,4 @@
-"""Reads a PyBullet client that somebody else made: its bodies, their state, and who touches whom.
+"""Reads a PyBullet client that somebody else made: its bodies, their state, and which links touch.
 
 Nothing here changes a world. `getCollisionShapeData` is left alone: it crashes on some models.
 """
@@ -20,13 +20,10 @@ MOST_BODIES = 20
 MOST_JOINTS = 60
 WIDEST_RANGE = 1e3
 """Limits farther apart are none: some models write 1e16 for a joint without limits."""
-BASE_KINDS = ("position", "angle", "linear velocity", "angular velocity")
-AXES = {
-    "position": ("x", "y", "z"),
-    "angle": ("roll", "pitch", "yaw"),
-    "linear velocity": ("vx", "vy", "vz"),
-    "angular velocity": ("wx", "wy", "wz"),
-}
+
+Link = tuple[int, int]
+"""Body id and link index; the base is link -1."""
+Pair = tuple[Link, Link]
 
 
 def bullet() -> Any:
@@ -46,11 +43,12 @@ class Joint:
 
     @property
     def has_limits(self) -> bool:
+        """Whether its model declares limits."""
         return self.low < self.high and self.high - self.low < WIDEST_RANGE
 
 
 @dataclasses.dataclass(frozen=True)
-class BodyModel:
+class Body:
     """A body of a world, as it was loaded."""
 
     id: int
@@ -59,17 +57,7 @@ class BodyModel:
     """The base first: link `i` of PyBullet is `links[i + 1]`."""
     joints: tuple[Joint, ...]
     is_free: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class Column:
-    """One number of a world's state."""
-
-    body: int
-    """Its place in the world's list of bodies."""
-    kind: str
-    name: str
-    joint: Joint | None = None
+    """Whether its base is not fixed to the world."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,20 +69,47 @@ class Dynamics:
 
 
 @dataclasses.dataclass(frozen=True)
-class WorldModel:
+class State:
+    """A body at one moment."""
+
+    position: NDArray[np.float64]
+    """Of the base [m]. Shape (3,)."""
+    velocity: NDArray[np.float64]
+    """Linear [m/s]. Shape (3,)."""
+    angular: NDArray[np.float64]
+    """Angular velocity [rad/s]. Shape (3,)."""
+    joints: NDArray[np.float64]
+    """Positions and speeds [rad, rad/s; m, m/s]. Shape (2, joints)."""
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """All of it. Shape (9 + 2 * joints,)."""
+        return np.concatenate([self.position, self.velocity, self.angular, self.joints.ravel()])
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
     """The bodies of one client."""
 
     client: int
-    bodies: tuple[BodyModel, ...]
-    columns: tuple[Column, ...]
+    bodies: tuple[Body, ...]
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Equal for worlds that are built alike."""
         return tuple((body.name, body.links) for body in self.bodies)
 
+    def link_name(self, link: Link) -> str:
+        """Return how to write a link: `tip of arm`."""
+        for body in self.bodies:
+            if body.id == link[0] and len(body.links) == 1:
+                return body.name
+            if body.id == link[0]:
+                return f"{body.links[link[1] + 1] or 'base'} of {body.name}"
+        return f"link {link[1]} of body {link[0]}"
 
-def read_world(client: int) -> WorldModel:
+
+def read_world(client: int) -> World:
     """Return what a client holds now."""
     p = bullet()
     ids = [p.getBodyUniqueId(i, physicsClientId=client) for i in range(p.getNumBodies(physicsClientId=client))]
@@ -102,12 +117,11 @@ def read_world(client: int) -> WorldModel:
     for each in ids:
         with contextlib.suppress(p.error):  # a soft body, which has neither links nor a mass
             bodies.append(_body(client, each))
-    bodies = _named_apart(sorted(bodies, key=lambda body: (not body.joints, not body.is_free))[:MOST_BODIES])
-    columns = [column for place, body in enumerate(bodies) for column in _columns(place, body)]
-    return WorldModel(client, tuple(bodies), tuple(columns))
+    bodies.sort(key=lambda body: (not body.joints, not body.is_free))
+    return World(client, tuple(_number_names(bodies[:MOST_BODIES])))
 
 
-def _body(client: int, body: int) -> BodyModel:
+def _body(client: int, body: int) -> Body:
     p = bullet()
     base, name = (text.decode(errors="replace") for text in p.getBodyInfo(body, physicsClientId=client))
     infos = [
@@ -120,42 +134,34 @@ def _body(client: int, body: int) -> BodyModel:
     ]
     links = [base, *(info[12].decode(errors="replace") for info in infos)]
     mass = p.getDynamicsInfo(body, -1, physicsClientId=client)[0]
-    return BodyModel(body, name or base or "a body", tuple(links), tuple(joints[:MOST_JOINTS]), mass > 0)
+    return Body(body, name or base or "a body", tuple(links), tuple(joints[:MOST_JOINTS]), mass > 0)
 
 
-def _named_apart(bodies: list[BodyModel]) -> list[BodyModel]:
+def _number_names(bodies: list[Body]) -> list[Body]:
     """Number bodies of one name; not by their ids, which are others at every reset of some environments."""
     counts: Counter[str] = Counter()
-    apart = []
+    numbered = []
     for body in bodies:
         counts[body.name] += 1
         count = counts[body.name]
-        apart.append(dataclasses.replace(body, name=f"{body.name} ({count})") if count > 1 else body)
-    return apart
+        numbered.append(dataclasses.replace(body, name=f"{body.name} ({count})") if count > 1 else body)
+    return numbered
 
 
-def _columns(place: int, body: BodyModel) -> list[Column]:
-    columns = [Column(place, kind, axis) for kind in BASE_KINDS for axis in AXES[kind]]
-    for kind in ("joint position", "joint velocity"):
-        columns += [Column(place, kind, joint.name, joint) for joint in body.joints]
-    return columns
-
-
-def read_state(world: WorldModel) -> NDArray[np.float64]:
-    """Return the numbers of the world's columns. Shape (columns,)."""
+def read_states(world: World) -> list[State]:
+    """Return the state of each body."""
     p, client = bullet(), world.client
-    numbers: list[float] = []
+    states = []
     for body in world.bodies:
-        position, turn = p.getBasePositionAndOrientation(body.id, physicsClientId=client)
-        linear, angular = p.getBaseVelocity(body.id, physicsClientId=client)
-        numbers += [*position, *p.getEulerFromQuaternion(turn), *linear, *angular]
-        states = p.getJointStates(body.id, [j.index for j in body.joints], physicsClientId=client) or ()
-        numbers += [state[0] for state in states]
-        numbers += [state[1] for state in states]
-    return np.array(numbers, np.float64)
+        position, _ = p.getBasePositionAndOrientation(body.id, physicsClientId=client)
+        velocity, angular = p.getBaseVelocity(body.id, physicsClientId=client)
+        joints = p.getJointStates(body.id, [j.index for j in body.joints], physicsClientId=client) or ()
+        numbers = np.array([each[:2] for each in joints], np.float64).reshape(-1, 2).T
+        states.append(State(np.array(position), np.array(velocity), np.array(angular), numbers))
+    return states
 
 
-def read_dynamics(client: int, body: BodyModel) -> Dynamics:
+def read_dynamics(client: int, body: Body) -> Dynamics:
     """Return masses and frictions."""
     p = bullet()
     infos = [p.getDynamicsInfo(body.id, i - 1, physicsClientId=client) for i in range(len(body.links))]
@@ -168,10 +174,6 @@ def read_gravity(client: int) -> list[float]:
     return [float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ"]
 
 
-Pair = tuple[tuple[int, int], tuple[int, int]]
-"""Two (body id, link index)."""
-
-
 def read_contacts(client: int) -> dict[Pair, float]:
     """Return the deepest distance per pair of links that touch [m]; below zero they are inside each other."""
     deepest: dict[Pair, float] = {}
@@ -181,7 +183,7 @@ def read_contacts(client: int) -> dict[Pair, float]:
     return deepest
 
 
-def thickness(client: int, link: tuple[int, int]) -> float:
+def thickness(client: int, link: Link) -> float:
     """Return the smallest extent of the box around a link [m]."""
     low, high = bullet().getAABB(*link, physicsClientId=client)
     return float(min(b - a for a, b in zip(low, high, strict=True)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import dataclasses
 import functools
 import inspect
 import re
@@ -13,8 +14,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
-
-from rlctl.check_env.world_results import Place, Source
 
 LIBRARIES = ("gymnasium", "numpy", "torch", "pybullet", "pybullet_utils", "rlctl", "builtins", "stable_baselines3")
 """Packages that are not part of an environment; rlctl's own tasks are in packages of their own."""
@@ -31,9 +30,19 @@ FIRST_IS_CLIENT = {
 """Functions whose only positional argument is the client."""
 CLIENT_WORDS = re.compile(r"client|\bcid\b|_cid\b|server", re.IGNORECASE)
 """Names of a client that is passed by position."""
-MOST_PLACES = 20
+MOST_CALLS = 20
 LONGEST_S = 2.0
 """Recording costs a fraction of a microsecond per call; after this time it stops [s]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BulletCall:
+    """A call of a function of PyBullet in the source."""
+
+    file: str
+    line: int
+    name: str
+
 
 Functions = dict[CodeType, Mapping[str, Any]]
 """The code of functions, and the names of the module that each is in."""
@@ -57,14 +66,7 @@ def record_functions() -> Iterator[Functions]:
         sys.settrace(before)
 
 
-def read_source(env: Any, ran: Functions) -> Source:
-    """Return the calls without a client in the functions that ran, and in the environment's other methods."""
-    ran = dict(ran)  # recording goes on
-    not_run = {code: names for code, names in _methods(env) if code not in ran}
-    return Source(_places(ran), _places(not_run))
-
-
-def _methods(env: Any) -> Iterator[tuple[CodeType, Mapping[str, Any]]]:
+def methods_of(env: Any) -> Iterator[tuple[CodeType, Mapping[str, Any]]]:
     """Yield the methods of the environment (or its task) and of the objects of the same package that it holds."""
     inner = getattr(env, "unwrapped", env)
     author = getattr(inner, "task", inner) if _package(type(inner).__module__) == "rlctl" else inner
@@ -79,13 +81,14 @@ def _package(module: str) -> str:
     return module.partition(".")[0]
 
 
-def _places(functions: Functions) -> list[Place]:
+def calls_in(functions: Functions) -> list[BulletCall]:
+    """Return the calls of PyBullet without a client in some functions, those of libraries left out."""
     own = [each for each in functions.items() if _package(each[1].get("__name__", "")) not in LIBRARIES]
-    places = {place for code, names in own for place in calls_without_client(code, names)}
-    return sorted(places, key=lambda each: (each.file, each.line))[:MOST_PLACES]
+    calls = {call for code, names in own for call in calls_without_client(code, names)}
+    return sorted(calls, key=lambda each: (each.file, each.line))[:MOST_CALLS]
 
 
-def calls_without_client(code: CodeType, names: Mapping[str, Any]) -> Iterator[Place]:
+def calls_without_client(code: CodeType, names: Mapping[str, Any]) -> Iterator[BulletCall]:
     """Yield the calls of PyBullet in a function that pass no client; `names` are those of its module."""
     function = _functions(code.co_filename).get(code.co_firstlineno)
     if function is None:
@@ -99,7 +102,7 @@ def calls_without_client(code: CodeType, names: Mapping[str, Any]) -> Iterator[P
     for node in nodes:
         name = _bullet_function(node.func, visible) if isinstance(node, ast.Call) else ""
         if name and not NO_CLIENT.fullmatch(name) and not _has_client(name, node):
-            yield Place(code.co_filename, node.lineno, name)
+            yield BulletCall(code.co_filename, node.lineno, name)
 
 
 @functools.cache

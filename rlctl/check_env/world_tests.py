@@ -8,10 +8,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.studies.world_reading import BodyModel, WorldModel, bullet, read_gravity, read_state
-from rlctl.check_env.world_results import Jump
+from rlctl.check_env.bullet_worlds import Body, World, bullet, read_gravity, read_states
 
-WATCHED_S = 0.1
+LONGEST_S = 0.1
 """How long a world goes on by itself [s]: time enough for what was put inside something to be thrown out."""
 MOST_STEPS = 100
 GRAVITY = -9.81  # [m/s^2]
@@ -22,19 +21,19 @@ ALL_GROUPS = -1
 """A collision group and mask of all bits."""
 LEAST_HALF = 0.05  # [m]
 FARTHEST = 100.0
-"""A body that is larger than this is no robot, and no box goes around it [m]."""
+"""A body that is larger than this is not a robot, and no box is put around it [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Touch:
-    """What a box around a body finds out about one of its links."""
+    """What a box around a body shows of one of its links."""
 
     has_shape: bool
     collides: bool
 
 
-def touches(client: int, body: BodyModel) -> dict[int, Touch]:
-    """Put a box around a robot or a free body and say, per link index, what touches it; empty for all others."""
+def touch_links(client: int, body: Body) -> dict[int, Touch]:
+    """Put a box around a robot or a free body and return, per link index, what touches it; empty for all others."""
     p = bullet()
     if not (body.joints or body.is_free):
         return {}
@@ -59,7 +58,7 @@ def touches(client: int, body: BodyModel) -> dict[int, Touch]:
     return {i: Touch(i in shaped or i in colliding, i in colliding) for i in indices}
 
 
-def weight_matters(world: WorldModel) -> bool:
+def weight_matters(world: World) -> bool:
     """Say whether gravity would change how a world without it goes on: not where all that moves moves level."""
     p, client = bullet(), world.client
     state = p.saveState(physicsClientId=client)
@@ -69,19 +68,32 @@ def weight_matters(world: WorldModel) -> bool:
         p.setGravity(0.0, 0.0, gravity, physicsClientId=client)
         for _ in range(WEIGHT_STEPS):
             p.stepSimulation(physicsClientId=client)
-        ends.append(read_state(world))
+        ends.append(np.concatenate([each.numbers for each in read_states(world)]))
     p.restoreState(state, physicsClientId=client)
     p.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
     p.removeState(state, physicsClientId=client)
     return bool(np.abs(ends[0] - ends[1]).max(initial=0.0) > UNMOVED)
 
 
-def jumps(world: WorldModel, seed: int) -> list[Jump]:
+@dataclasses.dataclass(frozen=True)
+class Jump:
+    """How fast a free body became right after a reset, with nothing done to it."""
+
+    body: str
+    speed: float
+    """[m/s]."""
+    explained: float
+    """The speed that it had, and that falling adds [m/s]."""
+    after_s: float
+    seed: int
+
+
+def find_jumps(world: World, seed: int) -> list[Jump]:
     """Let a world go on without its environment, and return how fast each free body became."""
     p, client = bullet(), world.client
     free = [body for body in world.bodies if body.is_free]
     dt = float(p.getPhysicsEngineParameters(physicsClientId=client)["fixedTimeStep"])
-    steps = min(MOST_STEPS, max(1, round(WATCHED_S / dt))) if dt > 0 else 0
+    steps = min(MOST_STEPS, max(1, round(LONGEST_S / dt))) if dt > 0 else 0
     start = {body.id: _velocity(client, body) for body in free}
     fastest = {body.id: (0.0, 0.0) for body in free}
     for step in range(1, steps + 1):
@@ -97,5 +109,5 @@ def jumps(world: WorldModel, seed: int) -> list[Jump]:
     ]
 
 
-def _velocity(client: int, body: BodyModel) -> NDArray[np.float64]:
+def _velocity(client: int, body: Body) -> NDArray[np.float64]:
     return np.array(bullet().getBaseVelocity(body.id, physicsClientId=client)[0])
