@@ -20,6 +20,7 @@ NOISE = tuple(
         # RL614 judges this with a tolerance: float rounding, which SB3's checker does not forgive, harms nobody.
         r"The reward was not computed with `compute_reward",
         r"computation of reward differs",
+        r"reward == env\.compute_reward",
     )
 )
 """Complaints that say nothing about an environment's quality."""

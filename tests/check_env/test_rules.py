@@ -4,10 +4,13 @@ Lives the environments in this process; what needs a process of its own is in `t
 """
 
 import re
+import runpy
 from importlib import import_module
 
+import gymnasium
 import pytest
 
+from rlctl.check_env.families.library_checkers import collect_complaints
 from rlctl.check_env.finding import RULES
 from tests.check_env.judging import FOLDER, case, check_case, findings, found, records_of, verdict_of
 
@@ -102,6 +105,14 @@ def test_hindsight_rewards_are_compared():
     (finding,) = findings("broken_checkers.py:OtherReward", "RL614")
     # Each reward is 0.5 below what compute_reward says.
     assert finding.evidence["value"] - finding.evidence["expected"] == pytest.approx(0.5)
+
+
+def test_an_assertion_without_a_message_is_quoted(tmp_path):
+    file = tmp_path / "stable_baselines3" / "checker.py"
+    file.parent.mkdir()
+    file.write_text("def check(env):\n    assert env is None\n")
+    check = runpy.run_path(str(file))["check"]
+    assert collect_complaints(check, gymnasium.make("CartPole-v1")) == [("error", "assert env is None")]
 
 
 def test_out_of_range_is_placed():

@@ -119,7 +119,8 @@ def _close(env: Any, complaints: list[tuple[str, str]], home: str) -> None:
 def _describe(error: BaseException, home: str) -> str:
     if _is_of_environment(error.__traceback__, home):
         return RAISED + describe(error)
-    text = _clean(str(error)) or "no message"
+    frames = traceback.extract_tb(error.__traceback__)
+    text = _clean(str(error) or (frames[-1].line if frames else "") or "") or "no message"  # an assert's own line
     return text if isinstance(error, AssertionError) else f"{type(error).__name__}: {text}"
 
 
