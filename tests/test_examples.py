@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
+import subprocess
 import sys
+import venv
 from pathlib import Path
 
 import pytest
@@ -71,6 +74,56 @@ def test_ci_workflow_uses_options_that_exist() -> None:
     for verb in verbs:
         page = run("-m", "rlctl", verb[1], "--help", cwd=EXAMPLES)
         assert [word for word in verb if word.startswith("--") and word not in page] == []
+
+
+def test_ci_workflow_installs_rlctl_from_a_place_that_exists() -> None:
+    workflow = yaml.safe_load((EXAMPLES / "ci" / "rlctl.yml").read_text())
+    (install,) = [step["run"] for step in workflow["jobs"]["learn"]["steps"] if "pip install" in step.get("run", "")]
+    assert install == 'pip install "$RLCTL" .'
+    assert workflow["env"]["RLCTL"].startswith("./")
+
+
+@pytest.mark.slow
+def test_ci_workflow_and_a_new_plugin_install_without_an_index(tmp_path: Path) -> None:
+    repository, root = tmp_path / "repository", EXAMPLES.parent
+    shutil.copytree(EXAMPLES / "my_task", repository)
+    tracked = ("pyproject.toml", "README.md", "LICENSE", "rlctl", "plugins")
+    (repository / "rlctl").mkdir()
+    for name in tracked:
+        copy = shutil.copytree if (root / name).is_dir() else shutil.copy
+        copy(root / name, repository / "rlctl" / name)
+    scripts = _environment_without_rlctl(tmp_path / "venv")
+    workflow = yaml.safe_load((EXAMPLES / "ci" / "rlctl.yml").read_text())
+    offline = {"PIP_NO_INDEX": "1", "PIP_NO_BUILD_ISOLATION": "0"}  # pip reads the second the wrong way round
+    env = {**os.environ, **offline, "RLCTL": workflow["env"]["RLCTL"], "PATH": f"{scripts}:{os.environ['PATH']}"}
+
+    def shell(command: str) -> str:
+        done = subprocess.run(command, shell=True, cwd=repository, env=env, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    (install,) = [step["run"] for step in workflow["jobs"]["learn"]["steps"] if "pip install" in step.get("run", "")]
+    shell(install)
+    shell("rlctl tasks new my-arm")
+    shell("pip install ./my-arm")  # not -e: offline there is nothing that hatchling needs for it
+    tasks = {task["name"] for task in json.loads(shell("rlctl tasks --check --json -"))["tasks"]}
+    assert {"my-task", "my-arm", "reach"} <= tasks
+
+
+def _environment_without_rlctl(folder: Path) -> Path:
+    """Make an environment that has whatever this one has, except rlctl; return its scripts."""
+    venv.create(folder, with_pip=True)
+    everything = folder / "everything"
+    everything.mkdir()
+    for site in dict.fromkeys(each for each in sys.path if each.endswith("site-packages")):
+        for place in Path(site).iterdir():
+            if "rlctl" not in place.name and not place.name.endswith(".pth") and not (everything / place.name).exists():
+                (everything / place.name).symlink_to(place)
+    (site,) = folder.glob("lib/python*/site-packages")
+    for old in site.glob("setuptools*"):  # the one of venv is older than torch wants
+        shutil.rmtree(old)
+    (site / "everything.pth").write_text(f"{everything}\n")
+    return folder / "bin"
 
 
 @pytest.mark.slow
