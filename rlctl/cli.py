@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 from typer.core import TyperGroup
 
 from rlctl import __version__
 from rlctl.errors import RlctlError, UsageError
+
+if TYPE_CHECKING:
+    from rlctl.env_spec import EnvChanges
 
 app = typer.Typer(
     name="rlctl",
@@ -56,7 +59,12 @@ Run = Annotated[
 ]
 Set = Annotated[
     list[str],
-    typer.Option("--set", metavar="KEY=VALUE", help="Set a recipe key, e.g. task.tolerance=0.02.", show_default=False),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Set a key, e.g. task.tolerance=0.02, randomize=true.",
+        show_default=False,
+    ),
 ]
 Json = Annotated[
     Optional[str],  # noqa: UP045
@@ -125,7 +133,7 @@ def check_env(
     if task is None:
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
     form, target = formats.choose(form, output, json)
-    spec = EnvSpec(task, _task_settings(settings))
+    spec = _parse_changes(settings).apply(EnvSpec(task))
     report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)
     formats.show(report, form, target)
     raise typer.Exit(report.exit_code)
@@ -243,7 +251,7 @@ def evaluate(
             checkpoint=checkpoint,
             episodes=episodes,
             seed=seed,
-            parameters=_task_settings(settings),
+            changes=_parse_changes(settings),
             stage=stage,
             deterministic=not stochastic,
             n_envs=n_envs,
@@ -325,7 +333,7 @@ def replay(
             seed=seed,
             checkpoint=checkpoint,
             task=task,
-            parameters=_task_settings(settings),
+            changes=_parse_changes(settings),
             verify=verify,
             gui=gui,
             output=output,
@@ -456,7 +464,7 @@ def import_run(
     _claim_stdout()
     from rlctl.runs.import_model import ImportRequest, import_model, show
 
-    request = ImportRequest(model, task, vecnormalize, algo, output, _task_settings(settings))
+    request = ImportRequest(model, task, vecnormalize, algo, output, _parse_changes(settings))
     show(import_model(request), json)
 
 
@@ -493,11 +501,10 @@ def _claim_stdout() -> None:
     output.results()
 
 
-def _task_settings(settings: list[str]) -> dict[str, Any]:
-    """The constructor arguments in `--set task.key=value`, for the verbs that take nothing else."""
-    from rlctl.run.recipe import parse_task_settings
+def _parse_changes(settings: list[str]) -> EnvChanges:
+    from rlctl.run.recipe import parse_changes
 
-    return parse_task_settings(settings)
+    return parse_changes(settings)
 
 
 def main() -> None:

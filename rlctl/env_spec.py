@@ -61,7 +61,7 @@ class EnvSpec:
         if is_task(constructor):
             env = self._make_task_env(constructor, render_mode)
         else:
-            for key in ("reward_weights", "events", "level"):
+            for key in ("reward_weights", "randomize", "events", "level"):
                 if getattr(self, key) != getattr(EnvSpec(self.task), key):
                     raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
             env = self._make_plain_env(constructor, render_mode)
@@ -103,11 +103,50 @@ class EnvSpec:
         return env
 
 
+@dataclasses.dataclass(frozen=True)
+class EnvChanges:
+    """What a user changes in an environment that a policy or a recipe names: `--set` of the verbs."""
+
+    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    randomize: bool | None = None
+    """True: all events act. False: only those in `events`, and those that are part of the task. None: as it is."""
+    events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+
+    def apply(self, spec: EnvSpec) -> EnvSpec:
+        """Return `spec` with the changes put over it."""
+        events = {} if self.randomize is False else dict(spec.events)
+        for name, changes in self.events.items():
+            events[name] = {**events.get(name, {}), **changes}
+        return dataclasses.replace(
+            spec,
+            parameters={**spec.parameters, **self.parameters},
+            reward_weights={**spec.reward_weights, **self.reward_weights},
+            randomize=spec.randomize if self.randomize is None else self.randomize,
+            events=events,
+        )
+
+    def __bool__(self) -> bool:
+        return self != UNCHANGED
+
+
+UNCHANGED = EnvChanges()
+
+
 def make(
-    task: str, *, render_mode: Literal["human", "rgb_array"] | None = None, **parameters: Any
+    task: str,
+    *,
+    render_mode: Literal["human", "rgb_array"] | None = None,
+    randomize: bool = False,
+    events: Mapping[str, Mapping[str, Any]] | None = None,
+    **parameters: Any,
 ) -> gymnasium.Env[Any, Any]:
-    """Return the Gymnasium environment of a task; keywords are the task's parameters."""
-    return EnvSpec(task, parameters).make(render_mode)
+    """Return the Gymnasium environment of a task; keywords are the task's parameters.
+
+    `randomize` lets all events of the task act, `events` those that it names, with the parameters it gives:
+    `events={"mass": {"factor": (0.9, 1.1)}}`.
+    """
+    return EnvSpec(task, parameters, randomize=randomize, events=events or {}).make(render_mode)
 
 
 def make_several(spec: EnvSpec, count: int) -> list[gymnasium.Env[Any, Any]]:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rlctl import output
-from rlctl.env_spec import EnvSpec
+from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
 from rlctl.rollout.collect import Episode, run_episodes
@@ -30,7 +28,7 @@ class EvalRequest:
     checkpoint: str = "best"
     episodes: int = 100
     seed: int = 0
-    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    changes: EnvChanges = UNCHANGED
     stage: str | None = None
     """Stage of the curriculum, from 1, or `all`; None: the last."""
     deterministic: bool = True
@@ -45,6 +43,8 @@ class Evaluation:
     policy_file: Path
     policy: Policy
     spec: EnvSpec
+    events: dict[str, bool]
+    """The events that the task offers, and whether each acted."""
     seed: int
     deterministic: bool
     episodes: list[Episode]
@@ -110,7 +110,7 @@ def run_evaluations(request: EvalRequest, gates: Gates) -> list[Evaluation]:
 
 def _choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
     if request.stage is None:
-        return [info.derive_spec(request.task, request.parameters)]
+        return [info.derive_spec(request.task, request.changes)]
     if request.task is not None and request.task != info.spec.task:
         raise UsageError(
             f"--stage: stages are those of {info.spec.task}, which the policy was trained on; leave out --task"
@@ -126,7 +126,7 @@ def _choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
             f"--stage {request.stage}: this policy was trained in {len(info.stages)} stages; "
             f"give a number from 1 to {len(info.stages)}, or all"
         )
-    return [info.derive_stage(number, request.parameters) for number in numbers]
+    return [request.changes.apply(info.stages[number - 1]) for number in numbers]
 
 
 def _evaluate(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
@@ -135,8 +135,8 @@ def _evaluate(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, g
         policy.info.check_fits(workers.info, path)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
-        episodes = _run_episodes(workers, policy, request)
-    evaluation = _summarize(path, policy, spec, request, episodes)
+        episodes, events = _run_episodes(workers, policy, request), workers.info.events
+    evaluation = _summarize(path, policy, spec, events, request, episodes)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
 
@@ -157,13 +157,16 @@ def _run_episodes(workers: Workers, policy: Policy, request: EvalRequest) -> lis
         )
 
 
-def _summarize(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, episodes: list[Episode]) -> Evaluation:
+def _summarize(
+    path: Path, policy: Policy, spec: EnvSpec, events: dict[str, bool], request: EvalRequest, episodes: list[Episode]
+) -> Evaluation:
     results = [episode.result for episode in episodes]
     distances = [result.final_distance for result in results if result.final_distance is not None]
     return Evaluation(
         policy_file=path,
         policy=policy,
         spec=spec,
+        events=events,
         seed=request.seed,
         deterministic=request.deterministic,
         episodes=episodes,

@@ -10,6 +10,7 @@ from rlctl import output
 from rlctl.env_spec import EnvSpec
 from rlctl.eval.evaluate import Evaluation
 from rlctl.eval.statistics import Spread
+from rlctl.run.env_info import describe_randomization
 from rlctl.run.policy import collect_versions
 
 
@@ -90,7 +91,8 @@ def _show_head(result: Evaluation) -> None:
     out, info = output.out(), result.policy.info
     mode = "" if result.deterministic else ", sampled actions"
     out.print(f"{result.spec.task}: {result.policy_file} ({info.algo}, step {info.training_steps:,})", markup=False)
-    out.print(f"{len(result.episodes)} episodes, seed {result.seed}{mode}")
+    randomization = describe_randomization(result.events)
+    out.print(f"{len(result.episodes)} episodes, seed {result.seed}{mode}{randomization and f', {randomization}'}")
 
 
 def _format_spread(spread: Spread) -> list[str]:
@@ -110,6 +112,8 @@ def as_json(result: Evaluation) -> dict[str, Any]:
             "versions": info.versions,
         },
         "versions": collect_versions(),
+        "randomized": any(result.events.values()),
+        "events": result.events,
         "seed": result.seed,
         "deterministic": result.deterministic,
         "success_rate": result.success_rate,

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rlctl import output
-from rlctl.env_spec import EnvSpec
+from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import UsageError
 from rlctl.replay.recorder import Choose, Rollout, drawable_env, play_episode, recorded_actions
 from rlctl.replay.report import ReplayedEpisode, ReplayResult
@@ -31,7 +29,7 @@ class ReplayRequest:
     seed: int = 0
     checkpoint: str = "best"
     task: str | None = None
-    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    changes: EnvChanges = UNCHANGED
     verify: Path | None = None
     gui: bool = False
     output: Path | None = None
@@ -67,7 +65,7 @@ def _check_request(request: ReplayRequest) -> None:
     if request.gui and target is not None:
         raise UsageError("--gui shows a window and writes nothing: leave out --output")
     recorded = request.verify is not None or _is_episode(source)
-    if recorded and (request.task is not None or request.parameters or request.episodes != 1):
+    if recorded and (request.task is not None or request.changes or request.episodes != 1):
         raise UsageError("a recorded episode is replayed as it was: leave out --task, --set and --episodes")
     if target is None:
         return
@@ -116,7 +114,7 @@ class _Actor:
             pin_threads()
         self._policy: Policy = load_policy(self._file)
         info = self._policy.info
-        self._spec: EnvSpec = info.derive_spec(request.task, request.parameters)
+        self._spec: EnvSpec = info.derive_spec(request.task, request.changes)
         self._name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
 
     def show(self) -> ReplayResult:
@@ -162,4 +160,6 @@ class _Actor:
 
 def _summarize(rollout: Rollout, recording: Path | None = None, episode: Path | None = None) -> ReplayedEpisode:
     info = rollout.episode.info
-    return ReplayedEpisode(info.seed, rollout.length, info.total_reward, info.success, recording, episode)
+    return ReplayedEpisode(
+        info.seed, rollout.length, info.total_reward, info.success, rollout.env.events, recording, episode
+    )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rlctl import output
 from rlctl.errors import AnswerIsNo
 from rlctl.replay.difference import Difference
+from rlctl.run.env_info import describe_randomization
 from rlctl.run.policy import collect_versions
 
 
@@ -21,6 +23,8 @@ class ReplayedEpisode:
     length: int
     total_reward: float
     success: bool | None
+    events: Mapping[str, bool]
+    """The events that the task offers, and whether each acted."""
     recording: Path | None = None
     """The `.rrd` file."""
     episode: Path | None = None
@@ -62,7 +66,9 @@ def show(result: ReplayResult, json: str | None) -> None:
         _show_verification(result, result.verification)
         return
     out = output.out()
-    out.print(f"{result.task}: {result.policy}" if result.policy else result.task, markup=False)
+    randomization = describe_randomization(result.episodes[0].events)
+    parts = [each for each in (result.policy, randomization) if each]
+    out.print(f"{result.task}: {', '.join(parts)}" if parts else result.task, markup=False)
     for episode in result.episodes:
         out.print(_line(episode), markup=False)
     if command := open_command(result):
@@ -120,4 +126,6 @@ def _episode_json(episode: ReplayedEpisode) -> dict[str, Any]:
         "length": episode.length,
         "return": episode.total_reward,
         "success": episode.success,
+        "randomized": any(episode.events.values()),
+        "events": dict(episode.events),
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
@@ -31,6 +31,8 @@ class EnvInfo(pydantic.BaseModel):
     control_dt: float | None = None
     """Time between two actions [s]."""
     reward_weights: dict[str, float] = {}
+    events: dict[str, bool] = {}
+    """Random changes that the task offers, and whether each acts."""
     has_success: bool = False
     has_compute_reward: bool = False
     """Whether it can say what a step would have been worth, had another goal been wanted."""
@@ -75,11 +77,19 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
             action_meaning=task.action_meaning,
             control_dt=task.control_dt,
             reward_weights=inner.reward_weights,
+            events={name: name in inner.events for name in task.events},
             has_success=inner.has_success,
             max_steps=inner.max_steps,
             robot=task.robot,
         )
     return EnvInfo(**common, max_steps=env.spec.max_episode_steps if env.spec else None)
+
+
+def describe_randomization(events: Mapping[str, bool]) -> str:
+    """Return whether and by what an environment was randomised; empty for one that offers no events."""
+    if acting := [name for name, acts in events.items() if acts]:
+        return f"randomised by {', '.join(acting)}"
+    return "not randomised" if events else ""
 
 
 def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:

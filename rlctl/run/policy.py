@@ -23,7 +23,7 @@ from pydantic import Field
 
 import rlctl
 from rlctl.dict_spaces import Observations, join, map_parts, split_space
-from rlctl.env_spec import EnvSpec
+from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.named_task import POLICY
 from rlctl.run import files, untrusted
@@ -73,17 +73,11 @@ class PolicyInfo(pydantic.BaseModel):
     """Of the best policy of a run: why it is the best."""
     versions: dict[str, str] = {}
 
-    def derive_spec(self, task: str | None = None, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
-        """Return what this policy was trained for, or another task, with parameters put over its own."""
+    def derive_spec(self, task: str | None = None, changes: EnvChanges = UNCHANGED) -> EnvSpec:
+        """Return what this policy was trained for, or another task, with changes."""
         if task is not None and task != self.spec.task:
-            return EnvSpec(task, parameters or {}, frame_stack=self.spec.frame_stack)
-        merged = {**self.spec.parameters, **(parameters or {})}
-        return dataclasses.replace(self.spec, parameters=merged, named_by=POLICY if task is None else "")
-
-    def derive_stage(self, number: int, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
-        """Return a stage of this policy's curriculum, from 1 to `len(stages)`, with parameters put over its own."""
-        stage = self.stages[number - 1]
-        return dataclasses.replace(stage, parameters={**stage.parameters, **(parameters or {})})
+            return changes.apply(EnvSpec(task, frame_stack=self.spec.frame_stack))
+        return changes.apply(dataclasses.replace(self.spec, named_by=POLICY if task is None else ""))
 
     def check_fits(self, env: EnvInfo, file: Path) -> None:
         """Raise `ArtifactError` if the policy in `file` was made for other spaces than `env` has."""

@@ -14,7 +14,7 @@ import pydantic
 from pydantic import Field
 
 from rlctl import registry
-from rlctl.env_spec import EnvSpec
+from rlctl.env_spec import EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
 from rlctl.run import schema_text, untrusted, yaml_text
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS, decide_by
@@ -251,6 +251,7 @@ def resolve(
     return fill_defaults(validate(merged, *sources))
 
 
+_OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events")
 _OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
 
 
@@ -356,16 +357,16 @@ def fill_defaults(recipe: Recipe) -> Recipe:
     return recipe.model_copy(update=changes)
 
 
-def parse_task_settings(settings: list[str]) -> dict[str, Any]:
-    """Return the constructor arguments in `--set task.key=value`; raises `RecipeError` for any other key."""
+def parse_changes(settings: list[str]) -> EnvChanges:
+    """Return what `--set` changes in an environment; raises `RecipeError` for a key that is not of one."""
     values = parse_settings(settings)
     for key in values:
-        if key != "task":
-            raise RecipeError(f"--set {key}: only task.* can be set here.{did_you_mean(key, ['task'])}")
-    parameters = values.get("task", {})
-    if not isinstance(parameters, dict):
-        raise RecipeError("--set task: write task.key=value")
-    return parameters
+        if key not in _OF_THE_ENVIRONMENT:
+            can = "task.NAME, reward_weights.NAME, randomize and events.NAME can be set here"
+            raise RecipeError(f"--set {key}: only {can}.{did_you_mean(key, _OF_THE_ENVIRONMENT)}")
+    recipe = validate(values, "--set")
+    randomize = recipe.randomize if "randomize" in values else None
+    return EnvChanges(recipe.task, recipe.reward_weights, randomize, recipe.events)
 
 
 def merge_flags(settings: list[str], **flags: Any) -> dict[str, Any]:

@@ -34,7 +34,9 @@ eval: {every_steps: 20_000, episodes: 50}
 ```
 
 YAML 1.2: `3e-4` is a number, `1e6` is a whole number where one is expected, `on` is text. Anchors and aliases are not
-supported. `--set` takes a key with dots: `--set algo_kwargs.gamma=0.98`.
+supported. `--set` takes a key with dots: `--set algo_kwargs.gamma=0.98`. `check-env`, `eval` and `replay` take
+those of `task`, `reward_weights`, `randomize` and `events`; `--set randomize=false` also leaves out the events that a
+policy was trained with.
 
 A default with *rlctl* is chosen by rlctl; the others are those of Stable-Baselines3.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.env_spec import EnvSpec
+from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 from rlctl.run.policy import PolicyInfo, collect_versions, load_policy, save_policy
 from rlctl.runs.sb3_model import SavedModel, SavedNormalization, read_model, read_normalization
@@ -26,7 +25,7 @@ class ImportRequest:
     normalization: Path | None = None
     algo: str | None = None
     output: Path | None = None
-    task_parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    changes: EnvChanges = UNCHANGED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +49,7 @@ def import_model(request: ImportRequest) -> ImportedPolicy:
         raise UsageError(f"--algo {request.algo}: no such algorithm.{did_you_mean(request.algo, ALGORITHMS)}")
     model = read_model(request.model, request.algo)
     normalization = read_normalization(request.normalization) if request.normalization else None
-    spec = EnvSpec(request.task, request.task_parameters)
+    spec = request.changes.apply(EnvSpec(request.task))
     env = spec.make()
     try:
         env_info = describe(env)

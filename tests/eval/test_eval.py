@@ -5,9 +5,10 @@ import sys
 import numpy as np
 import pytest
 
+from rlctl.env_spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
-from rlctl.eval.report import as_json
+from rlctl.eval.report import as_json, show
 from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
 from rlctl.rollout.workers import EpisodeResult
 from rlctl.train.request import TrainRequest, run_training
@@ -84,8 +85,26 @@ def test_json_has_what_ci_needs(evaluation):
 
 
 def test_tolerance_is_a_parameter(reach_run):
-    wide = EvalRequest(str(reach_run.path), episodes=4, parameters={"tolerance": 10.0})
+    wide = EvalRequest(str(reach_run.path), episodes=4, changes=EnvChanges({"tolerance": 10.0}))
     assert run_evaluation(wide, Gates()).success_rate == 1.0
+
+
+def test_it_says_whether_it_was_randomised(reach_run, evaluation, capfd):
+    shaken = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, changes=EnvChanges(randomize=True)), Gates())
+    offered = as_json(evaluation)["events"]
+    assert offered
+    assert not any(offered.values())
+    assert as_json(evaluation)["randomized"] is False
+    assert as_json(shaken)["randomized"] is True
+    assert as_json(shaken)["events"] == dict.fromkeys(offered, True)
+    assert [each.result.total_reward for each in shaken.episodes] != [
+        each.result.total_reward for each in evaluation.episodes
+    ]
+    for result in (evaluation, shaken):
+        show(result, None)
+    printed = capfd.readouterr()
+    assert "6 episodes, seed 0, not randomised" in printed.out + printed.err
+    assert f"6 episodes, seed 0, randomised by {', '.join(offered)}" in printed.out + printed.err
 
 
 def test_stochastic_repeats_with_its_seed(reach_run):

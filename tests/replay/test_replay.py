@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
+from rlctl.env_spec import EnvChanges
 from rlctl.errors import ArtifactError
 from rlctl.replay.replay import ReplayRequest, run_replay
 from rlctl.replay.report import as_json
@@ -53,7 +54,7 @@ def test_training_records_beside_its_episodes(run):
 
 
 def test_task_and_parameters_can_be_others(run, tmp_path):
-    request = ReplayRequest(str(run.run.path), parameters={"tolerance": 0.9}, output=tmp_path)
+    request = ReplayRequest(str(run.run.path), changes=EnvChanges({"tolerance": 0.9}), output=tmp_path)
     (episode,) = run_replay(request).episodes
     assert episode.success is True
     assert load_episode(episode.episode).info.spec.parameters == {"tolerance": 0.9}
@@ -65,7 +66,7 @@ def test_command_line_from_a_run_to_the_command_that_opens_it(replay, run, tmp_p
     done = replay(run.run.path, "-o", "a b.rrd")
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    assert lines[0] == "reach: best.safetensors, ppo, step 64"
+    assert lines[0] == "reach: best.safetensors, ppo, step 64, not randomised"
     assert lines[1].startswith("a b.rrd: seed ")
     assert lines[2:] == [
         "open with: rerun 'a b.rrd'",

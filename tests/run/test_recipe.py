@@ -4,9 +4,10 @@ import math
 
 import pytest
 
+from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, RecipeError
 from rlctl.run import recipe
-from rlctl.run.recipe import Recipe, parse_settings, parse_task_settings, resolve, validate
+from rlctl.run.recipe import Recipe, parse_changes, parse_settings, resolve, validate
 
 
 @pytest.fixture
@@ -176,12 +177,39 @@ def test_settings_that_cannot_be_read(settings, message):
     assert str(caught.value) == message
 
 
-def test_settings_of_verbs_that_take_the_task_only():
-    assert parse_task_settings(["task.tolerance=0.02", "task.name=[a, b]"]) == {"tolerance": 0.02, "name": ["a", "b"]}
-    with pytest.raises(RecipeError, match=r"^--set taks: only task\.\* can be set here\. Did you mean 'task'\?$"):
-        parse_task_settings(["taks.tolerance=1"])
-    with pytest.raises(RecipeError, match=r"^--set task: write task\.key=value$"):
-        parse_task_settings(["task=1"])
+def test_settings_of_verbs_that_take_an_environment():
+    assert parse_changes([]) == UNCHANGED
+    assert not parse_changes([])
+    assert parse_changes(["task.tolerance=0.02", "task.name=[a, b]"]).parameters == {
+        "tolerance": 0.02,
+        "name": ["a", "b"],
+    }
+    assert parse_changes(["randomize=false", "events.mass.factor=[0.9, 1.1]"]) == EnvChanges(
+        randomize=False, events={"mass": {"factor": [0.9, 1.1]}}
+    )
+    for setting, message in {
+        "taks.tolerance=1": "--set taks: only task.NAME, reward_weights.NAME, randomize and events.NAME can be set "
+        "here. Did you mean 'task'?",
+        "n_envs=3": "--set n_envs: only task.NAME, ",
+        "task=1": "--set: task: expected a mapping, got 1",
+        "randomize=maybe": "--set: randomize: expected true or false, got 'maybe'",
+        "events.mass=3": "--set: events.mass: expected a mapping, got 3",
+    }.items():
+        with pytest.raises(RecipeError) as caught:
+            parse_changes([setting])
+        assert str(caught.value).startswith(message)
+
+
+def test_what_is_changed_goes_over_what_was_trained_with():
+    trained = EnvSpec("reach", {"a": 1}, {"x": 1.0}, True, {"mass": {"factor": [0.5, 2.0], "body": "arm"}})
+    assert UNCHANGED.apply(trained) == trained
+    changed = EnvChanges({"b": 2}, {"y": 3.0}, None, {"mass": {"factor": [1, 1]}}).apply(trained)
+    assert changed == EnvSpec(
+        "reach", {"a": 1, "b": 2}, {"x": 1.0, "y": 3.0}, True, {"mass": {"factor": [1, 1], "body": "arm"}}
+    )
+    # Not randomised: also the events go that it was trained with, but for those that are asked for.
+    calm = EnvChanges(randomize=False, events={"push": {}}).apply(trained)
+    assert (calm.randomize, calm.events) == (False, {"push": {}})
 
 
 def test_a_file_that_is_none(tmp_path, config):

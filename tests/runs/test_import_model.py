@@ -14,7 +14,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from rlctl.env_spec import EnvSpec
+from rlctl.env_spec import EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run.policy import load_policy
 from rlctl.run.torch_policy import ALGORITHMS, policy_name
@@ -63,7 +63,7 @@ def save(tmp_path):
         env.training = False
         request = ImportRequest(
             tmp_path / "model.zip", SMALL, tmp_path / "vecnormalize.pkl", output=tmp_path / "policy.safetensors",
-            task_parameters=parameters,
+            changes=EnvChanges(parameters),
         )  # fmt: skip
         return model, env, request
 
@@ -175,7 +175,7 @@ def test_other_spaces_are_refused(save):
     other = ImportRequest(request.model, "reach", request.normalization)
     with pytest.raises(ArtifactError, match=r"model.zip: it observes Box\(3,\), reach gives Box"):
         import_model(other)
-    discrete = ImportRequest(request.model, SMALL, task_parameters={"observation": "vector", "action": "discrete"})
+    discrete = ImportRequest(request.model, SMALL, changes=EnvChanges({"observation": "vector", "action": "discrete"}))
     with pytest.raises(ArtifactError, match="its actions are Box"):
         import_model(discrete)
     with pytest.raises(UsageError, match="--algo pppo"):

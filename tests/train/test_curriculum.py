@@ -135,7 +135,7 @@ def test_tensorboard_has_the_stage(staged):
 def test_policy_file_has_all_stages(staged):
     info = load_policy(staged.run.best_policy).info
     assert info.derive_spec().parameters == HARD
-    assert [info.derive_stage(number).parameters for number in (1, 2)] == [EASY, HARD]
+    assert [info.stages[number - 1].parameters for number in (1, 2)] == [EASY, HARD]
 
 
 @pytest.mark.parametrize(("stage", "rates"), [(None, [0.0]), ("1", [1.0]), ("2", [0.0]), ("all", [1.0, 0.0])])
@@ -298,7 +298,7 @@ def test_reach_in_stages_of_its_class(write_module, tmp_path):
         assert (episode.info.spec.stage, episode.info.spec.parameters) == (2, {"tolerance": 0.05})
         assert verify_episode(episode, file)[1].difference is None
     info = load_policy(result.run.last_policy).info
-    assert [info.derive_stage(number).level for number in (1, 2)] == [0.1, info.spec.level] == [0.1, 1.0]
+    assert [info.stages[number - 1].level for number in (1, 2)] == [0.1, info.spec.level] == [0.1, 1.0]
     near, exact = run_evaluations(EvalRequest(str(result.run.path), episodes=2, stage="all"), Gates())
     # The same policy and goals, and the mass makes no great difference; `reached` is measured by the tolerance.
     assert near.terms["reached"] > exact.terms["reached"]

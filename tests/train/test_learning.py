@@ -2,6 +2,7 @@
 
 import pytest
 
+from rlctl.env_spec import EnvChanges
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.train.request import TrainRequest, run_training
 from tests.train.conftest import ENVS
@@ -13,7 +14,7 @@ from tests.train.conftest import ENVS
 def test_reach_is_learnt(tmp_path, seed):
     run = run_training(TrainRequest("reach", settings={"seed": seed}, root=tmp_path)).run
     wide = run_evaluation(EvalRequest(str(run.path)), Gates())
-    strict = run_evaluation(EvalRequest(str(run.path), parameters={"tolerance": 0.02}), Gates())
+    strict = run_evaluation(EvalRequest(str(run.path), changes=EnvChanges({"tolerance": 0.02})), Gates())
     assert wide.success_rate >= 0.98
     assert strict.success_rate >= 0.90
 
