@@ -170,8 +170,8 @@ class ForkServer:
             finally:
                 process.kill()
                 process.wait()
-            told = [(file.seek(0), file.read().decode(errors="replace"))[1] for file in (out, err)]
-        return subprocess.CompletedProcess(command, process.returncode, *told)
+            texts = [(file.seek(0), file.read().decode(errors="replace"))[1] for file in (out, err)]
+        return subprocess.CompletedProcess(command, process.returncode, *texts)
 
     def close(self):
         self._connection.close()

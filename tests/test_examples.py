@@ -37,7 +37,7 @@ def findings(task: str, cwd: Path) -> set[str]:
     return {finding["rule"] for finding in json.loads(done.stdout)["findings"]}
 
 
-def test_broken_env_has_the_mistakes_that_its_text_tells(tmp_path: Path) -> None:
+def test_broken_env_has_the_mistakes_that_its_text_names(tmp_path: Path) -> None:
     source = (EXAMPLES / "broken_env/pushed_ball.py").read_text()
     first = {"RL009", "RL204", "RL210", "RL301", "RL309", "RL501", "RL609", "RL704", "RL808"}
     assert findings(f"{EXAMPLES}/broken_env/pushed_ball.py:PushedBall", tmp_path) == first

@@ -27,9 +27,9 @@ def watched(folder, *commands):
     """Run commands in one process; return their exit codes and every class that was looked up for a pickle."""
     words = json.dumps([[str(word) for word in command] for command in commands])
     done = fork_server.for_commands().run([sys.executable, "-c", WATCHED, words], cwd=folder, timeout=240)
-    told = [line for line in done.stderr.splitlines() if line.startswith("@")]
-    assert told, done.stderr
-    return json.loads(told[-1][1:])
+    printed = [line for line in done.stderr.splitlines() if line.startswith("@")]
+    assert printed, done.stderr
+    return json.loads(printed[-1][1:])
 
 
 def test_the_life_of_a_run(tmp_path):

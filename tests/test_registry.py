@@ -183,7 +183,7 @@ def test_what_only_tasks_have(my_env):
 
 
 @pytest.mark.parametrize(
-    ("source", "told"),
+    ("source", "message"),
     [
         ("raise RuntimeError('no robot')", "import failed: RuntimeError: no robot (broken.py:1)"),
         ("raise SystemExit(0)", "import failed: SystemExit: 0 (broken.py:1)"),
@@ -195,12 +195,12 @@ def test_what_only_tasks_have(my_env):
         ("class E:\n    def __init__(self): 1 / 0", "ZeroDivisionError: division by zero (broken.py:2)"),
     ],
 )
-def test_a_plugin_that_raises(write_module, source, told):
+def test_a_plugin_that_raises(write_module, source, message):
     write_module("broken.py", source)
     for _ in range(2):  # a half-imported module is not kept
         with pytest.raises(TaskError) as caught:
             EnvSpec("broken.py:E").make()
-        assert str(caught.value) == f"task 'broken.py:E': {told}"
+        assert str(caught.value) == f"task 'broken.py:E': {message}"
         assert "Traceback" in caught.value.details
         assert caught.value.exit_code == 3
 

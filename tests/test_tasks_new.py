@@ -45,7 +45,7 @@ def plugin(tmp_path, monkeypatch):
     return new.create("my-arm")
 
 
-def test_what_is_written_and_said(rlctl, tmp_path):
+def test_what_is_written_and_printed(rlctl, tmp_path):
     result = rlctl("tasks", "new", "my-arm")
     assert (result.returncode, result.stderr) == (0, "")
     assert written(tmp_path / "my-arm") == FILES
@@ -148,7 +148,7 @@ def test_whole_or_not_at_all(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_somebody_else_wrote_meanwhile_stays(tmp_path):
+def test_what_another_process_wrote_meanwhile_stays(tmp_path):
     (tmp_path / "arm").mkdir()
     (tmp_path / "arm" / "theirs").write_text("precious")
     with pytest.raises(OSError):  # noqa: PT011
@@ -175,6 +175,6 @@ def test_from_the_wheel_to_a_policy(tmp_path):
     run("rlctl", "check-env", "my-arm", "--strict", cwd=empty, path=site)
     run("pytest", "-q", "-p", "no:cacheprovider", tmp_path / "my-arm", cwd=empty, path=site)
     for seed in range(3):
-        told = json.loads(run("rlctl", "train", "my-arm", "--seed", seed, "--json", "-", cwd=empty, path=site))
-        assert told["best"]["episodes"] == 100
-        assert told["best"]["success_rate"] >= 0.95
+        result = json.loads(run("rlctl", "train", "my-arm", "--seed", seed, "--json", "-", cwd=empty, path=site))
+        assert result["best"]["episodes"] == 100
+        assert result["best"]["success_rate"] >= 0.95

@@ -44,11 +44,11 @@ class FaultyOs:
     def _record_evaluation(self, name, first, *_):
         if name not in ("write", "fsync"):
             return
-        told = os.fstat(first)
-        if name == "fsync" and not self._hit(name) and told.st_ino in self._unsynced:
-            os.close(self._unsynced.pop(told.st_ino)[0])
-        if name == "write" and told.st_ino not in self._unsynced:
-            self._unsynced[told.st_ino] = (os.dup(first), told.st_size)
+        status = os.fstat(first)
+        if name == "fsync" and not self._hit(name) and status.st_ino in self._unsynced:
+            os.close(self._unsynced.pop(status.st_ino)[0])
+        if name == "write" and status.st_ino not in self._unsynced:
+            self._unsynced[status.st_ino] = (os.dup(first), status.st_size)
 
     def _operate(self, name, original, arguments, options):
         if not self._hit(name):

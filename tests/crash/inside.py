@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from rlctl.rollout.process_start import set_default_start
-from tests.crash import meddling
+from tests.crash import outside_changes
 from tests.crash.faulty_os import FaultyOs, FaultyShutil
 
 
@@ -28,8 +28,8 @@ def run(arguments, plan):
     _announce(saving.Saver, log)
     files.os = FaultyOs(log, **plan.get("disk", {}))
     files.shutil = FaultyShutil(files.os)
-    if "meddle" in plan:
-        meddling.begin(**plan["meddle"])
+    if "outside_change" in plan:
+        outside_changes.begin(**plan["outside_change"])
     if "signal" in plan:
         from tests.crash import phases
 

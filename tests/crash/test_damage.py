@@ -56,14 +56,14 @@ def test_damage_is_noticed_or_harmless(trials, whole, killed, folders, name, par
 
 def names_it(stderr: str, damage: Damage) -> bool:
     """Whether a warning or an error names a file that was damaged, or the folder of its checkpoint."""
-    told = "\n".join(re.findall(r"^(?:warning|error): .*$", stderr, re.MULTILINE))
-    if damage.files == ("run.json",) and "not a run of rlctl" in told:
+    printed = "\n".join(re.findall(r"^(?:warning|error): .*$", stderr, re.MULTILINE))
+    if damage.files == ("run.json",) and "not a run of rlctl" in printed:
         return True
-    return any(file in told for file in damage.files)
+    return any(file in printed for file in damage.files)
 
 
 def assert_as_told(run: RunDirectory, whole: RunDirectory, damage: Damage, noticed: bool) -> None:
-    """Hold that a resumed run ended as an undamaged one does, but for what it has told to be damaged."""
+    """Hold that a resumed run ended as an undamaged one does, but for what it has reported as damaged."""
     if not noticed or all(file.startswith("checkpoints/") for file in damage.files):
         assert_same_end(run, whole)
         return

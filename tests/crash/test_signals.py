@@ -110,6 +110,6 @@ def test_a_closed_terminal(tmp_path):
     _, status = os.waitpid(process, 0)
     assert os.waitstatus_to_exitcode(status) == CODES[signal.SIGHUP]
     assert end_orphans(process) == []
-    told = json.loads((only_run(tmp_path).status_file).read_text())
-    assert told["status"] == "interrupted"
-    assert "checkpoint saved" in told["error"]
+    content = json.loads((only_run(tmp_path).status_file).read_text())
+    assert content["status"] == "interrupted"
+    assert "checkpoint saved" in content["error"]

@@ -115,7 +115,7 @@ def test_stochastic_repeats_with_its_seed(reach_run):
 
 
 @pytest.mark.parametrize(
-    ("gates", "told"),
+    ("gates", "message"),
     [
         (Gates(min_success=1.1), r"success rate 0\.\d+ is below 1\.1"),
         (Gates(min_success_lower=1.1), r"lower bound 0\.\d+ of the success rate is below 1\.1"),
@@ -123,8 +123,8 @@ def test_stochastic_repeats_with_its_seed(reach_run):
         (Gates(min_success=1.1, min_return=1e9), "success rate .*; mean return"),
     ],
 )
-def test_gates(evaluation, gates, told):
-    with pytest.raises(AnswerIsNo, match=told):
+def test_gates(evaluation, gates, message):
+    with pytest.raises(AnswerIsNo, match=message):
         gates.check(evaluation)
 
 

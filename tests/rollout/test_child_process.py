@@ -75,7 +75,7 @@ def test_a_child_gets_its_arguments_and_its_lines_are_read(started):
     assert sorted(lines) == ["err", "out"]
 
 
-def test_it_is_said_how_a_child_ended(started):
+def test_how_a_child_ended_is_reported(started):
     child, *_ = started(exits=9)
     assert child.describe_end() == "ended with exit code 9"
     child, *_ = started()

@@ -28,7 +28,7 @@ PLACE = f"in environment 2, episode seed 7, step 3; to see it alone: rlctl check
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "message"),
     [
         ("raise", "RuntimeError: the gripper fell off"),
         ("nan observation", "ValueError: observation is not finite: element 0 is nan"),
@@ -39,11 +39,11 @@ PLACE = f"in environment 2, episode seed 7, step 3; to see it alone: rlctl check
         ("_exit", "worker 1 died while stepping (exit code 4)"),
     ],
 )
-def test_a_step_that_fails(spec, start, fault, told):
+def test_a_step_that_fails(spec, start, fault, message):
     workers = start(spec("Walk", fault=fault), 4, n_workers=2)
     with pytest.raises(TaskError) as caught:
         run_into_the_fault(workers)
-    assert str(caught.value) == f"task '{ENVS}:Walk': {told}\n{PLACE}"
+    assert str(caught.value) == f"task '{ENVS}:Walk': {message}\n{PLACE}"
     assert caught.value.exit_code == 3
 
 

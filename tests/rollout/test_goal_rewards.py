@@ -62,7 +62,7 @@ def test_rebuilt_environments_answer(spec, start, goals):
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "message"),
     [
         ("raise", "compute_reward raised RuntimeError: the goal has gone"),
         ("exit", "compute_reward raised SystemExit: done here"),
@@ -73,11 +73,11 @@ def test_rebuilt_environments_answer(spec, start, goals):
         ("_exit", "worker 0 died while in compute_reward (exit code 4)\nit ran the environments 0 to 1"),
     ],
 )
-def test_a_fault_names_compute_reward(spec, start, fault, told):
+def test_a_fault_names_compute_reward(spec, start, fault, message):
     workers = start(spec("Goals", fault=fault), 4, n_workers=2)
     with pytest.raises(TaskError) as caught:
         workers.compute_rewards(np.arange(7.0)[:, None] * np.ones(3), np.zeros((7, 3)))
-    assert str(caught.value) == f"task '{ENVS}:Goals': {told}"
+    assert str(caught.value) == f"task '{ENVS}:Goals': {message}"
     assert caught.value.exit_code == 3
 
 

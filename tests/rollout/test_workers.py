@@ -1,4 +1,4 @@
-"""Environments in worker processes: the same bits however they are spread, every kind of space, all output told."""
+"""Environments in worker processes: the same bits on any number of them, every kind of space, all output forwarded."""
 
 import os
 import subprocess
@@ -62,7 +62,7 @@ def test_reach_does_not_depend_on_the_number_of_environments(start):
         np.testing.assert_array_equal(a, b)
 
 
-def test_workers_live_as_this_process_does(spec, start):
+def test_workers_step_as_this_process_does(spec, start):
     workers = start(spec("Walk"), 2)
     env = spec("Walk").make()
     workers.reset({0: 3, 1: 4})
@@ -140,16 +140,16 @@ def test_every_kind_of_space(spec, start, kind):
     assert [result.length for result in ended] == [3, 3, 3]
 
 
-def test_what_environments_print_is_told_at_once(spec, start, capfd):
-    told = []
-    workers = start(spec("Walk", fault="print"), 1, on_output=told.append)
+def test_what_environments_print_is_forwarded_at_once(spec, start, capfd):
+    lines = []
+    workers = start(spec("Walk", fault="print"), 1, on_output=lines.append)
     workers.reset({0: 7})
     for _ in range(3):
         workers.step()
     deadline = time.monotonic() + 5
-    while len(told) < 2 and time.monotonic() < deadline:
+    while len(lines) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert sorted(told) == ["hello from its child", "hello from the environment"]
+    assert sorted(lines) == ["hello from its child", "hello from the environment"]
     assert capfd.readouterr() == ("", "")
 
 
@@ -174,11 +174,11 @@ def test_workers_import_no_learning_library(spec, start, tmp_path):
         "        print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
         "        return super().reset(**options)\n"
     )
-    told = []
-    workers = start(EnvSpec(f"{module}:Spy"), 1, on_output=told.append, start=subprocess.Popen)
+    lines = []
+    workers = start(EnvSpec(f"{module}:Spy"), 1, on_output=lines.append, start=subprocess.Popen)
     workers.reset({0: 0})
     workers.close()
-    loaded = set(told[0].split())
+    loaded = set(lines[0].split())
     assert "gymnasium" in loaded
     assert not loaded & {"torch", "stable_baselines3", "sb3_contrib", "rerun", "onnxruntime", "rich", "typer"}
 

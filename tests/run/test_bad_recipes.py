@@ -26,7 +26,7 @@ def refused(config, settings=()):
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "expected"),
     [
         ("n_envs: 1\nseed: 2\nn_envs: 3\n", ":3: key 'n_envs' is there twice"),
         ("n_envs:\t1\n", ":1: found character '\\t' that cannot start any token"),
@@ -66,11 +66,11 @@ def refused(config, settings=()):
         (b"task: {name: \xe9}\n", ": not UTF-8 text: invalid continuation byte at byte 13; save it as UTF-8"),
     ],
 )
-def test_a_file_that_is_no_recipe(content, told, tmp_path):
+def test_a_file_that_is_no_recipe(content, expected, tmp_path):
     file = tmp_path / "recipe.yaml"
     file.write_bytes(content if isinstance(content, bytes) else content.encode())
     message = refused(file)
-    place, found, _ = message.partition(told)
+    place, found, _ = message.partition(expected)
     assert found, message
     assert place.startswith(str(file))
     assert [each.name for each in tmp_path.iterdir()] == ["recipe.yaml"]
@@ -92,7 +92,7 @@ def test_what_looks_wrong_and_is_right(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("setting", "told"),
+    ("setting", "expected"),
     [
         ("n_envs=0", "n_envs: expected a whole number in [1, 10000], got 0"),
         ("n_envs=1e6", "n_envs: expected a whole number in [1, 10000], got 1000000.0"),
@@ -141,9 +141,9 @@ def test_what_looks_wrong_and_is_right(tmp_path):
         ("stage=[]", "no key 'stage'. Did you mean 'stages'? Keys here: "),
     ],
 )
-def test_values_that_cannot_be(setting, told):
+def test_values_that_cannot_be(setting, expected):
     message = refused(None, [setting])
-    assert message.startswith(f"command line: {told}")
+    assert message.startswith(f"command line: {expected}")
 
 
 def test_a_key_that_never_ends():
@@ -164,7 +164,7 @@ NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
 
 
 @pytest.mark.parametrize(
-    ("algo", "setting", "told"),
+    ("algo", "setting", "expected"),
     [
         ("ppo", "learning_rate=3", "expected a number in (0, 1] or lin_NUMBER, got 3"),
         ("ppo", "learning_rate=0", "expected a number in (0, 1] or lin_NUMBER, got 0"),
@@ -283,13 +283,13 @@ NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
         ("tqc", "n_quantiles=0", "expected a whole number in [1, 10000], got 0"),
     ],
 )
-def test_hyperparameters_that_make_no_sense(algo, setting, told):
+def test_hyperparameters_that_make_no_sense(algo, setting, expected):
     name = setting.partition("=")[0]
     of_the_network = name.startswith(("net_", "log_std", "activation", "features", "n_crit", "lstm", "n_quant"))
     section = "policy_kwargs" if of_the_network else "algo_kwargs"
     message = refused(None, [f"algo={algo}", f"{section}.{setting}"])
     assert message.startswith((f"command line: {section}.{name}", f"command line: no key '{section}.{name}"))
-    assert told in message
+    assert expected in message
 
 
 def not_built(task, root, settings):
@@ -304,7 +304,7 @@ def not_built(task, root, settings):
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         (["algo=sac", "algo_kwargs.buffer_size=1e12"], "algo_kwargs.buffer_size: 1000000000000 needs 40,000 GB of "),
         (["algo=sac", "algo_kwargs.batch_size=1e9", "algo_kwargs.learning_starts=9"], "algo_kwargs.batch_size: "),
@@ -314,12 +314,12 @@ def not_built(task, root, settings):
         (["policy_kwargs.squash_output=true"], "ppo cannot be used here: squash_output=True is only available when"),
     ],
 )
-def test_what_only_building_finds(settings, told, tmp_path):
-    assert not_built("Pendulum-v1", tmp_path / "runs", ["n_envs=2", *settings]).startswith(told)
+def test_what_only_building_finds(settings, message, tmp_path):
+    assert not_built("Pendulum-v1", tmp_path / "runs", ["n_envs=2", *settings]).startswith(message)
 
 
 @pytest.mark.parametrize(
-    ("setting", "told"),
+    ("setting", "message"),
     [
         ("task.tolerance='0.02'", "task.tolerance: expected a number, got '0.02'"),
         ("task.tolerance=true", "task.tolerance: expected a number, got True"),
@@ -328,8 +328,8 @@ def test_what_only_building_finds(settings, told, tmp_path):
         ("task.tollerance=1", "task.tollerance: Reach has no parameter 'tollerance'. Did you mean 'tolerance'?"),
     ],
 )
-def test_parameters_of_a_task(setting, told, tmp_path):
-    assert told in not_built("reach", tmp_path / "runs", ["n_envs=1", setting])
+def test_parameters_of_a_task(setting, message, tmp_path):
+    assert message in not_built("reach", tmp_path / "runs", ["n_envs=1", setting])
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_no_run_yet(root):
     assert ArtifactError("").exit_code == 5
 
 
-def test_a_word_that_stands_for_no_run(root, make_run, tmp_path):
+def test_a_word_that_names_no_run(root, make_run, tmp_path):
     make_run("reach", "2026-01-01_10-00-00_s0")
     assert error(ArtifactError, find_run, "raech", root) == (
         "no run 'raech': not a folder, and no task with a run. Did you mean 'reach'?"
@@ -174,8 +174,8 @@ def test_status(root, make_run):
 def test_a_second_writer_is_refused(root, make_run):
     run = make_run("reach", "2026-01-01_10-00-00_s0")
     lock = run.lock()
-    told = error(UsageError, run.lock)
-    assert told == f"{run.path}: another process is writing this run (pid {os.getpid()} on {os.uname().nodename})"
+    message = error(UsageError, run.lock)
+    assert message == f"{run.path}: another process is writing this run (pid {os.getpid()} on {os.uname().nodename})"
     lock.release()
     run.lock().release()
 

@@ -82,7 +82,7 @@ def test_a_task_is_described_with_its_names():
     env.close()
 
 
-def test_a_plain_environment_is_described_as_far_as_it_tells():
+def test_a_plain_environment_is_described_as_far_as_possible():
     info = describe(rlctl.make("Pendulum-v1"))
     assert info.observation_space["shape"] == [3]
     assert info.max_steps == 200
@@ -90,7 +90,7 @@ def test_a_plain_environment_is_described_as_far_as_it_tells():
     assert info.control_dt is None
 
 
-def test_differences_are_told_in_words():
+def test_differences_are_described():
     def info(observation, action):
         return EnvInfo(observation_space=space_to_json(observation), action_space=space_to_json(action))
 

@@ -157,7 +157,7 @@ def test_a_tree_is_removed(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-def test_a_sealed_file_tells_whether_it_was_changed(tmp_path):
+def test_changes_to_a_sealed_file_are_noticed(tmp_path):
     path = tmp_path / "recipe.yaml"
     files.write_sealed(path, "seed: 0\n")
     assert path.read_text().splitlines()[0] == "seed: 0"

@@ -65,7 +65,7 @@ def test_a_pickle_in_a_member(name, episode, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("members", "told"),
+    ("members", "message"),
     [
         ([("evil.pkl", b"")], "'evil.pkl' is not an array"),
         ([("../../x.npy", array_file(np.zeros(3)))], "'../../x.npy' leads out of it"),
@@ -79,12 +79,12 @@ def test_a_pickle_in_a_member(name, episode, tmp_path):
         ([(f"{n}.npy", array_file(np.zeros(0))) for n in range(1001)], "it has 1,001 members, at most 1,000 are read"),
     ],
 )
-def test_members_that_are_refused(members, told, tmp_path):
+def test_members_that_are_refused(members, message, tmp_path):
     path = tmp_path / "x.npz"
     archive(path, members)
     with pytest.raises(ArtifactError) as caught:
         files.read_npz(path)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert caught.value.exit_code == 5
     assert [each.name for each in tmp_path.iterdir()] == ["x.npz"]
 
@@ -134,7 +134,7 @@ def test_an_honest_archive_of_pictures(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"rewards": np.zeros(2)}, "reward terms are float64 of shape (3, 1), not float64 of shape (2, 1)"),
         ({"rewards": np.array(1.0)}, "rewards are float64 of shape (), not a row of float64"),
@@ -148,17 +148,17 @@ def test_an_honest_archive_of_pictures(tmp_path):
         ({"info": np.zeros((2, 2))}, "its description is damaged: "),
     ],
 )
-def test_an_episode_whose_parts_do_not_fit(changes, told, episode):
+def test_an_episode_whose_parts_do_not_fit(changes, message, episode):
     files.write_npz(episode, {**files.read_npz(episode), **changes})
     with pytest.raises(ArtifactError) as caught:
         load_episode(episode)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize("value", [None, -1, "x", [], {}, 10**30, 1e308])
 def test_any_value_at_any_place_of_an_episode(value, episode):
-    arrays, told = files.read_npz(episode), []
+    arrays, lines = files.read_npz(episode), []
     whole = json.loads(str(arrays["info"]))
     changed = [{**whole, key: value} for key in whole]
     changed += [{**whole, "spec": {**whole["spec"], key: value}} for key in whole["spec"]]
@@ -167,13 +167,13 @@ def test_any_value_at_any_place_of_an_episode(value, episode):
         try:
             load_episode(episode)
         except ArtifactError as error:
-            told.append(str(error))
-    assert told  # most values are refused, some are possible
-    assert all(len(each.splitlines()) == 1 for each in told)
+            lines.append(str(error))
+    assert lines  # most values are refused, some are possible
+    assert all(len(each.splitlines()) == 1 for each in lines)
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (b"[" * 100_000, "nested too deeply"),
         (b'{"a": ' * 200 + b"1" + b"}" * 200, "nested too deeply"),
@@ -184,13 +184,13 @@ def test_any_value_at_any_place_of_an_episode(value, episode):
         (b'{"a": "\x00"}', "Invalid control character"),
     ],
 )
-def test_json_that_is_none(content, told, tmp_path):
+def test_json_that_is_none(content, message, tmp_path):
     path = tmp_path / "run.json"
     path.write_bytes(content)
     with pytest.raises(ArtifactError) as caught:
         files.read_json(path)
     assert str(caught.value).startswith(f"{path}: damaged: ")
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize("content", ["null", "[]", '"task"', "{}", '{"task": null}', '{"task": ["reach"]}'])
@@ -218,10 +218,10 @@ def test_what_is_no_file(kind, suffix, tmp_path):
     make = {"pipe": os.mkfifo, "folder": os.mkdir, "device": lambda path: os.symlink("/dev/zero", path)}
     make.get(kind, lambda path: None)(path)
     readers = {".json": files.read_json, ".npz": load_episode}
-    told = {"folder": "a folder, not a file", "missing": "no such file"}.get(kind, "a pipe or a device, not a file")
+    message = {"folder": "a folder, not a file", "missing": "no such file"}.get(kind, "a pipe or a device, not a file")
     with pytest.raises(ArtifactError) as caught:
         readers.get(suffix, load_policy)(path)
-    assert str(caught.value) == f"{path}: {told}"
+    assert str(caught.value) == f"{path}: {message}"
 
 
 def test_a_policy_that_is_a_folder_is_not_called_missing(tmp_path):

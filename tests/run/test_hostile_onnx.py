@@ -103,7 +103,7 @@ def test_a_constant_of_a_terabyte(write):
 
 
 @pytest.mark.parametrize(
-    ("nodes", "told"),
+    ("nodes", "message"),
     [
         ([node("NoSuchOperator", "obs")], "damaged, or not an ONNX file that onnxruntime "),
         ([node("Tanh", "obs", domain="not.ours")], "damaged, or not an ONNX file that onnxruntime "),
@@ -113,8 +113,8 @@ def test_a_constant_of_a_terabyte(write):
         ([node("Log", "obs", to="x"), node("Mul", "x", "x")], "its graph does not fit its description: "),
     ],
 )
-def test_graphs_that_are_no_policy(nodes, told, write):
-    assert told in refused(write(nodes))
+def test_graphs_that_are_no_policy(nodes, message, write):
+    assert message in refused(write(nodes))
 
 
 def test_a_state_without_measure(write):
@@ -172,7 +172,7 @@ def test_any_cut_and_any_flipped_byte(write):
     path = write([node("Add", "obs", "w")], [constant("w", np.zeros(4, np.float32))])
     whole = path.read_bytes()
     rng = np.random.default_rng(0)
-    told = []
+    lines = []
     for _ in range(150):
         content = bytearray(whole[: rng.integers(len(whole))] if rng.random() < 0.3 else whole)
         for place in rng.integers(len(content), size=3) if content else ():
@@ -181,6 +181,6 @@ def test_any_cut_and_any_flipped_byte(write):
         try:
             OnnxPolicy.load(path)
         except ArtifactError as error:
-            told.append(str(error))
-    assert len(told) > 75
-    assert all(len(each.splitlines()) == 1 for each in told)
+            lines.append(str(error))
+    assert len(lines) > 75
+    assert all(len(each.splitlines()) == 1 for each in lines)

@@ -80,7 +80,7 @@ BOX_DATA = {"type": "Box", "low": "-1.0", "high": "1.0", "dtype": "float32"}
 
 
 @pytest.mark.parametrize(
-    ("kwargs", "told"),
+    ("kwargs", "message"),
     [
         ({"net_arch": [1_000_000, 1_000_000]}, LARGER),
         ({"net_arch": [100_000, 100_000]}, LARGER),
@@ -94,8 +94,8 @@ BOX_DATA = {"type": "Box", "low": "-1.0", "high": "1.0", "dtype": "float32"}
         ({"log_std_init": "x"}, "its tensors do not fit its description: "),
     ],
 )
-def test_a_network_of_another_size(kwargs, told, changed, described):
-    assert told in refused(changed({**described, "policy_kwargs": kwargs}))
+def test_a_network_of_another_size(kwargs, message, changed, described):
+    assert message in refused(changed({**described, "policy_kwargs": kwargs}))
 
 
 def test_critics_and_layers_without_number(changed, described):
@@ -106,7 +106,7 @@ def test_critics_and_layers_without_number(changed, described):
 
 
 @pytest.mark.parametrize(
-    ("space", "told"),
+    ("space", "message"),
     [
         ({**BOX_DATA, "shape": [10**12]}, "1,000,000,000,000 elements, at most 10,000,000 are supported"),
         ({**BOX_DATA, "shape": [10**6, 10**6]}, "1,000,000,000,000 elements, at most "),
@@ -130,13 +130,13 @@ def test_critics_and_layers_without_number(changed, described):
         (nested(400), "its rlctl metadata is damaged: nested too deeply"),
     ],
 )
-def test_a_space_that_cannot_be(space, told, changed, described):
+def test_a_space_that_cannot_be(space, message, changed, described):
     described["env"]["observation_space"] = space
-    assert told in refused(changed(described))
+    assert message in refused(changed(described))
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("[" * 100_000, "its rlctl metadata is damaged: nested too deeply"),
         ('{"format": ' + "9" * 10_000 + "}", "its rlctl metadata is damaged: Exceeds the limit"),
@@ -145,12 +145,12 @@ def test_a_space_that_cannot_be(space, told, changed, described):
         ('{"format": "x"}', "its rlctl metadata is damaged: format: Input should be a valid integer"),
     ],
 )
-def test_a_description_that_is_none(text, told, changed):
-    assert told in refused(changed(text))
+def test_a_description_that_is_none(text, message, changed):
+    assert message in refused(changed(text))
 
 
 @pytest.mark.parametrize(
-    ("tensors", "told"),
+    ("tensors", "message"),
     [
         ({"policy/log_std": np.full(2, np.nan, np.float32)}, "damaged: policy/log_std is not finite"),
         ({"normalize//var": np.full(5, np.inf)}, "damaged: normalize//var is not finite"),
@@ -161,14 +161,14 @@ def test_a_description_that_is_none(text, told, changed):
     ],
 )
 @pytest.mark.filterwarnings("ignore:invalid value encountered in sqrt")
-def test_tensors_that_cannot_be(tensors, told, changed):
-    assert told in refused(changed(**tensors))
+def test_tensors_that_cannot_be(tensors, message, changed):
+    assert message in refused(changed(**tensors))
 
 
 @pytest.mark.parametrize("value", [None, -1, "x", [], {}, 10**30])
 def test_any_value_at_any_place(value, changed, described):
     """Refused in a line, or of no consequence; whatever it is, no other exception."""
-    good, told = 0, []
+    good, lines = 0, []
     mutated = [{**described, key: value} for key in described]
     for part in ("env", "spec"):
         mutated += [{**described, part: {**described[part], key: value}} for key in described[part]]
@@ -178,8 +178,8 @@ def test_any_value_at_any_place(value, changed, described):
             load_policy(path)
             good += 1
         except RlctlError as error:
-            told.append((error.exit_code, len(str(error).splitlines())))
-    assert set(told) == {(5, 1)}
+            lines.append((error.exit_code, len(str(error).splitlines())))
+    assert set(lines) == {(5, 1)}
     assert good < len(described)
 
 

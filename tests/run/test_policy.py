@@ -117,7 +117,7 @@ def test_a_truncated_file(path, size):
     assert caught.value.exit_code == 5
 
 
-def test_a_file_of_somebody_else(path):
+def test_a_file_of_another_program(path):
     rewrite(path, {"format": "pt"})
     with pytest.raises(ArtifactError) as caught:
         rlctl.load_policy(path)
@@ -153,7 +153,7 @@ def test_a_missing_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"policy_kwargs": {"net_arch": [32]}}, "its tensors do not fit its description: Error"),
         ({"policy_kwargs": {"net_arch": "wide"}}, "its tensors do not fit its description: "),
@@ -163,12 +163,12 @@ def test_a_missing_file(tmp_path):
         ({"policy": "TransformerPolicy"}, "policy of an unknown kind 'TransformerPolicy' for ppo"),
     ],
 )
-def test_a_description_that_does_not_fit(path, changes, told):
+def test_a_description_that_does_not_fit(path, changes, message):
     info, _ = read_policy(path)
     rewrite(path, {"rlctl": info.model_copy(update=changes).model_dump_json()})
     with pytest.raises(ArtifactError) as caught:
         rlctl.load_policy(path)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ RULE = {"success": 0.8, "window": 100}
 
 
 @pytest.mark.parametrize(
-    ("stages", "told"),
+    ("stages", "message"),
     [
         (
             [{"task": {"tolerance": 0.2}}, {}],
@@ -56,10 +56,10 @@ RULE = {"success": 0.8, "window": 100}
         ),
     ],
 )
-def test_refused_stages_are_named(stages, told):
+def test_refused_stages_are_named(stages, message):
     with pytest.raises(RecipeError) as caught:
         validate({"stages": stages}, "recipe")
-    assert str(caught.value) == told
+    assert str(caught.value) == message
 
 
 def test_each_stage_changes_the_recipe_and_not_the_stage_before_it():

@@ -28,7 +28,7 @@ def test_mcnemar_by_hand():
     assert success_difference(candidate, baseline).verdict is Verdict.WORSE
 
 
-def test_equal_policies_cannot_be_told_apart():
+def test_equal_policies_do_not_differ_significantly():
     values = successes((True, 7), (False, 3))
     difference = success_difference(values, values)
     assert (difference.mean, difference.p, difference.needed) == (0.0, 1.0, None)

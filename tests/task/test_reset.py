@@ -11,7 +11,7 @@ from tests.task.tasks import Cubes, Pile, PileAnew
 SEEDS = range(10)
 
 
-def live(env, seed, actions):
+def play(env, seed, actions):
     """Observations and rewards of an episode, shape (T + 1, ...)."""
     rows = [np.append(env.reset(seed=seed)[0], 0.0)]
     for action in actions:
@@ -47,7 +47,7 @@ def test_reach_after_many_contacts():
         assert push_into_the_plane(dirty, seed) > 20
         fresh = TaskEnv(Reach())
         chosen = down if seed % 2 else actions
-        np.testing.assert_array_equal(live(dirty, seed, chosen), live(fresh, seed, chosen), err_msg=f"seed {seed}")
+        np.testing.assert_array_equal(play(dirty, seed, chosen), play(fresh, seed, chosen), err_msg=f"seed {seed}")
         fresh.close()
     dirty.close()
 
@@ -65,10 +65,10 @@ def test_a_pile_of_free_bodies(task):
     dirty = TaskEnv(task())
     steps = np.zeros((150, 1))
     for seed in range(6):
-        live(dirty, 1000 + seed, steps)
+        play(dirty, 1000 + seed, steps)
         assert contacts(dirty) >= 5
         fresh = TaskEnv(task())
-        np.testing.assert_array_equal(live(dirty, seed, steps), live(fresh, seed, steps), err_msg=f"seed {seed}")
+        np.testing.assert_array_equal(play(dirty, seed, steps), play(fresh, seed, steps), err_msg=f"seed {seed}")
         fresh.close()
     dirty.close()
 
@@ -96,7 +96,7 @@ def test_seeds_differ_and_the_next_episode_goes_on_from_them():
 def test_environments_side_by_side_are_as_alone():
     actions = np.random.default_rng(3).uniform(-1, 1, (60, 7))
     alone = TaskEnv(Reach())
-    expected = [live(alone, seed, actions) for seed in (1, 2)]
+    expected = [play(alone, seed, actions) for seed in (1, 2)]
     alone.close()
     envs = [TaskEnv(Reach()), TaskEnv(Reach())]
     rows = [[np.append(env.reset(seed=seed)[0], 0.0)] for seed, env in enumerate(envs, start=1)]
@@ -108,5 +108,5 @@ def test_environments_side_by_side_are_as_alone():
         np.testing.assert_array_equal(np.array(seen), known)
     envs[0].close()
     envs[0].close()  # again: nothing happens
-    np.testing.assert_array_equal(live(envs[1], 2, actions), expected[1])
+    np.testing.assert_array_equal(play(envs[1], 2, actions), expected[1])
     envs[1].close()

@@ -47,7 +47,7 @@ class ByName(Clock):
     observation_layout = "dict"
 
 
-def live(env, seed=0, steps=10):
+def play(env, seed=0, steps=10):
     """Observations, shape (steps + 1, ...), of an episode whose k-th action is k / 10."""
     rows = [env.reset(seed=seed)[0]]
     rows += [env.step(np.full(2, k / 10))[0] for k in range(1, steps + 1)]
@@ -56,7 +56,7 @@ def live(env, seed=0, steps=10):
 
 def test_nothing_is_noisy_or_late_unless_asked_for(make):
     env = make(Clock())
-    rows = live(env)
+    rows = play(env)
     assert rows[:, 0].tolist() == list(range(10, 21))
     assert (rows[:, 1:4] == 0).all()
     np.testing.assert_array_equal(env.task.got, np.float32([[k / 10] * 2 for k in range(1, 11)]))
@@ -67,7 +67,7 @@ def test_a_late_observation(make):
     assert env.reset(seed=0)[1] == {"events": {"late_time": {"steps": 2.0}}}
     # The first observation, until the third step sees what was two steps before.
     for _ in range(2):  # and no episode sees one before it
-        assert live(env)[:, 0].tolist() == [10, 10, 10, 11, 12, 13, 14, 15, 16, 17, 18]
+        assert play(env)[:, 0].tolist() == [10, 10, 10, 11, 12, 13, 14, 15, 16, 17, 18]
 
 
 def test_a_late_observation_in_a_dictionary(make):
@@ -84,7 +84,7 @@ def test_a_delay_of_all_observations(make):
         def observe(self):
             return {"time": self.seen, "angle": self.seen * 2}
 
-    rows = live(make(Both(), randomize=True))
+    rows = play(make(Both(), randomize=True))
     assert rows[:, 0].tolist() == [10, 10, 10, 10, 11, 12, 13, 14, 15, 16, 17]
     assert rows[:, 1].tolist() == [20, 20, 20, 20, 22, 24, 26, 28, 30, 32, 34]
 
@@ -92,7 +92,7 @@ def test_a_delay_of_all_observations(make):
 def test_a_late_action(make):
     env = make(Clock(), late_action={"steps": 2})
     for _ in range(2):
-        live(env)
+        play(env)
         # Two steps of 0, then the actions from the first on; the reward judges what the policy did.
         np.testing.assert_allclose(env.task.got, [[k / 10] * 2 for k in [0, 0, 1, 2, 3, 4, 5, 6, 7, 8]])
         env.reset()
@@ -130,7 +130,7 @@ def test_noise_is_as_large_as_was_drawn(make):
         drawn = env.reset(seed=seed)[1]["events"]["noisy_angle"]["std"]
         assert 0.1 <= drawn <= 0.2
     env.max_steps = 3000
-    rows = live(env, steps=3000)
+    rows = play(env, steps=3000)
     drawn = env.reset(seed=0)[1]["events"]["noisy_angle"]["std"]
     angles = rows[:, 1:4]
     # 9003 draws: the deviation is known to 1 / sqrt(2 * 9003) = 0.75 %, the mean to 1 / sqrt(9003) = 1 % of it
@@ -157,7 +157,7 @@ def test_noise_stays_inside_the_bounds_of_its_observation(make):
     class Bounded(Clock):
         observation_bounds = {"angle": (0.0, 0.05)}
 
-    angles = live(make(Bounded(), noisy_angle={}))[:, 1:4]
+    angles = play(make(Bounded(), noisy_angle={}))[:, 1:4]
     assert angles.min() == 0.0
     assert angles.max() == np.float32(0.05)
 
@@ -169,7 +169,7 @@ def test_signals_act_in_the_order_of_the_task(make):
             "delay": Event("observation", events.delay, of="time", steps=1),
         }
 
-    times = live(make(Chain(), randomize=True))[:, 0]
+    times = play(make(Chain(), randomize=True))[:, 0]
     # Noise first: the late value is the noisy one as it was, the first two are the same number.
     assert times[0] == times[1] != times[2]
 
@@ -178,7 +178,7 @@ def test_everything_comes_from_the_seed(make):
     env, other = make(Clock(), randomize=True), make(Clock(), randomize=True)
 
     def episode(env, seed):
-        rows = live(env, seed)
+        rows = play(env, seed)
         return rows, np.array(env.task.got)
 
     first = episode(env, 3)
@@ -240,7 +240,7 @@ def test_a_signal_of_the_authors_own(make):
         events = {"stuck": Event("observation", stuck, of="place", chance=1.0)}
 
     env = make(Stuck(start=0.5), stuck={})
-    assert live(env, steps=3)[:, 0].tolist() == [0.5] * 4
+    assert play(env, steps=3)[:, 0].tolist() == [0.5] * 4
 
 
 def test_a_signal_function_that_gives_none():

@@ -235,7 +235,7 @@ def handlers():
 
 
 # What is no reason to end a training.
-RUDE = {
+MISBEHAVIOUR = {
     "prints much": print_much,
     "prints rubbish": print_rubbish,
     "warns much": many_warnings,
@@ -249,16 +249,16 @@ RUDE = {
 }
 
 
-class Rude(Line):
-    """What `Line` is, with bad manners: all of them, or those of one name; its values come in odd types."""
+class Misbehaving(Line):
+    """The same as `Line`, which also misbehaves: in all ways, or in that of one name; its values come in odd types."""
 
-    def __init__(self, manners=None):
+    def __init__(self, misbehaviour=None):
         super().__init__()
-        self.manners = list(RUDE) if manners is None else [manners]
+        self.misbehaviour = list(MISBEHAVIOUR) if misbehaviour is None else [misbehaviour]
 
     def reset(self, *, seed=None, options=None):
-        while self.manners:
-            RUDE[self.manners.pop(0)]()
+        while self.misbehaviour:
+            MISBEHAVIOUR[self.misbehaviour.pop(0)]()
         return super().reset(seed=seed)
 
     def step(self, action):

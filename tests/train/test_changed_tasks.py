@@ -93,18 +93,18 @@ CHANGES = {
 @pytest.mark.parametrize("what", CHANGES)
 def test_another_task_is_refused_unless_forced(plugin, resume, capfd, what):
     folder, run = plugin
-    does, told = CHANGES[what]
-    told = told.format(folder=folder)
+    does, message = CHANGES[what]
+    message = message.format(folder=folder)
     does(folder)
     before = run.status_file.read_bytes()
     with pytest.raises(UsageError) as caught:
         resume(run)
     assert str(caught.value) == (
-        f"{run.path}: {told}. What was learnt may not fit any more; --force goes on all the same"
+        f"{run.path}: {message}. What was learnt may not fit any more; --force goes on all the same"
     )
     assert run.status_file.read_bytes() == before
     resume(run, force=True)
-    assert f"going on at step 64, not bit-exact: {told}" in capfd.readouterr().err.splitlines()
+    assert f"going on at step 64, not bit-exact: {message}" in capfd.readouterr().err.splitlines()
     assert run.status()["status"] == "finished"
     assert [row["steps"] for row in rows(run.metrics_file)] == ["32", "64", "96", "128"]
 
@@ -161,11 +161,11 @@ def test_an_environment_that_no_seed_reaches_begins_new_episodes(killed, resume,
     run = killed("Unseeded", settings)
     before, _ = checkpoint.read_newest(run)
     resume(run)
-    told = capfd.readouterr().err
+    printed = capfd.readouterr().err
     assert (
         "going on at step 64, not bit-exact: environment 0 did not come back to where it was with its seed and "
         "actions, so all begin their next episodes"
-    ) in told
+    ) in printed
     after, damage = checkpoint.read_newest(run)
     assert damage == []
     assert after.state.step == 128
@@ -180,7 +180,7 @@ def test_an_environment_that_no_seed_reaches_begins_new_episodes(killed, resume,
     resume(run, total_timesteps=160)  # and it can be gone on with
 
 
-def test_an_environment_that_fails_when_lived_again_begins_new_episodes(killed, resume, tmp_path, capfd, write_module):
+def test_an_environment_that_fails_in_the_replay_begins_new_episodes(killed, resume, tmp_path, capfd, write_module):
     file = write_module(
         "fragile.py",
         f"""
@@ -197,18 +197,18 @@ def test_an_environment_that_fails_when_lived_again_begins_new_episodes(killed, 
     run = killed("Fragile", envs=file)
     (tmp_path / "fragile").touch()
     resume(run)
-    told = capfd.readouterr().err
-    assert "RuntimeError: the gripper fell off in environment " in told
-    assert ", step 2, when it was replayed" in told
-    assert "did not come back to where it was with its seed and actions, so all begin their next episodes" in told
+    printed = capfd.readouterr().err
+    assert "RuntimeError: the gripper fell off in environment " in printed
+    assert ", step 2, when it was replayed" in printed
+    assert "did not come back to where it was with its seed and actions, so all begin their next episodes" in printed
     assert run.status()["status"] == "finished"
 
 
 @pytest.fixture
-def meddler(write_module):
+def intrusive(write_module):
     """A task whose import changes what it can."""
     return write_module(
-        "meddler.py",
+        "intrusive.py",
         f"""
         import os, signal, sys; sys.path.append({str(ENVS.parent)!r})
         import numpy as np
@@ -217,23 +217,23 @@ def meddler(write_module):
         os.umask(0o777)
         np.seterr(all="raise")
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        class Meddler(Line):
+        class Intrusive(Line):
             pass
         """,
     )
 
 
-def test_an_import_changes_nothing_of_ours(train, meddler):
+def test_an_import_changes_nothing_of_ours(train, intrusive):
     folder, errors = os.getcwd(), np.geterr()
     whole = train("Line", TINY).run
-    run = train("Meddler", TINY, envs=meddler).run
+    run = train("Intrusive", TINY, envs=intrusive).run
     assert os.getcwd() == folder
     assert np.geterr() == errors
     assert_same_run(whole, run)
     assert run.status_file.stat().st_mode & 0o777 == whole.status_file.stat().st_mode & 0o777
 
 
-def test_an_import_does_not_take_signals_from_a_training(train, meddler, monkeypatch):
+def test_an_import_does_not_take_signals_from_a_training(train, intrusive, monkeypatch):
     from rlctl.train.saving import Saver
 
     before = signal.getsignal(signal.SIGTERM)
@@ -247,7 +247,7 @@ def test_an_import_does_not_take_signals_from_a_training(train, meddler, monkeyp
 
     monkeypatch.setattr(Saver, "checkpoint", checkpoint)
     with pytest.raises(Interrupted, match="interrupted at step 64; checkpoint saved"):
-        train("Meddler", TINY, envs=meddler)
+        train("Intrusive", TINY, envs=intrusive)
     assert signal.getsignal(signal.SIGTERM) == before
 
 

@@ -86,7 +86,7 @@ def test_min_steps_are_steps_of_the_stage():
     assert stages.is_due(220)
 
 
-def test_success_that_is_never_reported_is_told_once():
+def test_missing_success_is_warned_of_once():
     stages = curriculum({"promote": {"success": 0.5, "window": 2}})
     assert stages.warning() is None
     stages.count(ended(None, None))
@@ -156,8 +156,8 @@ def test_eval_of_all_stages_is_a_table(staged, tmp_path, capsys):
 
 @pytest.mark.parametrize("stage", ["0", "3", "last"])
 def test_eval_of_a_stage_that_is_not_there(staged, stage):
-    told = f"--stage {stage}: this policy was trained in 2 stages; give a number from 1 to 2, or all"
-    with pytest.raises(UsageError, match=told):
+    message = f"--stage {stage}: this policy was trained in 2 stages; give a number from 1 to 2, or all"
+    with pytest.raises(UsageError, match=message):
         run_evaluation(EvalRequest(str(staged.run.path), stage=stage), Gates())
 
 
@@ -169,7 +169,7 @@ def test_without_stages_there_is_no_stage_anywhere(train, small_ppo):
         run_evaluations(EvalRequest(str(result.run.path), stage="all"), Gates())
 
 
-def test_promotion_by_return_told_in_plain_lines(train, small_ppo, capsys):
+def test_promotion_by_return_in_plain_lines(train, small_ppo, capsys):
     # An episode returns -10 * cost: -10 reaches -10, and -20 does not reach -15.
     stages = [
         {"task": {"cost": 1.0}, "promote": {"return": -10.0, "window": 4}},
@@ -248,7 +248,7 @@ def test_an_off_policy_algorithm_keeps_its_replay_buffer(train):
 
 
 @pytest.mark.parametrize(
-    ("second", "told"),
+    ("second", "message"),
     [
         (
             {"task": {"size": 2}},
@@ -259,8 +259,8 @@ def test_an_off_policy_algorithm_keeps_its_replay_buffer(train):
         ({"reward_weights": {"x": 1.0}}, r"^stage 2 of 2: reward_weights: .* is a plain Gymnasium environment"),
     ],
 )
-def test_a_stage_that_cannot_be_is_refused_before_training(train, small_ppo, tmp_path, second, told):
-    with pytest.raises(RecipeError, match=told):
+def test_a_stage_that_cannot_be_is_refused_before_training(train, small_ppo, tmp_path, second, message):
+    with pytest.raises(RecipeError, match=message):
         train("Staged", {**small_ppo, "stages": [{"promote": {"return": 0.0}}, second]})
     assert not list(tmp_path.glob("runs/*/*/run.json"))
 

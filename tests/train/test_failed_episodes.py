@@ -55,14 +55,14 @@ def test_the_command_that_the_error_names(rlctl, tmp_path):
     trained = rlctl(*arguments, *(part for each in settings for part in ("--set", each)))
     assert trained.returncode == 3, trained.stderr
     assert trained.stdout == ""
-    told = trained.stderr.splitlines()
+    printed = trained.stderr.splitlines()
     # The environment's own traceback comes first, and no line of it is rlctl's.
-    (begin,) = (number for number, line in enumerate(told) if line.startswith("Traceback"))
-    error = next(number for number, line in enumerate(told) if line.startswith("error: "))
-    assert not [line for line in told[begin:error] if "/rlctl/" in line]
-    was_due = told[-1].startswith("the checkpoint of step ")
-    assert len(told) - error == (3 if was_due else 2)
-    command = told[error + 1].partition(": rlctl ")[2].split()
+    (begin,) = (number for number, line in enumerate(printed) if line.startswith("Traceback"))
+    error = next(number for number, line in enumerate(printed) if line.startswith("error: "))
+    assert not [line for line in printed[begin:error] if "/rlctl/" in line]
+    was_due = printed[-1].startswith("the checkpoint of step ")
+    assert len(printed) - error == (3 if was_due else 2)
+    command = printed[error + 1].partition(": rlctl ")[2].split()
     replayed = rlctl(*command)
     assert replayed.returncode == 3
     assert "RuntimeError: the gripper fell off" in replayed.stderr

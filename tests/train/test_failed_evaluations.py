@@ -31,14 +31,14 @@ def only_run(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "message"),
     [
         ("raise", "RuntimeError: the gripper fell off"),
         pytest.param("out of memory", "worker 0 died while stepping (SIGKILL: ", marks=pytest.mark.slow),
         pytest.param("sleep", "no answer for 3 s while stepping", marks=pytest.mark.slow),
     ],
 )
-def test_training_goes_on(train, settings, tmp_path, capfd, fault, told):
+def test_training_goes_on(train, settings, tmp_path, capfd, fault, message):
     with pytest.raises(TaskError) as caught:
         train("FailsWhenEvaluated", settings(2, 3, fault=fault), envs=FAULTY, env_timeout_s=3.0)
     run = only_run(tmp_path)
@@ -46,7 +46,7 @@ def test_training_goes_on(train, settings, tmp_path, capfd, fault, told):
     assert first.startswith(
         f"{run.path}: the training is done, but 2 of its evaluations failed, the first at step 64: task "
     )
-    assert told in first
+    assert message in first
     assert place.startswith(f"in environment 0, episode seed {SEED}, step 7; ")
     assert caught.value.exit_code == 3
     assert run.status()["status"] == "finished"
@@ -63,7 +63,7 @@ def test_training_goes_on(train, settings, tmp_path, capfd, fault, told):
 
 
 @pytest.mark.slow
-def test_it_is_lived_again(train, settings, tmp_path):
+def test_it_can_be_replayed(train, settings, tmp_path):
     # Each life is counted: the first is the one evaluation, the second and third may be the replay's.
     with pytest.raises(TaskError):
         train("FailsWhenEvaluated", settings(1, 2, 3, total_timesteps=32), envs=FAULTY)

@@ -1,4 +1,4 @@
-"""Environments that go wrong in a training: what is told, what is left running, and that the run goes on after it."""
+"""Environments that go wrong in a training: what is reported, what is left running, and that the run can go on."""
 
 import errno
 import fcntl
@@ -58,9 +58,9 @@ def test_a_fault_is_named_and_the_run_goes_on_after_it(fail, resume, monkeypatch
     began = time.monotonic()
     error, run = fail(fault=fault, timeout_s=3.0 if fault in HANGS else 60.0)
     assert time.monotonic() - began < 60
-    told = ENDS.get(fault, "no answer for 3 s while stepping; if that may take so long, raise --env-timeout")
+    message = ENDS.get(fault, "no answer for 3 s while stepping; if that may take so long, raise --env-timeout")
     assert str(error).splitlines() == [
-        f"task '{ENVS}:Faulty': {told}",
+        f"task '{ENVS}:Faulty': {message}",
         f"{PLACE}to reproduce it: rlctl replay {run.episode_file(0)}",
         f"the checkpoint of step 64 stands; go on with: rlctl train --resume {run.path}",
     ]
@@ -101,22 +101,22 @@ def test_an_environment_that_cannot_be_built_leaves_no_run(train, tmp_path):
 
 
 @pytest.mark.usefixtures("no_child_left")
-def test_bad_manners_change_nothing(train, whole, capfd):
-    run = train("Rude", TINY, envs=ENVS).run
+def test_bad_behaviour_changes_nothing(train, whole, capfd):
+    run = train("Misbehaving", TINY, envs=ENVS).run
     assert_same_weights(whole, run)
     assert ["sleep", "300.0625"] not in [process.info["cmdline"] for process in psutil.process_iter(["cmdline"])]
-    told = capfd.readouterr().err
-    assert "more lines of what environments print are left out" in told
-    assert "warning: closing environment 0: RuntimeError: closed twice" in told
-    assert "\x1b" not in told
-    assert "Traceback" not in told
+    printed = capfd.readouterr().err
+    assert "more lines of what environments print are left out" in printed
+    assert "warning: closing environment 0: RuntimeError: closed twice" in printed
+    assert "\x1b" not in printed
+    assert "Traceback" not in printed
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("manners", faulty_envs.RUDE)
+@pytest.mark.parametrize("misbehaviour", faulty_envs.MISBEHAVIOUR)
 @pytest.mark.usefixtures("no_child_left")
-def test_one_of_the_bad_manners_alone(train, whole, manners):
-    assert_same_weights(whole, train("Rude", {**TINY, "task": {"manners": manners}}, envs=ENVS).run)
+def test_one_kind_of_bad_behaviour_alone(train, whole, misbehaviour):
+    assert_same_weights(whole, train("Misbehaving", {**TINY, "task": {"misbehaviour": misbehaviour}}, envs=ENVS).run)
 
 
 def assert_same_weights(one, other):
@@ -125,21 +125,21 @@ def assert_same_weights(one, other):
     assert different == []
 
 
-def test_observations_outside_their_space_are_counted_and_said(train, capfd):
+def test_observations_outside_their_space_are_counted_and_reported(train, capfd):
     run = train("Outside", {**TINY, "total_timesteps": 64}, envs=ENVS).run
-    told = capfd.readouterr().err.splitlines()
+    printed = capfd.readouterr().err.splitlines()
     assert (
         "warning: observation is outside its space: element 0 is 12.5, not -10 to 10; "
         "such observations are counted, and taken as they are"
-    ) in told
-    assert "warning: observation comes as float64, its space has float32: cast, and counted" in told
+    ) in printed
+    assert "warning: observation comes as float64, its space has float32: cast, and counted" in printed
     # Each of two environments took 32 steps, in four episodes that began with an observation each; three had a fifth.
     assert run.status()["observations_outside"] == 2 * 3
     assert run.status()["observations_cast"] == 2 * (32 + 4)
-    assert "warning: observations 6 outside their space and 72 of another dtype" in told
+    assert "warning: observations 6 outside their space and 72 of another dtype" in printed
 
 
-def test_a_file_system_without_locks_is_said(train, monkeypatch, capfd):
+def test_a_file_system_without_locks_is_warned_of(train, monkeypatch, capfd):
     def flock(*_):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 

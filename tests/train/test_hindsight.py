@@ -163,7 +163,7 @@ NEEDS = (
 
 
 @pytest.mark.parametrize(
-    ("env", "settings", "told"),
+    ("env", "settings", "message"),
     [
         (
             "Line",
@@ -186,10 +186,10 @@ NEEDS = (
         ),
     ],
 )
-def test_an_environment_that_does_not_fit_is_refused(build, env, settings, told):
+def test_an_environment_that_does_not_fit_is_refused(build, env, settings, message):
     with pytest.raises(RecipeError) as caught:
         build(env, **{"task": {}, **settings})
-    assert str(caught.value) == told
+    assert str(caught.value) == message
     assert caught.value.exit_code == 2
 
 
@@ -200,7 +200,7 @@ def test_it_is_refused_before_there_is_a_run(train, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         (
             {"reward_weights": {"away": -2.0}},
@@ -217,16 +217,16 @@ def test_it_is_refused_before_there_is_a_run(train, tmp_path):
         ),
     ],
 )
-def test_recipes_that_do_not_go_together_with_it(settings, told):
+def test_recipes_that_do_not_go_together_with_it(settings, message):
     recipe = recipes.validate({"algo": "sac", "her": {}, "n_envs": 4, **settings}, "test")
     with pytest.raises(RecipeError) as caught:
         replay_arguments(recipes.fill_defaults(recipe), recipe.her, goals(max_steps=50))
-    assert str(caught.value) == told
+    assert str(caught.value) == message
     assert caught.value.exit_code == 2
 
 
 @pytest.mark.parametrize(
-    ("task", "kwargs", "told"),
+    ("task", "kwargs", "message"),
     [
         # Learning begins after 20 of 40 steps of the first four episodes.
         (
@@ -250,11 +250,11 @@ def test_recipes_that_do_not_go_together_with_it(settings, told):
         ),
     ],
 )
-def test_learning_before_an_episode_is_over(build, task, kwargs, told):
+def test_learning_before_an_episode_is_over(build, task, kwargs, message):
     model = build(task, algo_kwargs={**FAST, **kwargs}, task={"steps": 10} if task == "Plane" else {})
     with pytest.raises(RecipeError) as caught:
         model.learn(256)
-    assert str(caught.value) == told
+    assert str(caught.value) == message
 
 
 def test_what_will_do_does(build):

@@ -1,4 +1,4 @@
-"""The check before training: errors refuse, warnings are told, everything else goes on."""
+"""The check before training: errors refuse, warnings are printed, everything else goes on."""
 
 import pytest
 
@@ -25,10 +25,10 @@ def test_without_the_check_it_trains(train, runs, small_ppo):
     assert len(runs()) == 1
 
 
-def test_warnings_are_told_and_training_goes_on(train, small_ppo, capsys):
+def test_warnings_are_printed_and_training_goes_on(train, small_ppo, capsys):
     assert train("FixedStart", small_ppo, check=True).steps == 256
-    told = capsys.readouterr().err
-    assert "check before training: warnings RL306" in told
+    printed = capsys.readouterr().err
+    assert "check before training: warnings RL306" in printed
 
 
 def test_an_environment_that_cannot_be_built_is_the_workers_matter(train, small_ppo):

@@ -55,7 +55,7 @@ def test_two_processes_that_begin_the_same_run_at_once(tmp_path):
     assert latest in [(tmp_path / each["run"]).resolve() for each in (one, other)]
 
 
-def test_a_run_that_somebody_else_writes(train, resume):
+def test_a_run_that_another_process_writes(train, resume):
     run = train("Line", TINY).run
     with (
         run.lock(),

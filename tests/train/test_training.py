@@ -161,7 +161,7 @@ def test_same_seed_gives_the_same_weights(train, small_ppo):
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "message"),
     [
         ("raise", "RuntimeError: the gripper fell off"),
         ("nan reward", "ValueError: reward is nan"),
@@ -169,9 +169,9 @@ def test_same_seed_gives_the_same_weights(train, small_ppo):
         ("shape", r"ValueError: observation has shape \(2,\), the space has \(1,\)"),
     ],
 )
-def test_a_fault_of_the_environment_is_named_with_episode_and_step(train, small_ppo, fault, told):
+def test_a_fault_of_the_environment_is_named_with_episode_and_step(train, small_ppo, fault, message):
     settings = {**small_ppo, "total_timesteps": 1000, "task": {"fault": fault, "episode": 8}}
-    with pytest.raises(TaskError, match=told) as caught:
+    with pytest.raises(TaskError, match=message) as caught:
         train("Faulty", settings)
     assert "episode seed " in str(caught.value)
     assert "step 7" in str(caught.value)
@@ -192,7 +192,7 @@ def test_a_worker_that_dies_ends_the_run(train, small_ppo):
         train("Faulty", {**small_ppo, "total_timesteps": 1000, "task": {"fault": "die"}})
 
 
-def test_divergence_is_told(train, small_ppo):
+def test_divergence_is_reported(train, small_ppo):
     settings = {**small_ppo, "total_timesteps": 2000, "normalize": {"observation": False, "reward": False}}
     settings["algo_kwargs"] = {**settings["algo_kwargs"], "learning_rate": 1.0, "max_grad_norm": 1e30}
     with pytest.raises(DivergedError, match=r"training diverged: .* not finite at step 64"):
@@ -200,7 +200,7 @@ def test_divergence_is_told(train, small_ppo):
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         ({"algo_kwargs": {"n_step": 16}}, "no key 'algo_kwargs.n_step' for ppo. Did you mean 'n_steps'?"),
         ({"algo": "sac", "algo_kwargs": {"n_epochs": 3}}, "no key 'algo_kwargs.n_epochs' for sac."),
@@ -212,12 +212,12 @@ def test_divergence_is_told(train, small_ppo):
         ({"reward_weights": {"speed": 1.0}}, "is a plain Gymnasium environment; only tasks have them"),
     ],
 )
-def test_recipe_errors_name_the_key(train, small_ppo, settings, told):
+def test_recipe_errors_name_the_key(train, small_ppo, settings, message):
     if settings.get("algo", "ppo") != "ppo":
         small_ppo.pop("algo_kwargs")
     with pytest.raises(RecipeError) as caught:
         train("Line", recipes.merge(small_ppo, settings))
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_task_and_resume_exclude_each_other():
@@ -243,8 +243,8 @@ def test_live_policy_and_saved_policy_act_the_same(finished):
 
 
 @pytest.mark.parametrize(
-    ("device", "told"), [("gpu", "--device 'gpu': no such device"), ("cuda:99", "--device cuda:99: ")]
+    ("device", "message"), [("gpu", "--device 'gpu': no such device"), ("cuda:99", "--device cuda:99: ")]
 )
-def test_a_device_that_is_not_there(train, small_ppo, device, told):
-    with pytest.raises(UsageError, match=told):
+def test_a_device_that_is_not_there(train, small_ppo, device, message):
+    with pytest.raises(UsageError, match=message):
         train("Line", small_ppo, device=device)

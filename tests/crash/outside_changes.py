@@ -26,7 +26,7 @@ def begin(what, after=0, until=None):
             _broken.clear()
         saved = original(saver, pack, progress, **options)
         if step == after:
-            MEDDLING[what](RunDirectory(saver.metrics.path.parent))
+            CHANGES[what](RunDirectory(saver.metrics.path.parent))
         return saved
 
     saving.Saver.checkpoint = checkpoint
@@ -72,7 +72,7 @@ class _Unwilling:
         raise OSError(_broken[0], os.strerror(_broken[0]))
 
 
-MEDDLING = {
+CHANGES = {
     "run removed": lambda run: shutil.rmtree(run.path),
     "all runs removed": lambda run: shutil.rmtree(run.path.parents[1]),
     "run.json removed": lambda run: run.status_file.unlink(),

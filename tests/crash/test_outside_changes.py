@@ -6,7 +6,7 @@ import pytest
 
 from rlctl.train import checkpoint
 from tests.crash.contract import assert_quiet, assert_same_end, assert_tidy
-from tests.crash.meddling import CLOCKS
+from tests.crash.outside_changes import CLOCKS
 from tests.crash.trials import ARGUMENTS, only_run, resume
 from tests.train.comparing import rows
 
@@ -15,11 +15,11 @@ AFTER = 48
 
 
 @pytest.fixture
-def meddle(trials, folders):
+def change(trials, folders):
     """Train while something happens after a step; return how it ended, its run, and the warnings."""
 
     def run(what, name=NAME, **plan):
-        ended = trials.run(ARGUMENTS[name], next(folders), meddle={"what": what, "after": AFTER, **plan})
+        ended = trials.run(ARGUMENTS[name], next(folders), outside_change={"what": what, "after": AFTER, **plan})
         assert_quiet(ended)
         assert ended.code == 0, ended.stderr
         warnings = [line for line in ended.stderr.splitlines() if line.startswith(("warning", "saved again"))]
@@ -44,8 +44,8 @@ def assert_same_learnt(run, whole):
 
 
 @pytest.mark.parametrize("what", ["run removed", "all runs removed"])
-def test_a_run_that_is_removed_is_there_again(trials, whole, meddle, what):
-    ended, run, warnings = meddle(what)
+def test_a_run_that_is_removed_is_there_again(trials, whole, change, what):
+    ended, run, warnings = change(what)
     assert warnings == [
         f"warning: {relative(run, ended)} was removed while training: made anew, without what was in it"
     ]
@@ -64,18 +64,18 @@ def relative(run, ended):
 
 
 def usable(trials, run, folder):
-    for arguments, told in (
+    for arguments, text in (
         (["eval", str(run.path), "--episodes", "2"], "success rate"),
         (["export", str(run.path), "--onnx"], "verified"),
         ([*resume(run), "-n", "96"], ": 96 steps in "),
     ):
         ended = trials.run(arguments, folder)
         assert ended.code == 0, ended.stderr
-        assert told in ended.stdout + ended.stderr
+        assert text in ended.stdout + ended.stderr
 
 
 @pytest.mark.parametrize(
-    ("what", "told"),
+    ("what", "message"),
     [
         ("run.json removed", "run.json was removed while training: written again"),
         ("lock removed", None),
@@ -85,11 +85,11 @@ def usable(trials, run, folder):
         ("event file removed", None),
     ],
 )
-def test_what_is_removed_is_written_again(whole, meddle, what, told):
-    _, run, warnings = meddle(what)
+def test_what_is_removed_is_written_again(whole, change, what, message):
+    _, run, warnings = change(what)
     assert_same_end(run, only_run(whole(NAME).folder))
     assert list(run.tensorboard.iterdir())
-    assert [warning.endswith(str(told)) for warning in warnings] == ([True] if told else [])
+    assert [warning.endswith(str(message)) for warning in warnings] == ([True] if message else [])
 
 
 @pytest.mark.parametrize(
@@ -100,8 +100,8 @@ def test_what_is_removed_is_written_again(whole, meddle, what, told):
         ("sac, kept", "segments removed", 32),
     ],
 )
-def test_the_next_checkpoint_is_whole(trials, whole, meddle, name, what, after):
-    ended, run, warnings = meddle(what, name, after=after)
+def test_the_next_checkpoint_is_whole(trials, whole, change, name, what, after):
+    ended, run, warnings = change(what, name, after=after)
     assert warnings == []
     assert_same_end(run, only_run(whole(name).folder))
     again = trials.run([*resume(run), "-n", "96"], ended.folder)
@@ -120,8 +120,8 @@ def test_the_next_checkpoint_is_whole(trials, whole, meddle, name, what, after):
         ("metrics sorted out", [64, 80]),
     ],
 )
-def test_a_table_that_is_meddled_with_has_whole_rows_from_then_on(whole, meddle, what, left):
-    _, run, warnings = meddle(what)
+def test_a_changed_table_has_whole_rows_from_then_on(whole, change, what, left):
+    _, run, warnings = change(what)
     before = only_run(whole(NAME).folder)
     assert warnings == []
     assert_same_learnt(run, before)
@@ -130,34 +130,34 @@ def test_a_table_that_is_meddled_with_has_whole_rows_from_then_on(whole, meddle,
     assert rows(run.evals_file) == rows(before.evals_file)
 
 
-def test_evaluations_table_removed(whole, meddle):
-    _, run, _ = meddle("evals removed")
+def test_evaluations_table_removed(whole, change):
+    _, run, _ = change("evals removed")
     before = only_run(whole(NAME).folder)
     assert rows(run.evals_file) == rows(before.evals_file)[1:]
     assert rows(run.metrics_file) == rows(before.metrics_file)
 
 
 @pytest.mark.parametrize(
-    ("what", "told"), [("read-only", "Read-only file system"), ("full", "No space left on device")]
+    ("what", "message"), [("read-only", "Read-only file system"), ("full", "No space left on device")]
 )
-def test_a_disk_that_takes_nothing_for_a_while(whole, meddle, what, told):
-    _, run, warnings = meddle(what, after=16, until=64)
+def test_a_disk_that_takes_nothing_for_a_while(whole, change, what, message):
+    _, run, warnings = change(what, after=16, until=64)
     assert warnings[0].startswith("warning: not saved: ")
-    assert warnings[0].endswith(f"{told}; training goes on")
+    assert warnings[0].endswith(f"{message}; training goes on")
     assert warnings[-1] == "saved again, at step 64"
     assert_same_end(run, only_run(whole(NAME).folder))
 
 
-def test_latest_is_not_ours_any_more(trials, whole, meddle):
-    ended, run, _ = meddle("latest replaced", after=16)
+def test_latest_is_not_ours_any_more(trials, whole, change):
+    ended, run, _ = change("latest replaced", after=16)
     assert_same_end(run, only_run(whole(NAME).folder))
     assert (ended.folder / "runs" / "latest" / "mine").exists()
     assert trials.run(["train", "--resume", "latest"], ended.folder).code == 0
 
 
 @pytest.mark.parametrize("what", CLOCKS)
-def test_a_clock_that_jumps_changes_nothing(whole, meddle, what):
-    _, run, warnings = meddle(what)
+def test_a_clock_that_jumps_changes_nothing(whole, change, what):
+    _, run, warnings = change(what)
     assert warnings == []
     assert_same_end(run, only_run(whole(NAME).folder))
 
@@ -166,7 +166,7 @@ def test_latest_after_the_clock_was_set_back(trials, folders):
     folder = next(folders)
     short = [*ARGUMENTS[NAME], "-n", "16"]
     first = trials.run(short, folder)
-    second = trials.run([*short, "--seed", "1"], folder, meddle={"what": "clock back"})
+    second = trials.run([*short, "--seed", "1"], folder, outside_change={"what": "clock back"})
     assert (first.code, second.code) == (0, 0)
     older, newer = sorted((folder / "runs" / "Line").iterdir(), reverse=True)
     assert (older.name[-2:], newer.name[-2:]) == ("s0", "s1")
