@@ -57,7 +57,7 @@ def create(name: str) -> NewPlugin:
         )
         for path, text in sources.items()
     }
-    _write(folder, content)
+    write_files(folder, content)
     return NewPlugin(name, folder, package, cls, list(content))
 
 
@@ -132,7 +132,7 @@ def _make_class_name(name: str, used: str) -> str:
     return f"{cls}Task" if keyword.iskeyword(cls) or re.search(rf"\b{cls}\b", used) else cls
 
 
-def _write(folder: Path, content: dict[Path, str]) -> None:
+def write_files(folder: Path, content: dict[Path, str]) -> None:
     beside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     try:
         for path, text in content.items():
