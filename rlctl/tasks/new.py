@@ -133,6 +133,7 @@ def _make_class_name(name: str, used: str) -> str:
 
 
 def write_files(folder: Path, content: dict[Path, str]) -> None:
+    """Write files into a new folder, all or none; raise `OSError` if the folder exists or one cannot be written."""
     beside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     try:
         for path, text in content.items():

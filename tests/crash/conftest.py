@@ -58,6 +58,8 @@ def pytest_terminal_summary(terminalreporter):
     tried, died = collections.Counter(), collections.Counter()
     for outcome in ("passed", "failed"):
         for report in terminalreporter.stats.get(outcome, ()):
+            if not report.nodeid.startswith("tests/crash/"):
+                continue
             kind = report.nodeid.rpartition("/")[2].partition("[")[0]
             trials = [name for name, _ in report.user_properties].count("trial")
             tried[kind] += trials or 1  # a test that has no folders is a trial
