@@ -257,12 +257,14 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
     """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing."""
     if text is None or text == "latest":
         # The link first: names go by a clock, which may have been set back since.
-        newest = _read_latest(root) or _find_newest(root)
+        newest = _read_latest(root) or _repair_latest(root)
         if newest is None:
             raise ArtifactError(f"no run yet under {root.resolve()}; train one: rlctl train reach")
         return newest
     if (Path(text) / "run.json").is_file():
         return RunDirectory(Path(text))
+    if Path(text).name == "latest" and _dangles(Path(text)):
+        return find_run("latest", Path(text).parent)
     folder = root / registry.make_slug(text)
     if (newest := _find_newest(folder, depth=1)) is not None:
         return newest
@@ -284,6 +286,18 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> tup
         return path, RunDirectory(owner) if (owner / "run.json").is_file() else None
     run = find_run(text, root)
     return run.policy_file(which), run
+
+
+def _repair_latest(root: Path) -> RunDirectory | None:
+    """Return the newest run, and point to it where the run that `latest` points to was removed."""
+    newest = _find_newest(root)
+    if newest is not None and _dangles(root / "latest"):
+        _point_latest_to(root, newest.path)
+    return newest
+
+
+def _dangles(link: Path) -> bool:
+    return link.is_symlink() and not link.exists()
 
 
 def _read_latest(root: Path) -> RunDirectory | None:

@@ -5,6 +5,7 @@ import fcntl
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 
@@ -80,6 +81,18 @@ def test_the_newest_run(root, make_run):
     assert find_run("reach", root).path == reach.path
     assert find_run(str(newest.path), root).path == newest.path
     assert find_run("some/where/ant.py:ant", root).path == newest.path
+
+
+@pytest.mark.parametrize("text", [None, "latest", "runs/latest"])
+def test_latest_points_to_the_newest_run_when_its_own_was_removed(root, make_run, text):
+    left = make_run("reach", "2026-01-01_10-00-00_s0")
+    removed = directory.create("ant", 0, root)
+    removed.write_status({"task": "ant"})
+    assert find_run(text, root).path.resolve() == removed.path
+    shutil.rmtree(removed.path)
+    assert not (root / "latest").exists()
+    assert find_run(text, root).path.resolve() == left.path
+    assert (root / "latest").resolve() == left.path
 
 
 def test_of_two_in_one_second_the_later(root, make_run):
