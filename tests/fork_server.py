@@ -150,7 +150,7 @@ class ForkServer:
                 "command": command,
                 "descriptors": [0, 1, 2, *pass_fds],
                 "env": dict(os.environ if env is None else env),
-                "cwd": str(cwd or os.getcwd()),
+                "cwd": os.path.abspath(cwd or "."),
                 "process_group": process_group,
                 "session": start_new_session,
                 "blocked": [int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, ())],
