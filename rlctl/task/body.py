@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -232,6 +233,15 @@ class Body(Motors):
         # PyBullet divides a substep's impulse by the time of the whole step.
         forces = np.array([point[9] for point in points]) * self._substeps
         return Contacts(names, forces, np.array([point[8] for point in points]))
+
+    def distance_to(self, other: Body, link: str | None = None) -> float:
+        """Return the shortest distance [m] between the collision shapes of two bodies, negative where they overlap.
+
+        With `link`, of that link of this body.
+        """
+        index = {} if link is None else {"linkIndexA": self._part_index(link)}
+        points = pybullet.getClosestPoints(self.id, other.id, 100.0, **index, physicsClientId=self.client)
+        return min((float(point[8]) for point in points), default=math.inf)
 
     def _contact_points(self) -> Any:
         points = self._cache.get("contacts")
