@@ -31,6 +31,8 @@ class Reach(Task):
     reward_weights = {"distance": -1.0, "reached": 1.0, "action": -0.05, "smoothness": -0.05}
     events = {  # what a real arm may differ by; acts with `randomize: true`
         "mass": Event("reset", events.scale_mass, body="arm", factor=(0.8, 1.2)),
+        "gravity": Event("reset", events.shift_gravity, change=(-0.5, 0.5)),  # [m/s^2]
+        "color": Event("reset", events.set_color, body="arm", red=(0, 1), green=(0, 1), blue=(0, 1)),
         "joint_damping": Event("reset", events.scale_joint_damping, body="arm", factor=(0.5, 1.5)),
         "motor_strength": Event("reset", events.scale_motor_strength, body="arm", factor=(0.8, 1.0)),
         "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.002)),  # [rad]
