@@ -1,0 +1,202 @@
+"""Biped: two hips and two knees learn to walk, on a rail (`biped`) and free (`biped-3d`)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rlctl.errors import TaskError
+from rlctl.task import Box, Event, Sim, Task, events, rewards
+from rlctl_locomotion.ground import add_ground
+
+MODELS = Path(__file__).parent / "models"
+JOINTS = ["left_hip", "left_knee", "right_hip", "right_knee"]
+FEET = ("left_foot", "right_foot")
+RAIL = ["rail_x", "rail_z", "pitch"]
+ANGLE = 0.5  # [rad], of a joint at action 1
+FORCE = [50.0] * 4  # [N m], of a motor
+GAIN = 0.2  # part of the position error that the motors take away in a physics step
+HEIGHT = 0.58  # [m], of the trunk's middle, standing with straight legs
+STANCE = np.array([0.25, 0.0, -0.25, 0.0])  # [rad], one leg before the other: with straight legs nothing could stand
+START_NOISE = 0.05  # [rad]
+FALLEN = 0.2  # [m], of the trunk's middle
+FORWARDS = np.array([1.0, 0.0, 0.0])
+HIGHEST_STEP = 0.1  # [m], a quarter of a leg
+
+
+@dataclass
+class Biped(Task):
+    """Walk forwards on a rail, in a vertical plane: at least `least_distance` in an episode, without a fall."""
+
+    least_distance: float = 5.0  # [m]; 0 asks only to stand
+    top_speed: float = 1.0  # [m/s], what is faster earns no more
+    roughness: float = 0.0  # [m], height of the steps in the ground
+    terrain_seed: int = 0
+    episode_s: float = 20.0  # [s], 1,000 steps
+
+    robot = "biped, four joints"
+    control_dt, substeps, solver_iterations = 0.02, 4, 20  # [s], -, -
+    action_space = Box(-1.0, 1.0, (4,), np.float32)
+    action_meaning = "joint angles of left hip, left knee, right hip, right knee; 1 is 0.5 rad forwards"
+    observation_units = {
+        "joint_positions": "rad",
+        "joint_velocities": "rad/s",
+        "height": "m",
+        "attitude": "rad",
+        "velocity": "m/s",
+        "angular_velocity": "rad/s",
+    }
+    # A step at 0.5 m/s earns 1.05 and one on the spot 0.05: with 0.2 and 0.7 all that was learned was to stand.
+    reward_weights = {
+        "progress": 1.0,
+        "forward_while_alive": 1.0,
+        "alive": 0.05,
+        "fall": -5.0,
+        "posture": -0.5,
+        "energy": -0.0005,
+        "smoothness": -0.2,
+    }
+    events = {  # with `randomize: true`, but for the push, which a recipe or a stage names
+        "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
+        "friction": Event("reset", events.set_friction, body="ground", friction=(0.3, 1.5)),
+        "gravity": Event("reset", events.shift_gravity, change=(-0.5, 0.5)),  # [m/s^2]
+        "joint_damping": Event("reset", events.scale_joint_damping, body="robot", joints=JOINTS, factor=(0.5, 1.5)),
+        "motor_strength": Event("reset", events.scale_motor_strength, body="robot", joints=JOINTS, factor=(0.8, 1.0)),
+        "color": Event("reset", events.set_color, body="robot", red=(0, 1), green=(0, 1), blue=(0, 1)),
+        "start": Event("start", events.offset_joints, body="robot", joints=JOINTS, velocity=(-0.5, 0.5)),  # [rad/s]
+        "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.01)),  # [rad]
+        "velocity_noise": Event("observation", events.noise, of="joint_velocities", std=(0.0, 0.2)),  # [rad/s]
+        "observation_delay": Event("observation", events.delay, steps=(0, 1)),  # of 20 ms
+        "action_noise": Event("action", events.noise, std=(0.0, 0.05)),
+        "action_delay": Event("action", events.delay, steps=(0, 1)),
+        "push": Event(
+            "interval", events.push, every_s=3.0, body="robot", link="trunk", force=(0.0, 20.0), duration_s=(0.1, 0.2)
+        ),
+    }
+
+    rlctl_ignore = {"RL611": "walking metres is what training is for; random actions fall in a second"}
+    ground_width = 2.4  # [m]
+
+    def load_robot(self, sim: Sim) -> None:
+        """Load the robot as body `robot`, where the ground is at height 0."""
+        self.body = sim.load("robot", MODELS / "biped_planar.urdf", fixed=True)
+        self.body.disable_motors(RAIL)
+
+    def place(self, height: float, joints: np.ndarray) -> None:
+        """Put the robot at the start, its trunk at `height` [m] and its joints, shape (4,), at angles [rad]."""
+        self.body.set_joints(np.concatenate([[0.0, height, 0.0], joints]))
+
+    def build(self, sim: Sim) -> None:
+        """Load the ground and the robot."""
+        if self.least_distance > self.top_speed * self.episode_s:
+            raise TaskError(
+                f"least_distance: {self.least_distance:g} m is out of reach: at top_speed {self.top_speed:g} m/s an "
+                f"episode of {self.episode_s:g} s is {self.top_speed * self.episode_s:g} m long."
+            )
+        self.ground = add_ground(
+            sim, roughness=self.roughness, seed=self.terrain_seed, highest_step=HIGHEST_STEP, width=self.ground_width
+        )
+        self.load_robot(sim)
+        self.body.set_friction(1.0)  # times the ground's
+        self.joints = self.body.find_joints(JOINTS)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Stand still, one leg before the other."""
+        joints = STANCE + rng.uniform(-START_NOISE, START_NOISE, 4)
+        # Both feet above the ground by up to 1 cm: a leg of 0.4 m at angle a, its knee bent by b, is so high.
+        reach = [0.2 * np.cos(hip) + 0.2 * np.cos(hip + knee) for hip, knee in joints.reshape(2, 2)]
+        self.place(HEIGHT - 0.4 + max(reach) + 0.002, joints)
+        self.last_action = self.action_change = np.zeros(4, np.float32)
+        self.update()
+        self.foot_contacts = np.zeros(2)  # what is known of contacts before a step is of the last episode
+
+    def update(self) -> None:
+        """Read what rewards and observations share, once per step."""
+        self.trunk = self.body.mass_state("trunk")
+        self.velocity = np.array(self.trunk.velocity)
+        touching = self.body.links_touching(self.ground)
+        self.foot_contacts = np.array([float(foot in touching) for foot in FEET])
+
+    def act(self, action: np.ndarray) -> None:
+        """Set the joints' target angles."""
+        self.body.drive_to(ANGLE * action.astype(np.float64), max_force=FORCE, gain=GAIN, joints=JOINTS)
+        self.action_change, self.last_action = action - self.last_action, action
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """Return the state of joints and trunk, in the plane, and which feet touch the ground."""
+        (vx, _, vz), (_, pitch_rate, _) = self.trunk.velocity, self.trunk.angular_velocity
+        return {
+            **self.observe_legs(),
+            "attitude": np.array([self.trunk.roll_pitch_yaw[1]]),  # [rad], pitch
+            "velocity": np.array([vx, vz]),
+            "angular_velocity": np.array([pitch_rate]),
+        }
+
+    def observe_legs(self) -> dict[str, np.ndarray]:
+        """Return joints, height, contacts and the last action, which smoothness is judged by."""
+        return {
+            "joint_positions": self.body.joint_positions[self.joints],
+            "joint_velocities": self.body.joint_velocities[self.joints],
+            "height": np.array([self.trunk.position[2]]),
+            "foot_contacts": self.foot_contacts,
+            "last_action": self.last_action,
+        }
+
+    def rewards(self, action: np.ndarray) -> dict[str, float]:
+        """Return how fast and how well it walks; `fall` is 1 in the step that ends an episode."""
+        fallen = self.is_fallen()
+        speed = min(rewards.forward_velocity(self.velocity, FORWARDS), self.top_speed)
+        return {
+            "progress": speed,
+            "forward_while_alive": 0.0 if fallen else speed,
+            "alive": rewards.alive(fallen),
+            "fall": float(fallen),
+            "posture": rewards.posture(np.array(self.trunk.orientation)),
+            "energy": rewards.power(self.body.joint_torques[self.joints], self.body.joint_velocities[self.joints]),
+            "smoothness": rewards.squared(self.action_change),
+        }
+
+    def is_terminated(self) -> bool:
+        """The trunk is below 0.2 m."""
+        self.update()
+        return self.is_fallen()
+
+    def is_fallen(self) -> bool:
+        """Say whether the trunk is down."""
+        return rewards.fallen(self.trunk.position[2], FALLEN) > 0
+
+    def is_success(self) -> bool:
+        """It has walked far enough, or was only asked to stand, and is up."""
+        return not self.is_fallen() and (self.least_distance == 0 or self.trunk.position[0] >= self.least_distance)
+
+
+@dataclass
+class Biped3D(Biped):
+    """Walk forwards without a rail: nothing but wide feet keeps the robot from falling sideways or turning."""
+
+    robot = "biped, four joints, free"
+    reward_weights = {**Biped.reward_weights, "heading": -0.2}
+    ground_width = 12.0  # [m]
+
+    def load_robot(self, sim: Sim) -> None:
+        """Load the free robot."""
+        self.body = sim.load("robot", MODELS / "biped_3d.urdf", position=(0, 0, HEIGHT))
+        self.body.cap_joint_speed(20.0)  # [rad/s, m/s]; a motor's limit is 12, a fall's end 3
+
+    def place(self, height: float, joints: np.ndarray) -> None:
+        """Put the robot at the start."""
+        self.body.set_base((0.0, 0.0, height))
+        self.body.set_joints(joints)
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """Return the state of joints and trunk, and which feet touch the ground."""
+        return {
+            **self.observe_legs(),
+            "attitude": np.array(self.trunk.roll_pitch_yaw),  # [rad], roll, pitch and yaw
+            "velocity": self.velocity,
+            "angular_velocity": np.array(self.trunk.angular_velocity),
+        }
+
+    def rewards(self, action: np.ndarray) -> dict[str, float]:
+        """Return what the biped on a rail gets, and how far the robot has turned [rad^2]."""
+        return {**super().rewards(action), "heading": self.trunk.roll_pitch_yaw[2] ** 2}
