@@ -28,9 +28,11 @@ def test_the_wheel_trains_reach_from_an_empty_folder(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     tasks = json.loads(call(scripts / "rlctl", "tasks", "--check", "--json", "-", cwd=empty))["tasks"]
-    assert [(task["name"], task["algo"], task["problem"]) for task in tasks] == [
-        (name, "ppo", None) for name in ("ant", "half-cheetah", "hopper", "humanoid", "reach", "walker2d")
-    ]
+    assert {(task["name"], task["algo"], task["problem"]) for task in tasks} == {
+        *((name, "ppo", None) for name in ("ant", "half-cheetah", "hopper", "humanoid", "reach", "walker2d")),
+        *((name, "ppo", None) for name in ("biped", "biped-3d", "quadruped", "kuka-grasp", "gear-arm")),
+        ("reach-sparse", "sac", None),
+    }
     for task in tasks:  # with its models
         call(scripts / "rlctl", "check-env", task["name"], "--select", "RL001,RL002,RL301", cwd=empty)
     result = json.loads(call(scripts / "rlctl", "train", "reach", "-n", "8000", "--json", "-", cwd=empty))
