@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from typing import Any
 
 from rlctl.check_env.bullet_clients import connected
 from rlctl.check_env.instance import Instance
 from rlctl.check_env.messages import Built
+from rlctl.check_env.own_code import find_author, is_task
 
 WAIVERS = "rlctl_ignore"
 """The class attribute that waives rules: rule id -> reason."""
@@ -19,17 +19,15 @@ def describe_built(instance: Instance) -> Built:
     env = instance.env
     inner = getattr(env, "unwrapped", env)
     spec = getattr(env, "spec", None)
-    task_env = sys.modules.get("rlctl.task.env")
-    is_task = task_env is not None and isinstance(inner, task_env.TaskEnv)
-    author = type(inner.task) if is_task else type(inner)
+    author = type(find_author(env))
     file, line = _place(author)
     return Built(
         leaves=instance.leaves,
         action_leaves=instance.action_leaves,
         observation_space=_short(getattr(env, "observation_space", None)),
         action_space=_short(env.action_space),
-        names=dict(inner.observation_sizes) if is_task else {},
-        max_steps=inner.max_steps if is_task else getattr(spec, "max_episode_steps", None),
+        names=dict(inner.observation_sizes) if is_task(env) else {},
+        max_steps=inner.max_steps if is_task(env) else getattr(spec, "max_episode_steps", None),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         accepts_seed=instance.accepts_seed,
         is_env=instance.is_env,

@@ -1,4 +1,4 @@
-"""Reads an environment's functions for calls of PyBullet that leave physicsClientId out."""
+"""RL808: calls of PyBullet that leave physicsClientId out, in an environment's functions."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
 
+from rlctl.check_env.finding import Finding, Severity, list_names
+from rlctl.check_env.own_code import find_author
+
 LIBRARIES = ("gymnasium", "numpy", "torch", "pybullet", "pybullet_utils", "rlctl", "builtins", "stable_baselines3")
 """Packages that are not part of an environment; rlctl's own tasks are in packages of their own."""
 NO_CLIENT = re.compile(
@@ -30,12 +33,12 @@ FIRST_IS_CLIENT = {
 """Functions whose only positional argument is the client."""
 CLIENT_WORDS = re.compile(r"client|\bcid\b|_cid\b|server", re.IGNORECASE)
 """Names of a client that is passed by position."""
-MOST_CALLS = 20
+MOST_CALLS, SHOWN = 20, 4
 LONGEST_S = 2.0
 """Recording costs a fraction of a microsecond per call; after this time it stops [s]."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, order=True)
 class BulletCall:
     """A call of a function of PyBullet in the source."""
 
@@ -43,33 +46,59 @@ class BulletCall:
     line: int
     name: str
 
-
-Functions = dict[CodeType, Mapping[str, Any]]
-"""The code of functions, and the names of the module that each is in."""
+    @property
+    def place(self) -> str:
+        """`file.py:12`."""
+        return f"{Path(self.file).name}:{self.line}"
 
 
 @contextlib.contextmanager
-def record_functions() -> Iterator[Functions]:
-    """Record the Python functions that run inside the `with` block, for `LONGEST_S` at most."""
-    ran: Functions = {}
+def record_calls() -> Iterator[dict[BulletCall, bool]]:
+    """Find the calls without a client in the functions that run inside the `with` block, and whether each ran."""
+    calls: dict[BulletCall, bool] = {}
+    by_line: dict[CodeType, dict[int, list[BulletCall]]] = {}
     before, end = sys.gettrace(), time.monotonic() + LONGEST_S
 
-    def note(frame: FrameType, event: str, argument: Any) -> None:
-        ran[frame.f_code] = frame.f_globals
+    def enter(frame: FrameType, event: str, argument: Any) -> Any:
+        code = frame.f_code
+        if code not in by_line:
+            lines = by_line.setdefault(code, {})
+            for call in calls_without_client(code, frame.f_globals):
+                calls.setdefault(call, False)
+                lines.setdefault(call.line, []).append(call)
         if time.monotonic() > end:
             sys.settrace(before)
+        return run_line if by_line[code] else None
 
-    sys.settrace(note)
+    def run_line(frame: FrameType, event: str, argument: Any) -> Any:
+        calls.update(dict.fromkeys(by_line[frame.f_code].get(frame.f_lineno, ()), True))
+        return run_line
+
+    sys.settrace(enter)
     try:
-        yield ran
+        yield calls
     finally:
         sys.settrace(before)
 
 
-def methods_of(env: Any) -> Iterator[tuple[CodeType, Mapping[str, Any]]]:
+def find_left_out(env: Any, recorded: Mapping[BulletCall, bool]) -> Iterator[Finding]:
+    """Yield what `record_calls` recorded: the calls that ran; if none did, those and the ones in other methods."""
+    calls, where, severity = sorted(call for call, has_run in recorded.items() if has_run), "", Severity.ERROR
+    if not calls:
+        others = {call for code, names in _methods(env) for call in calls_without_client(code, names)}
+        calls, where, severity = sorted({*recorded, *others}), ", where it did not run", Severity.WARNING
+    if calls:
+        count = f"{len(calls)} calls" if len(calls) > 1 else "a call"
+        shown = list_names([f"{each.place} {each.name}" for each in calls], SHOWN)
+        evidence = {"file": calls[0].file, "line": calls[0].line, "places": [each.place for each in calls[:MOST_CALLS]]}
+        names = sorted({each.name for each in calls})
+        message = f"{count} of PyBullet without physicsClientId{where}: {shown}"
+        yield Finding("RL808", message, {**evidence, "functions": names}, severity)
+
+
+def _methods(env: Any) -> Iterator[tuple[CodeType, Mapping[str, Any]]]:
     """Yield the methods of the environment (or its task) and of the objects of the same package that it holds."""
-    inner = getattr(env, "unwrapped", env)
-    author = getattr(inner, "task", inner) if _package(type(inner).__module__) == "rlctl" else inner
+    author = find_author(env)
     package = _package(type(author).__module__)
     held = [each for each in getattr(author, "__dict__", {}).values() if _package(type(each).__module__) == package]
     for kind in dict.fromkeys(type(each) for each in (author, *held)):
@@ -81,16 +110,10 @@ def _package(module: str) -> str:
     return module.partition(".")[0]
 
 
-def calls_in(functions: Functions) -> list[BulletCall]:
-    """Return the calls of PyBullet without a client in some functions, those of libraries left out."""
-    own = [each for each in functions.items() if _package(each[1].get("__name__", "")) not in LIBRARIES]
-    calls = {call for code, names in own for call in calls_without_client(code, names)}
-    return sorted(calls, key=lambda each: (each.file, each.line))[:MOST_CALLS]
-
-
 def calls_without_client(code: CodeType, names: Mapping[str, Any]) -> Iterator[BulletCall]:
     """Yield the calls of PyBullet in a function that pass no client; `names` are those of its module."""
-    function = _functions(code.co_filename).get(code.co_firstlineno)
+    is_library = _package(names.get("__name__", "")) in LIBRARIES
+    function = None if is_library else _functions(code.co_filename).get(code.co_firstlineno)
     if function is None:
         return
     nodes = list(_own_nodes(function))

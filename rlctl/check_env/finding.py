@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +91,11 @@ class Finding:
     def name(self) -> str:
         """The rule's name."""
         return RULES[self.rule].name
+
+
+def list_names(names: Sequence[str], most: int) -> str:
+    """Return some names, and how many more there are: `hip, knee and 3 more`."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 class NotJudged(Exception):

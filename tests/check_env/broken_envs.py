@@ -135,6 +135,13 @@ class OftenOutOfRange(Clean):
         return self.position + np.float32(7.0 * (self.steps % 5 == 3))
 
 
+class LastOutOfRange(Clean):
+    """Outside only when an episode has just ended."""
+
+    def observe(self):
+        return self.position + np.float32(7.0 * (self.steps == LIMIT))
+
+
 class Rounding(Clean):
     def observe(self):
         rounded = np.nextafter(np.float32(self.size), np.float32(np.inf))

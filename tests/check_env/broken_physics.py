@@ -218,7 +218,11 @@ class OverridesForgetful(ForgetsClient):
 
 
 class MayForgetClient(Cart):
-    """Forgets the client in a method that nothing calls."""
+    """Forgets the client in a branch that is not taken, and in a method that nothing calls."""
+
+    def vary(self):
+        if self.fixed:
+            p.getNumBodies()
 
     def count(self):
         return p.getNumBodies()

@@ -50,6 +50,15 @@ class FloatTable(TwoAxes):
     dtype, high = np.float32, 1
 
 
+class Tiles(Seen):
+    """A board of 9 x 9 tiles: too small for a picture."""
+
+    shape = (9, 9)
+
+    def observe(self):
+        return np.full((9, 9), int(100 + 10 * self.position[0]), np.uint8)
+
+
 class Dark(Seen):
     def observe(self):
         return super().observe() // 255

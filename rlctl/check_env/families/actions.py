@@ -27,7 +27,7 @@ from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
 from rlctl.check_env.leaves import Leaf
 from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message
 
@@ -131,17 +131,20 @@ def _saturates(trials: Trials, dimension: Dimension, copies: NDArray[np.intp]) -
 def _without_effect(effects: Sequence[_Effect], total: int, left_out: str) -> Iterator[Finding]:
     dead, costly, copied = ([each.name for each in effects if each.kind == kind] for kind in ("none", "cost", "copy"))
     if dead:
-        what = "no action has any effect" if len(dead) == total else f"{_list(dead)} without any effect"
+        what = (
+            "no action has any effect" if len(dead) == total else f"{list_names(dead, MOST_NAMES)} without any effect"
+        )
         how = f"at its lowest and highest value, over {STAGES[-1][1]} steps from two seeds"
         message = f"{what}: {how}, no observation, reward or end changes{left_out}"
         yield _finding("RL701", dead, message, Severity.ERROR if len(dead) == total else Severity.WARNING)
     if costly:
-        message = f"{_list(costly)} changes nothing but its own step's reward, a cost for doing nothing{left_out}"
+        names = list_names(costly, MOST_NAMES)
+        message = f"{names} changes nothing but its own step's reward, a cost for doing nothing{left_out}"
         # If no action moves anything, it is a bandit, or a series that is only watched.
         acts = any(each.kind == "lasting" for each in effects)
         yield _finding("RL701", costly, message, Severity.WARNING if acts else Severity.INFO)
     if copied:
-        message = f"{_list(copied)} changes nothing but its own copy in the observation{left_out}"
+        message = f"{list_names(copied, MOST_NAMES)} changes nothing but its own copy in the observation{left_out}"
         yield _finding("RL701", copied, message, Severity.INFO)
 
 
@@ -151,13 +154,8 @@ def _saturated(effects: Sequence[_Effect], left_out: str) -> Iterator[Finding]:
         ("switch", SWITCH, ": a switch", Severity.INFO),
     ):
         if names := [each.name for each in effects if each.saturates == kind]:
-            message = f"{_list(names)}: from {part} of its range on, nothing changes{what}{left_out}"
+            message = f"{list_names(names, MOST_NAMES)}: from {part} of its range on, nothing changes{what}{left_out}"
             yield _finding("RL702", names, message, severity)
-
-
-def _list(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-    return ", ".join(names[:MOST_NAMES]) + more
 
 
 def _finding(rule: str, names: list[str], message: str, severity: Severity) -> Finding:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.experiment import check
-from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.finding import Finding, NotJudged, Severity, list_names
 from rlctl.check_env.leaves import Leaf
 from rlctl.check_env.messages import Built
 from rlctl.check_env.records import Records
@@ -79,7 +79,7 @@ def find_constant_elements(records: Records) -> Iterator[Finding]:
     if names:
         yield Finding(
             "RL110",
-            f"{len(names)} of {total} elements of the observation never changed: {_list(names)}",
+            f"{len(names)} of {total} elements of the observation never changed: {list_names(names, MOST_NAMED)}",
             {"value": len(names), "expected": 0, "elements": [each.partition(" (")[0] for each in names[:MOST_NAMED]]},
             Severity.WARNING if has_constant_leaf else Severity.INFO,
         )
@@ -94,11 +94,6 @@ def _constant(rows: Numbers, leaf: Leaf) -> NDArray[np.intp]:
     return np.flatnonzero(still & (low < high))
 
 
-def _list(texts: Sequence[str]) -> str:
-    more = f" and {len(texts) - MOST_NAMED} more" if len(texts) > MOST_NAMED else ""
-    return ", ".join(texts[:MOST_NAMED]) + more
-
-
 @check("RL111", *WITH_SEARCH)
 def find_copies(records: Records) -> Iterator[Finding]:
     built = records.require_built()
@@ -106,7 +101,9 @@ def find_copies(records: Records) -> Iterator[Finding]:
         if copies := copies_in(rows, float(np.finfo(leaf.dtype).eps)):
             texts = [_equation(built, index, each) for each in copies]
             elements = [built.element(index, each[0]) for each in copies[:MOST_NAMED]]
-            yield Finding("RL111", _list(texts), {"value": len(copies), "expected": 0, "elements": elements})
+            yield Finding(
+                "RL111", list_names(texts, MOST_NAMED), {"value": len(copies), "expected": 0, "elements": elements}
+            )
 
 
 def _equation(built: Built, index: int, copy: Copy) -> str:

@@ -16,8 +16,9 @@ from rlctl.check_env.records import Records
 
 ROUNDING = 1e-6
 """Excess over a bound, relative to the bound, up to which it is float rounding."""
-LARGE_SHARE = 0.1
-"""Part of all observations from which values outside the bounds are no rare extreme."""
+LARGE_SHARE, SMALL_SHARE = 0.1, 0.005
+"""Part of all observations from which values outside the bounds are no rare extreme, or below which they hardly matter.
+The last one of an episode does not count: a limit that ends it has just been passed."""
 
 
 def _forms(records: Records) -> Iterator[tuple[Leaf, list[tuple[Trajectory, Form]]]]:
@@ -105,19 +106,23 @@ def find_out_of_range(records: Records) -> Iterator[Finding]:
         if not leaf.supported:
             continue
         worst: tuple[float, Trajectory, Series, int, int] | None = None
-        outside = total = 0
+        outside = inner = total = 0
         from_reset = False
         for trajectory, series in _series(records, index):
             excess = _excess(leaf, series.values).reshape(len(series.values), -1)
             rows = excess.max(axis=1, initial=0.0)
+            is_last = (series.steps == trajectory.steps) & trajectory.has_ended
             outside, total = outside + int((rows > 0).sum()), total + len(rows)
+            inner += int((rows[~is_last] > 0).sum())
             from_reset |= bool((rows[series.steps == 0] > 0).any())
             if rows.size and rows.max() > (worst[0] if worst else 0.0):
                 row = int(rows.argmax())
                 worst = float(rows[row]), trajectory, series, row, int(excess[row].argmax())
         if worst is not None:
-            is_often = from_reset or outside >= LARGE_SHARE * total
-            yield _out_of_range(records, index, *worst[1:], outside=(outside, total), is_often=is_often)
+            is_large = from_reset or inner >= LARGE_SHARE * total
+            rare = Severity.WARNING if inner >= SMALL_SHARE * total else Severity.INFO
+            severity = Severity.ERROR if is_large else rare
+            yield _out_of_range(records, index, *worst[1:], outside=(outside, total), severity=severity)
 
 
 def _excess(leaf: Leaf, values: NDArray[Any]) -> NDArray[np.float64]:
@@ -138,7 +143,7 @@ def _out_of_range(
     flat: int,
     *,
     outside: tuple[int, int],
-    is_often: bool,
+    severity: Severity,
 ) -> Finding:
     built = records.require_built()
     leaf, step = built.leaves[index], int(series.steps[row])
@@ -160,7 +165,7 @@ def _out_of_range(
             "observations_outside": outside[0],
             "observations": outside[1],
         },
-        Severity.ERROR if is_often and not is_rounding else Severity.WARNING,
+        Severity.WARNING if is_rounding else severity,
     )
 
 

@@ -6,19 +6,17 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.bullet_clients import connected
 from rlctl.check_env.bullet_worlds import Joint, Pair
-from rlctl.check_env.client_calls import Functions, calls_in, methods_of, record_functions
+from rlctl.check_env.client_calls import find_left_out, record_calls
 from rlctl.check_env.context import Context
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, failure
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
 from rlctl.check_env.messages import Message, Skipped
 from rlctl.check_env.world_logs import Log, LoggedWorld, Place, WorldLogger
 from rlctl.check_env.world_tests import Jump
@@ -45,14 +43,14 @@ SAME = 1e-9
 FEWEST_LINKS = 2
 LIGHTEST_BASE = 0.05
 """A base does not matter where it has less than this part of the mass."""
-MOST_NAMES, MOST_PLACES = 3, 4
+MOST_NAMES = 3
 
 
 @experiment("worlds", *(f"RL80{i}" for i in range(1, 9)), share=4.0)
 def watch_worlds(context: Context) -> Iterator[Message]:
     """Log the worlds of an instance through a few episodes. What changes them (falling alone, boxes) comes after."""
     older = set(connected())
-    with record_functions() as ran, context.fresh() as instance:
+    with record_calls() as calls, context.fresh() as instance:
         logger = WorldLogger(instance, older)
         for number, (kind, steps) in enumerate(EPISODES):
             if number and (context.budget.seconds_left < 0 or not logger.worlds):
@@ -69,7 +67,7 @@ def watch_worlds(context: Context) -> Iterator[Message]:
             raise NotJudged("no episode could be logged")
         if not worlds:
             raise NotApplicable("no PyBullet world")
-        yield from _client_left_out(instance.env, dict(ran))
+        yield from find_left_out(instance.env, dict(calls))
     for world in worlds:
         yield from _judge(world)
     if logger.resets < 2:
@@ -97,18 +95,13 @@ def _when(place: Place) -> str:
     return f"at step {place['step']}" if place["step"] else "at reset"
 
 
-def _list(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-    return ", ".join(names[:MOST_NAMES]) + more
-
-
 def _gravity(world: LoggedWorld) -> Iterator[Finding]:
     masses = [each.masses for each in world.dynamics[0]]
     bodies = zip(world.world.bodies, masses, strict=True)
     heavy = [body.name for body, mass in bodies if body.is_free or (body.joints and sum(mass[1:]) > 0)]
     if heavy and not any(world.gravity) and world.weight_matters is not False:
         evidence = {"value": world.gravity, "expected": [0.0, 0.0, -9.81], "bodies": heavy}
-        yield Finding("RL801", f"gravity is (0, 0, 0), and {_list(heavy)} can move", evidence)
+        yield Finding("RL801", f"gravity is (0, 0, 0), and {list_names(heavy, MOST_NAMES)} can move", evidence)
 
 
 def _collisions(world: LoggedWorld) -> Iterator[Finding]:
@@ -176,7 +169,7 @@ def _joint_limits(world: LoggedWorld) -> Iterator[Finding]:
         for _, steps, place, value, joint in ordered[:1]:
             others = [each[-1].name for each in ordered[1:]]
             unit = "rad" if joint.is_angle else "m"
-            more = f"; so {'are' if len(others) > 1 else 'is'} {_list(others)}" if others else ""
+            more = f"; so {'are' if len(others) > 1 else 'is'} {list_names(others, MOST_NAMES)}" if others else ""
             limits = [joint.low, joint.high]
             yield Finding(
                 "RL804",
@@ -282,11 +275,9 @@ def _friction(world: LoggedWorld, i: int) -> Iterator[Finding]:
     if changed and touches and all(not touches[j - 1].collides for j in changed):
         names = [body.links[j] for j in changed]
         low, high = float(frictions[:, changed].min()), float(frictions[:, changed].max())
-        yield Finding(
-            "RL806",
-            f"the friction of {_list(names)} of {body.name} varies from {low:.3g} to {high:.3g}, and touches nothing",
-            {"body": body.name, "links": names, "value": [low, high]},
-        )
+        what = f"the friction of {list_names(names, MOST_NAMES)} of {body.name} varies from {low:.3g} to {high:.3g}"
+        evidence = {"body": body.name, "links": names, "value": [low, high]}
+        yield Finding("RL806", f"{what}, and touches nothing", evidence)
 
 
 def _base_mass(world: LoggedWorld, i: int) -> Iterator[Finding]:
@@ -311,23 +302,3 @@ def _base_mass(world: LoggedWorld, i: int) -> Iterator[Finding]:
 
 def _varies(values: NDArray[np.float64]) -> bool:
     return bool(np.ptp(values) > SAME * np.abs(values).max())
-
-
-def _client_left_out(env: Any, ran: Functions) -> Iterator[Finding]:
-    """Yield the calls without a client in the functions that ran, or else in the environment's other methods."""
-    calls, where, severity = calls_in(ran), "", Severity.ERROR
-    if not calls:
-        not_run = {code: names for code, names in methods_of(env) if code not in ran}
-        calls, where, severity = calls_in(not_run), ", in methods that did not run", Severity.WARNING
-    if calls:
-        count = f"{len(calls)} calls" if len(calls) > 1 else "a call"
-        places = [f"{Path(each.file).name}:{each.line}" for each in calls]
-        shown = [f"{place} {each.name}" for place, each in zip(places, calls, strict=True)]
-        more = f" and {len(shown) - MOST_PLACES} more" if len(shown) > MOST_PLACES else ""
-        names = sorted({each.name for each in calls})
-        yield Finding(
-            "RL808",
-            f"{count} of PyBullet without physicsClientId{where}: {', '.join(shown[:MOST_PLACES])}{more}",
-            {"file": calls[0].file, "line": calls[0].line, "places": places, "functions": names},
-            severity,
-        )

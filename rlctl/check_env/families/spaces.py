@@ -51,7 +51,9 @@ def find_unusual_images(records: Records) -> Iterator[Finding]:
             continue
         name, shape = leaf_name(leaf), list(leaf.shape)
         if problem := _image_problem(leaf):
-            yield Finding("RL108", f"{name} has {problem}", {"element": name, "value": shape, "dtype": leaf.dtype})
+            evidence = {"element": name, "value": shape, "dtype": leaf.dtype}
+            severity = Severity.WARNING if _looks_like_image(leaf) else Severity.INFO
+            yield Finding("RL108", f"{name} has {problem}", evidence, severity)
         elif len(shape) == 3 and leaf.dtype == "uint8" and (brightest := _brightest(records, index)) in (0, 1):
             message = (
                 f"{name} is uint8 up to 255, and no pixel of any episode is brighter than {brightest}: scaled twice?"
@@ -75,6 +77,14 @@ def _image_problem(leaf: Leaf) -> str:
     if sorted(shape)[1] < SMALLEST_SIDE:
         return f"the shape of an image, {shape}, smaller than {SMALLEST_SIDE} x {SMALLEST_SIDE}"
     return ""
+
+
+def _looks_like_image(leaf: Leaf) -> bool:
+    """Say whether a space is as large as a picture, or has the format that the default networks take for one."""
+    is_format = (
+        len(leaf.shape) == 3 and leaf.dtype == "uint8" and bool(np.all(leaf.low == 0) and np.all(leaf.high == 255))
+    )
+    return is_format or sum(size >= SMALLEST_SIDE for size in leaf.shape) >= 2
 
 
 def _brightest(records: Records, index: int) -> int | None:

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import re
 import statistics
-import sys
-import sysconfig
 import time
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rlctl.check_env.context import Context
@@ -19,6 +14,7 @@ from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.instance import Instance
 from rlctl.check_env.messages import Fact, Message
+from rlctl.check_env.own_code import find_own_code, kind_of, rebuilds_world
 from rlctl.check_env.records import Records
 from rlctl.check_env.sampling import Sampler, Samples, Stopwatch, TimedCall
 
@@ -58,20 +54,6 @@ NAMED_CALLS = 3
 LEAST_SHARE = 0.01
 """Calls that take less are not named among the slowest."""
 
-KINDS = {
-    "rendering": r"pybullet\.(getCameraImage|addUserDebug\w+)$|(matplotlib|pyglet|OpenGL|PIL\.ImageDraw)\.|"
-    r"pygame\.(draw|gfxdraw|display|font|transform|surface|Surface)\b|"
-    r"cv2\.(imshow|imwrite|line|circle|rectangle|polylines|fillPoly|putText|arrowedLine)$|"
-    r"mujoco\.(mjr_render|renderer\.)|gymnasium\.envs\.mujoco\.mujoco_rendering\.",
-    "sleeping": r"time\.sleep$|pygame\.time\.(wait|delay|Clock\.tick\w*)$|cv2\.waitKey\w*$",
-    "connecting": r"pybullet\.connect$",
-    "loading": r"pybullet\.(load(URDF|MJCF|SDF|SoftBody|Bullet|Texture|Plugin)|create(Collision|Visual)Shape\w*|"
-    r"createMultiBody|createSoftBody\w*|resetSimulation)$|mujoco\..*from_(xml|binary)\w*$|"
-    r"open$|(TextIOWrapper|Buffered\w+|FileIO)\.read\w*$",
-}
-"""What step and reset should not do, by the names of functions."""
-_KINDS = {kind: re.compile(pattern) for kind, pattern in KINDS.items()}
-
 
 @dataclasses.dataclass(frozen=True)
 class Speed:
@@ -101,7 +83,7 @@ def measure_speed(context: Context) -> Iterator[Message]:
     deadline = time.monotonic() + seconds / 2
     _play(instance, steps, resets, TIMED_STEPS, deadline)
     _play(instance, steps, resets, TIMED_RESETS, deadline, only_reset=True)
-    sampler = Sampler(own_code(instance.env), kind_of)
+    sampler = Sampler(find_own_code(instance.env), kind_of)
     in_step, in_reset = Samples(sampler), Samples(sampler)
     with sampler.running():
         for only_reset in (False, True):
@@ -118,7 +100,7 @@ def measure_speed(context: Context) -> Iterator[Message]:
             slowest_in_reset=in_reset.slowest()[:MOST_CALLS],
             suspicious_in_step=in_step.suspicious(),
             suspicious_in_reset=in_reset.suspicious(),
-            rebuilds=_rebuilds(instance.env),
+            rebuilds=rebuilds_world(instance.env),
         ),
     )
 
@@ -149,47 +131,6 @@ def typical(seconds: Sequence[float], batch: int) -> float | None:
     batch = min(batch, len(seconds))
     starts = range(0, len(seconds) - batch + 1, batch)
     return statistics.median(statistics.fmean(seconds[start : start + batch]) for start in starts)
-
-
-def own_code(env: Any) -> Callable[[str], bool]:
-    """Return what decides of a file whether it is the environment's own code, and no library's."""
-    import rlctl
-
-    paths = sysconfig.get_paths()
-    libraries = [str(Path(rlctl.__file__).parent), *(paths[name] for name in ("stdlib", "purelib", "platlib"))]
-    author = sys.modules.get(type(_find_author(env)).__module__)
-    folder = str(Path(getattr(author, "__file__", None) or "/nowhere/at.all").parent)
-
-    @functools.cache
-    def is_own(file: str) -> bool:
-        if file.startswith(f"{folder}/"):
-            return True
-        return not file.startswith(("<", *(f"{each}/" for each in libraries))) and "site-packages" not in file
-
-    return is_own
-
-
-def kind_of(name: str, own: bool) -> str:
-    """Return what is suspicious about a function: a key of `KINDS`, or nothing."""
-    if own:
-        return "rendering" if name.rpartition(".")[2] in ("render", "_render") else ""
-    return next((kind for kind, pattern in _KINDS.items() if pattern.match(name)), "")
-
-
-def _find_author(env: Any) -> Any:
-    """Return the object whose class somebody wrote: a task's environment is rlctl's."""
-    inner = getattr(env, "unwrapped", env)
-    return inner.task if _is_task(inner) else inner
-
-
-def _is_task(inner: Any) -> bool:
-    task_env = sys.modules.get("rlctl.task.env")
-    return task_env is not None and isinstance(inner, task_env.TaskEnv)
-
-
-def _rebuilds(env: Any) -> bool:
-    inner = getattr(env, "unwrapped", env)
-    return _is_task(inner) and not inner.task.fast_reset
 
 
 @check("RL901", "speed")
