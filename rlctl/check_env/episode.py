@@ -29,8 +29,6 @@ class Moment:
     """What was returned where it is not what Gymnasium's interface says: `tuple of 4`, `NoneType`."""
     is_readable: bool = True
     """False where step returned something that cannot be taken apart: nothing above it is known."""
-    seconds: float = 0.0
-    """How long the call took."""
 
     @property
     def flags(self) -> tuple[bool, bool]:
@@ -81,7 +79,6 @@ class Episode:
         """Begin the episode; `then_unseeded` resets once more, without a seed."""
         self.steps, self.ended = 0, "" if self.max_steps else "steps"
         self._next = self._choose_actions()
-        started = time.perf_counter()
         try:
             returned = self.instance.reset(self.seed, self.number, timer=self._timer)
             if then_unseeded:
@@ -89,10 +86,9 @@ class Episode:
         except EnvironmentRaised:
             self.ended = "raised"
             raise
-        seconds = time.perf_counter() - started
         if isinstance(returned, tuple) and len(returned) == 2:
-            return Moment(0, None, returned[0], info=returned[1], seconds=seconds)
-        return Moment(0, None, returned, form=_form(returned), seconds=seconds)
+            return Moment(0, None, returned[0], info=returned[1])
+        return Moment(0, None, returned, form=_form(returned))
 
     def _choose_actions(self) -> Iterator[Any]:
         if isinstance(self._actions, str):
@@ -105,13 +101,12 @@ class Episode:
         call, env = self.instance.call, self.instance.env
         try:
             action = call("sample", next, self._next, step=self.steps)
-            started = time.perf_counter()
             timed = (self._timer, env.step, action) if self._timer else (env.step, action)
             returned = call("step", *timed, step=self.steps)
         except EnvironmentRaised:
             self.ended = "raised"
             raise
-        moment = self._read(action, returned, time.perf_counter() - started)
+        moment = self._read(action, returned)
         terminated, truncated = moment.flags
         if not moment.is_readable:
             self.ended = "raised"
@@ -123,14 +118,14 @@ class Episode:
             self.ended = "time"
         return moment
 
-    def _read(self, action: Any, returned: Any, seconds: float) -> Moment:
+    def _read(self, action: Any, returned: Any) -> Moment:
         if isinstance(returned, tuple) and len(returned) == 5:
-            return Moment(self.steps, action, *returned, seconds=seconds)
+            return Moment(self.steps, action, *returned)
         form = _form(returned)
         if isinstance(returned, tuple) and len(returned) == 4:
             observation, reward, done, info = returned
-            return Moment(self.steps, action, observation, reward, done, False, info, form, seconds=seconds)
-        return Moment(self.steps, action, None, form=form, is_readable=False, seconds=seconds)
+            return Moment(self.steps, action, observation, reward, done, False, info, form)
+        return Moment(self.steps, action, None, form=form, is_readable=False)
 
 
 def _form(returned: Any) -> str:

@@ -116,9 +116,6 @@ class Trajectory:
     infos: Mapping[str, Series]
     """Numbers in info, by name; those in a dictionary of info as `reward_terms/distance`. Values have shape (n,)."""
     forms: list[Form]
-    step_s: float
-    """Time in `step`, summed [s]."""
-    reset_s: float
 
     @property
     def steps(self) -> int:

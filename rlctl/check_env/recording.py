@@ -125,7 +125,6 @@ class Notes:
         self._infos: dict[str, tuple[list[int], list[float]]] = {}
         self._actions: list[NDArray[np.float64]] = []
         self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
-        self._step_s = self._reset_s = 0.0
 
     def add(self, moment: Moment) -> int:
         """Write down what a call returned; return how much memory that takes [bytes]."""
@@ -135,14 +134,11 @@ class Notes:
         if not moment.is_readable:
             return 0
         if moment.step:
-            self._step_s += moment.seconds
             self._actions.append(flat_action(self._action_leaves, moment.action))
             self._count_form("terminated", type_name(moment.terminated))
             self._count_form("truncated", type_name(moment.truncated))
             self._flags.append(moment.flags)
             self._add_reward(moment.reward)
-        else:
-            self._reset_s = moment.seconds
         self._add_info(moment.info)
         return self._add_observation(moment.observation)
 
@@ -233,6 +229,4 @@ class Notes:
                 Form(**dict(zip(names, key, strict=False)), step=step, count=count)
                 for key, (step, count) in self._forms.items()
             ],
-            step_s=self._step_s,
-            reset_s=self._reset_s,
         )

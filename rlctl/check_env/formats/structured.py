@@ -24,7 +24,7 @@ def text(report: Report) -> str:
 
 def content(report: Report) -> dict[str, Any]:
     """Return a report as plain data."""
-    verdict, evidence = report.verdict, report.records
+    verdict, records = report.verdict, report.records
     return {
         "format": "rlctl check-env 1",
         "rlctl": __version__,
@@ -33,7 +33,7 @@ def content(report: Report) -> dict[str, Any]:
         "strict": report.strict,
         "findings": [finding_json(each) for each in verdict.findings],
         "waived": [
-            {**finding_json(each), "reason": evidence.built.waivers[each.rule] if evidence.built else ""}
+            {**finding_json(each), "reason": records.built.waivers[each.rule] if records.built else ""}
             for each in verdict.waived
         ],
         "judged": verdict.judged,
@@ -42,11 +42,11 @@ def content(report: Report) -> dict[str, Any]:
         "crashed": [{"what": name, "traceback": trace} for name, trace in verdict.crashed.items()],
         "environment": _environment(report),
         "speed": _speed(report),
-        "episodes": len(evidence.episodes),
-        "steps": sum(each.steps for each in evidence.trajectories),
+        "episodes": len(records.episodes),
+        "steps": sum(each.steps for each in records.trajectories),
         "seconds": report.seconds,
         "budget_seconds": report.budget_s,
-        "studies": evidence.seconds,
+        "experiments": records.seconds,
     }
 
 
