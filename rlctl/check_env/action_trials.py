@@ -144,7 +144,7 @@ class Trials:
 
     def play(self, seed: int, chosen: Sequence[Any]) -> list[Frame]:
         """Play an episode with given actions, to its end at most; the first frame is that of reset."""
-        episode = Episode(self.instance, seed, chosen, max_steps=len(chosen), deadline=self.deadline)
+        episode = Episode(self.instance, seed, given=chosen, max_steps=len(chosen), deadline=self.deadline)
         frames = [to_frame(moment) for moment in episode]
         if episode.ended == "time":
             raise OutOfTime

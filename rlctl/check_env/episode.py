@@ -47,16 +47,18 @@ class Episode:
         self,
         instance: Instance,
         seed: int,
-        actions: str | Iterable[Any] = "random",
+        actions: str = "random",
         *,
         number: int = 0,
         action_seed: int | None = None,
         max_steps: int = 10_000,
         deadline: float = float("inf"),
+        given: Iterable[Any] | None = None,
         timer: Callable[..., Any] | None = None,
     ) -> None:
-        """`actions` is a kind (see `check_env.actions`, drawn with `action_seed`, else with `seed`), or the actions
-        themselves. `deadline` is on `time.monotonic`'s clock [s]. `timer` calls the environment's functions for us."""
+        """`actions` is a kind (see `check_env.actions`), drawn with `action_seed`, else with `seed`; or the name of
+        those that are `given`. `deadline` is on `time.monotonic`'s clock [s]. `timer` calls the environment's functions
+        for us."""
         self.instance = instance
         self.seed = seed
         self.number = number
@@ -66,7 +68,8 @@ class Episode:
         self.ended = ""
         """`terminated`, `truncated`, `both`, `raised`, or what cut it: `steps`, `time`; empty while it goes on."""
         self._timer = timer
-        self._actions = actions
+        self.actions = actions
+        self._given = given
         self._action_seed = seed if action_seed is None else action_seed
         self._next = iter(self._choose_actions())
 
@@ -91,9 +94,9 @@ class Episode:
         return Moment(0, None, returned, form=_form(returned))
 
     def _choose_actions(self) -> Iterator[Any]:
-        if isinstance(self._actions, str):
-            return actions(self.instance.env.action_space, self._actions, self._action_seed)
-        return iter(self._actions)
+        if self._given is not None:
+            return iter(self._given)
+        return actions(self.instance.env.action_space, self.actions, self._action_seed)
 
     def step(self) -> Moment:
         """Take one step."""

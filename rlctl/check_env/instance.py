@@ -24,6 +24,10 @@ class Budget:
     def seconds_left(self) -> float:
         return self.deadline - time.monotonic()
 
+    def end_within(self, seconds: float) -> float:
+        """Return when something that may take so long ends at the latest, on the same clock [s]."""
+        return min(time.monotonic() + seconds, self.deadline)
+
 
 class Instance:
     """One environment, and how it is called."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-import time
-from collections.abc import Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,47 +10,31 @@ from numpy.typing import NDArray
 
 from rlctl.check_env.episode import Episode, Moment
 from rlctl.check_env.failures import EnvironmentRaised, failure
-from rlctl.check_env.instance import Budget, Instance
+from rlctl.check_env.instance import Budget
 from rlctl.check_env.leaves import Leaf, pick
 from rlctl.check_env.messages import MOST_INFOS, Failure, Form, Series, Trajectory
 from rlctl.check_env.returned import flat_action, numbers_in, type_name
 
 
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """Which episode to record."""
-
-    role: str
-    episode: int
-    seed: int
-    actions: str = "random"
-    action_seed: int | None = None
-    """The seed of the actions; by default the episode's."""
-    max_steps: int = 10_000
-    max_s: float = 10.0
-    then_unseeded: bool = False
-    """Reset with the seed, and then once more without one."""
-    given: Iterable[Any] | None = None
-    """The actions themselves, at least `max_steps` of them; `actions` is then only their kind's name."""
-
-
 class Recording:
     """An episode that is written down while it is played. `reset`, then `step` while `running`; `run` does all."""
 
-    def __init__(self, instance: Instance, plan: Plan, budget: Budget) -> None:
-        self.plan = plan
+    def __init__(self, role: str, episode: Episode, budget: Budget) -> None:
+        """`role` is what it is recorded for; `budget` is charged with its memory."""
+        self.role = role
+        self.episode = episode
         self.budget = budget
-        self.episode = Episode(
-            instance,
-            plan.seed,
-            plan.actions if plan.given is None else plan.given,
-            number=plan.episode,
-            action_seed=plan.action_seed,
-            max_steps=plan.max_steps,
-        )
         self.failure: Failure | None = None
         self._ended = ""
-        self._notes = Notes(instance)
+        self._step = 0
+        self._rewards: list[float] = []
+        self._values: dict[int, tuple[list[int], list[Any]]] = {}
+        self._is_number: list[bool] = []
+        self._flags: list[tuple[bool, bool]] = []
+        self._forms: dict[tuple[Any, ...], list[int]] = {}
+        self._infos: dict[str, tuple[list[int], list[float]]] = {}
+        self._actions: list[NDArray[np.float64]] = []
+        self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
 
     def run(self) -> list[Trajectory | Failure]:
         """Play the episode to its end; return what to send."""
@@ -61,28 +43,23 @@ class Recording:
             self.step()
         return self.messages()
 
-    def reset(self) -> None:
-        """Begin the episode."""
-        self.episode.deadline = min(time.monotonic() + self.plan.max_s, self.budget.deadline)
-        try:
-            self._note(self.episode.reset(then_unseeded=self.plan.then_unseeded))
-        except EnvironmentRaised as error:
-            self._fail(error)
+    def reset(self, *, then_unseeded: bool = False) -> None:
+        """Begin the episode; `then_unseeded` resets once more, without a seed."""
+        self._note(lambda: self.episode.reset(then_unseeded=then_unseeded))
 
     def step(self) -> None:
         """Take one step."""
+        self._note(self.episode.step)
+
+    def _note(self, call: Callable[[], Moment]) -> None:
         try:
-            self._note(self.episode.step())
+            moment = call()
         except EnvironmentRaised as error:
-            self._fail(error)
-
-    def _note(self, moment: Moment) -> None:
-        self.budget.bytes_left -= self._notes.add(moment)
+            self._ended = "raised"
+            self.failure = failure(error, self.episode.instance.progress)
+            return
+        self.budget.bytes_left -= self._add(moment)
         self._ended = self.episode.ended or ("memory" if self.budget.bytes_left <= 0 and moment.step else "")
-
-    def _fail(self, error: EnvironmentRaised) -> None:
-        self._ended = "raised"
-        self.failure = failure(error, self.episode.instance.progress)
 
     @property
     def running(self) -> bool:
@@ -92,41 +69,18 @@ class Recording:
     @property
     def steps(self) -> int:
         """How many steps were taken."""
-        return len(self._notes.rewards)
+        return len(self._rewards)
 
     @property
     def was_cut(self) -> bool:
         """Whether the episode was left before its end, for steps or time."""
         return self._ended in ("steps", "time")
 
-    @property
-    def trajectory(self) -> Trajectory:
-        """What was written down."""
-        plan = self.plan
-        return self._notes.trajectory(plan.role, plan.episode, plan.seed, plan.actions, self._ended or "steps")
-
     def messages(self) -> list[Trajectory | Failure]:
         """Return what to send: the trajectory, and the failure that ended it, if one did."""
         return [self.trajectory, *([self.failure] if self.failure else [])]
 
-
-class Notes:
-    """What came back from an episode so far."""
-
-    def __init__(self, instance: Instance) -> None:
-        self.rewards: list[float] = []
-        self._leaves = instance.leaves
-        self._action_leaves = instance.action_leaves
-        self._step = 0
-        self._values: dict[int, tuple[list[int], list[Any]]] = {}
-        self._is_number: list[bool] = []
-        self._flags: list[tuple[bool, bool]] = []
-        self._forms: dict[tuple[Any, ...], list[int]] = {}
-        self._infos: dict[str, tuple[list[int], list[float]]] = {}
-        self._actions: list[NDArray[np.float64]] = []
-        self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
-
-    def add(self, moment: Moment) -> int:
+    def _add(self, moment: Moment) -> int:
         """Write down what a call returned; return how much memory that takes [bytes]."""
         self._step = moment.step
         if moment.form:
@@ -134,7 +88,7 @@ class Notes:
         if not moment.is_readable:
             return 0
         if moment.step:
-            self._actions.append(flat_action(self._action_leaves, moment.action))
+            self._actions.append(flat_action(self.episode.instance.action_leaves, moment.action))
             self._count_form("terminated", type_name(moment.terminated))
             self._count_form("truncated", type_name(moment.truncated))
             self._flags.append(moment.flags)
@@ -158,15 +112,15 @@ class Notes:
     def _add_reward(self, reward: Any) -> None:
         self._count_form("reward", type_name(reward))
         try:
-            self.rewards.append(float(reward))
+            self._rewards.append(float(reward))
             self._is_number.append(True)
         except Exception:  # its type is noted, and is a finding
-            self.rewards.append(float("nan"))
+            self._rewards.append(float("nan"))
             self._is_number.append(False)
 
     def _add_observation(self, observation: Any) -> int:
         size = 0
-        for index, leaf in enumerate(self._leaves):
+        for index, leaf in enumerate(self.episode.instance.leaves):
             try:
                 value = pick(observation, leaf.path)
             except (LookupError, TypeError):
@@ -174,7 +128,7 @@ class Notes:
                 continue
             if leaf.supported:
                 size += self._add_leaf(index, leaf, value)
-        keys = {leaf.path[0] for leaf in self._leaves if leaf.path}
+        keys = {leaf.path[0] for leaf in self.episode.instance.leaves if leaf.path}
         if isinstance(observation, dict) and keys and observation.keys() != keys:
             self._count_form("keys", ", ".join(sorted(map(str, observation))))
         return size
@@ -203,21 +157,22 @@ class Notes:
             self._count_form("memory", "shared", index)
         self._previous[index] = value, copy
 
-    def trajectory(self, role: str, episode: int, seed: int, actions: str, ended: str) -> Trajectory:
-        """Return everything."""
+    @property
+    def trajectory(self) -> Trajectory:
+        """What was written down."""
         names = ("what", "type", "leaf", "dtype", "shape")
         return Trajectory(
-            role=role,
-            episode=episode,
-            seed=seed,
-            actions=actions,
-            ended=ended,
+            role=self.role,
+            episode=self.episode.number,
+            seed=self.episode.seed,
+            actions=self.episode.actions,
+            ended=self._ended or "steps",
             observations={
                 index: Series(np.array(steps, np.int64), np.stack(values))
                 for index, (steps, values) in self._values.items()
             },
             action_values=np.stack(self._actions) if self._actions else np.zeros((0, 0)),
-            rewards=np.array(self.rewards, np.float64),
+            rewards=np.array(self._rewards, np.float64),
             reward_is_number=np.array(self._is_number, np.bool_),
             terminated=np.array([flag for flag, _ in self._flags], np.bool_),
             truncated=np.array([flag for _, flag in self._flags], np.bool_),

@@ -173,7 +173,7 @@ def exceed_bounds(context: Context) -> Iterator[Message]:
         trials.require_repeatable()
         inside = trials.plain(FIRST_SEED, REPEATED_STEPS)
         beyond = [trials.change(each, _twice) for each in trials.actions(FIRST_SEED, REPEATED_STEPS)]
-        outside, _ = _play_until_refused(Episode(instance, FIRST_SEED, beyond, max_steps=len(beyond)))
+        outside, _ = _play_until_refused(Episode(instance, FIRST_SEED, given=beyond, max_steps=len(beyond)))
         yield from _first_difference(inside, outside)
 
 
@@ -239,7 +239,7 @@ def give_nan(context: Context) -> Iterator[Message]:
         nan = trials.change(first, lambda part, leaf: np.full_like(part, np.nan) if is_float_box(leaf) else part)
         # A simulator may write a log of what it did not like to where it is: MuJoCo does.
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-            frames, is_refused = _play_until_refused(Episode(instance, FIRST_SEED, [nan, *good], max_steps=6))
+            frames, is_refused = _play_until_refused(Episode(instance, FIRST_SEED, given=[nan, *good], max_steps=6))
     if is_refused:
         return
     is_finite = all(np.isfinite(each.reward) and np.isfinite(each.observation).all() for each in frames[1:])

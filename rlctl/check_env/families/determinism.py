@@ -19,7 +19,7 @@ from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message, Skipped, Trajectory
-from rlctl.check_env.recording import Plan, Recording
+from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 
 COMPARED_STEPS = 300
@@ -31,7 +31,6 @@ WATCHED_STEPS = 30
 FEWEST_SEEDS = 4
 LATE = 20
 """What an unfinished episode changes only after so many steps is a residue, not the episode's start [steps]."""
-NO_TIME = "the first comparisons took all the time there is for them"
 
 
 @experiment("comparisons", share=6.0)
@@ -40,26 +39,25 @@ def compare_repetitions(context: Context) -> Iterator[Message]:
     instance, budget = context.instance, context.budget
     longest_s = budget.seconds_left / 4
     steps = COMPARED_STEPS
-    for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
+    for number, role in enumerate(("alone", "reused", "dirty", "seeds", "unseeded", "unseeded again")):
         instance.progress.phase(role)
         if role == "dirty":
             unfinished = min(DIRTY_STEPS, max(1, steps // 2))
-            Recording(instance, Plan(role, 0, SECOND_SEED, "extreme", max_steps=unfinished, max_s=1.0), budget).run()
+            other = Episode(instance, SECOND_SEED, "extreme", max_steps=unfinished, deadline=budget.end_within(1.0))
+            Recording(role, other, budget).run()
         if budget.seconds_left < 0:
-            yield Skipped(role, NO_TIME)
+            yield Skipped(role, "the first comparisons took all the time there is for them")
             continue
         seed = SECOND_SEED if role == "seeds" else FIRST_SEED
-        recording = Recording(
-            instance, Plan(role, number, seed, "random", FIRST_SEED, COMPARED_STEPS, longest_s), budget
-        )
-        yield from recording.run()
-        steps = min(steps, recording.steps)
-    for number, role in enumerate(("unseeded", "unseeded again")):
-        if budget.seconds_left < 0:
-            yield Skipped(role, NO_TIME)
+        episode = Episode(instance, seed, number=number, action_seed=FIRST_SEED, max_steps=COMPARED_STEPS)
+        episode.deadline = budget.end_within(longest_s)
+        recording = Recording(role, episode, budget)
+        if role.startswith("unseeded"):
+            recording.reset(then_unseeded=True)
+            yield from recording.messages()
         else:
-            plan = Plan(role, number, FIRST_SEED, max_steps=0, then_unseeded=True)
-            yield from Recording(instance, plan, budget).run()
+            yield from recording.run()
+            steps = min(steps, recording.steps)
 
 
 def compare(records: Records, first: str, second: str) -> tuple[Trajectory, Difference | None]:

@@ -10,11 +10,10 @@ import numpy as np
 from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import RECORDING, check, experiment
-from rlctl.check_env.failures import EnvironmentRaised
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.leaves import Leaf, leaf_name
 from rlctl.check_env.messages import ENDS, FIRST_SEED, Fact, Message, Trajectory
-from rlctl.check_env.recording import Notes, Plan, Recording
+from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 
 EPISODES = (
@@ -56,8 +55,9 @@ def record_episodes(context: Context) -> Iterator[Message]:
             what = "time" if budget.seconds_left < 0 else "memory"
             raise NotJudged(f"{number} of {len(EPISODES)} episodes were played in the {what} there is")
         longest = LATER_ENDLESS_STEPS if number >= 3 and cut else ENDLESS_STEPS
-        plan = Plan("episodes", number, FIRST_SEED + number, kind, max_steps=longest, max_s=budget.seconds_left / 2)
-        recording = Recording(instance, plan, budget)
+        deadline = budget.end_within(budget.seconds_left / 2)
+        episode = Episode(instance, FIRST_SEED + number, kind, number=number, max_steps=longest, deadline=deadline)
+        recording = Recording("episodes", episode, budget)
         yield from recording.run()
         cut += recording.was_cut
         failures += recording.failure is not None
@@ -178,14 +178,11 @@ def step_after_end(context: Context) -> Iterator[Message]:
         pass
     if episode.ended not in ENDS:
         raise NotJudged("the episode did not come to an end")
-    end, notes = episode.steps, Notes(instance)
-    try:
-        while episode.steps < end + STEPS_AFTER:
-            notes.add(episode.step())
-    except EnvironmentRaised:
-        pass  # refused, as it should be
+    end, recording = episode.steps, Recording("after the end", episode, budget)
+    while episode.steps < end + STEPS_AFTER and recording.failure is None:  # to refuse is what it should do
+        recording.step()
     yield Fact("end", end)
-    yield notes.trajectory("after the end", 0, FIRST_SEED, "random", "steps")
+    yield recording.trajectory
 
 
 @dataclasses.dataclass(frozen=True)

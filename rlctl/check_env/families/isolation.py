@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 from rlctl.check_env.comparison import find_difference
 from rlctl.check_env.context import Context
+from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.families.determinism import COMPARED_STEPS, compare, require_independent
 from rlctl.check_env.families.interface import select_failures
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.instance import Instance
 from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Failure, Message, Skipped, Trajectory
-from rlctl.check_env.recording import Plan, Recording
+from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 
 IN_TURNS, AFTER_CLOSE = "two instances stepped in turns", "after another instance was closed"
@@ -26,9 +27,9 @@ def compare_instances(context: Context) -> Iterator[Message]:
 
     def begin(instance: Instance, role: str, seed: int) -> Recording:
         progress.phase(role)
-        return Recording(
-            instance, Plan(role, seed - FIRST_SEED, seed, max_steps=COMPARED_STEPS, max_s=longest_s), budget
-        )
+        deadline = budget.end_within(longest_s)
+        episode = Episode(instance, seed, number=seed - FIRST_SEED, max_steps=COMPARED_STEPS, deadline=deadline)
+        return Recording(role, episode, budget)
 
     progress.phase("alone")
     first = context.build()

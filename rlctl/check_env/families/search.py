@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from rlctl.check_env.actions import action_at, zero_action
 from rlctl.check_env.context import Context
+from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
-from rlctl.check_env.recording import Plan, Recording
+from rlctl.check_env.recording import Recording
 from rlctl.check_env.rewarded import has_succeeded
 
 MOST_STEPS = 6_000
@@ -154,8 +155,11 @@ class _Search:
         """Play one sequence of actions."""
         given = (copy.deepcopy(action) for action in sequence)
         longest_s = max(0.0, self.budget.seconds_left / 4)
-        plan = Plan("search", self.episode, self._seed, kind, max_steps=len(sequence), max_s=longest_s, given=given)
-        recording = Recording(self.instance, plan, self.budget)
+        deadline, steps = self.budget.end_within(longest_s), len(sequence)
+        episode = Episode(
+            self.instance, self._seed, kind, number=self.episode, max_steps=steps, deadline=deadline, given=given
+        )
+        recording = Recording("search", episode, self.budget)
         yield from recording.run()
         played = recording.trajectory
         is_terminated = played.ended == "terminated"

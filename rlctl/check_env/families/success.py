@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.check_env.context import Context
+from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
-from rlctl.check_env.recording import Plan, Recording
+from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 from rlctl.check_env.rewarded import (
     SUCCESS,
@@ -46,8 +47,8 @@ def record_starts(context: Context) -> Iterator[Message]:
         if context.budget.seconds_left < 0 or context.budget.bytes_left < 0 or failures >= MAX_FAILURES:
             yield Skipped("starts", f"only {number} of {STARTS} starts could be made")
             return
-        plan = Plan("starts", number, FIRST + number, "zero", max_steps=START_STEPS)
-        recording = Recording(context.instance, plan, context.budget)
+        episode = Episode(context.instance, FIRST + number, "zero", number=number, max_steps=START_STEPS)
+        recording = Recording("starts", episode, context.budget)
         yield from recording.run()
         failures += recording.failure is not None
 
