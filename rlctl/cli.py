@@ -151,7 +151,7 @@ def train(
     force: Annotated[bool, typer.Option("--force", help="Go on with a run even if its task has changed.")] = False,
     config: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(metavar="FILE", help="Recipe that goes over the task's own.", show_default=False),
+        typer.Option(metavar="FILE", help="Recipe that goes over the task's own, or presets/NAME.", show_default=False),
     ] = None,
     settings: Set = [],  # noqa: B006
     algo: Annotated[

@@ -50,9 +50,14 @@ class Locomotion(Task):
     }
     events = {  # with `randomize: true`; without, the tasks are the family's
         "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
-        "friction": Event("reset", events.set_friction, body="floor", friction=(0.5, 1.1)),
+        "friction": Event("reset", events.set_friction, body="floor", friction=(0.3, 1.5)),
+        "gravity": Event("reset", events.shift_gravity, change=(-0.5, 0.5)),  # [m/s^2]
+        "joint_damping": Event("reset", events.scale_joint_damping, body="robot", factor=(0.5, 1.5)),
+        "color": Event("reset", events.set_color, body="robot", red=(0, 1), green=(0, 1), blue=(0, 1)),
         "motor_strength": Event("reset", events.scale_motor_strength, body="robot", factor=(0.8, 1.0)),
+        "start": Event("start", events.offset_joints, body="robot", velocity=(-0.1, 0.1)),  # [rad/s]
         "joint_noise": Event("observation", events.noise, of="joints", std=(0.0, 0.02)),
+        "observation_delay": Event("observation", events.delay, steps=(0, 1)),  # of 16.5 ms
         "action_noise": Event("action", events.noise, std=(0.0, 0.05)),
         "action_delay": Event("action", events.delay, steps=(0, 1)),  # of 16.5 ms
     }

@@ -38,6 +38,8 @@ class Reach(Task):
         "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.002)),  # [rad]
         "velocity_noise": Event("observation", events.noise, of="joint_velocities", std=(0.0, 0.05)),  # [rad/s]
         "goal_noise": Event("observation", events.noise, of="hand_to_goal", std=(0.0, 0.005)),  # [m], of a camera
+        "start": Event("start", events.offset_joints, body="arm", velocity=(-0.2, 0.2)),  # [rad/s]
+        "observation_delay": Event("observation", events.delay, steps=(0, 1)),  # of 17 ms
         "action_noise": Event("action", events.noise, std=(0.0, 0.05)),
         "action_delay": Event("action", events.delay, steps=(0, 2)),  # of 17 ms
     }

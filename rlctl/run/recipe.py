@@ -20,6 +20,7 @@ from rlctl.run import schema_text, untrusted, yaml_text
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.run.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.run.network_parameters import NETWORK_PARAMETERS
+from rlctl.run.presets import find_config
 from rlctl.run.quantities import Number, Switch, Whole
 from rlctl.run.stages import Stage, check_promotions
 
@@ -234,6 +235,7 @@ def resolve(
     """
     packaged_file = registry.find_recipe_file(task)
     packaged = read(packaged_file) if packaged_file else {}
+    config = find_config(config) if config else None
     from_config = read(config) if config else {}
     given = merge(from_config, settings)
     sources = [
