@@ -151,7 +151,7 @@ class Trials:
         return frames
 
     def copies(self, dimension: Dimension, seed: int, steps: int, longest_delay: int) -> NDArray[np.intp]:
-        """Return the elements of the observation that are nothing but this number of an earlier action."""
+        """Return the elements of the observation that only repeat this number of an earlier action."""
         rows = [frame.observation for frame in self.plain(seed, steps)[1:]]
         given = [flat_action(self.instance.action_leaves, each) for each in self.actions(seed, len(rows))]
         values = np.array([each[dimension.column] for each in given])

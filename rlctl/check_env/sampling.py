@@ -58,7 +58,7 @@ class TimedCall:
     name: str
     """`pybullet.stepSimulation`."""
     place: str
-    """Where in the environment's code most of its time goes, `file.py:12`; empty if that is not known."""
+    """Where in the environment's code most of its time goes, `file.py:12`; empty if there is none."""
     share: float
     """Its part of the time of all steps, or of all resets."""
     kind: str = ""
@@ -205,7 +205,7 @@ def _operation(frame: FrameType) -> str:
 
 
 def _called(frame: FrameType) -> tuple[str, bool]:
-    """Return the name of what a frame is calling, from the text of the call, and whether that is known as a builtin."""
+    """Return the name of what a frame is calling, from the text of the call, and whether that is a builtin for sure."""
     text = _call_text(frame.f_code, frame.f_lasti)
     root, *attributes = text.split(".")
     scopes: Iterable[Any] = (frame.f_locals, frame.f_globals, vars(builtins))

@@ -170,7 +170,7 @@ class WorldLogger:
 
     def finish(self) -> list[LoggedWorld]:
         """Return the worlds; boxes are put into them now, which leaves them unusable."""
-        # What never moves is no physics: a copy of the robot that kinematics are solved with.
+        # What never moves is not simulated: a copy of the robot that kinematics are solved with.
         worlds = [each for each in self.worlds.values() if each.moves] or list(self.worlds.values())
         for logged in worlds:
             for body in logged.world.bodies:

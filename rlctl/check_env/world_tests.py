@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rlctl.check_env.bullet_worlds import Body, World, bullet, read_gravity, read_states
 
 LONGEST_S = 0.1
-"""How long a world goes on by itself [s]: time enough for what was put inside something to be thrown out."""
+"""How long a world goes on without its environment [s]: what was put inside something is thrown out by then."""
 MOST_STEPS = 100
 GRAVITY = -9.81  # [m/s^2]
 WEIGHT_STEPS = 20

@@ -5,7 +5,14 @@ from broken_envs import Clean
 from gymnasium import spaces
 
 
-class DeadAction(Clean):
+class OneAxis(Clean):
+    """Success is a matter of the first number alone."""
+
+    def info(self):
+        return {"is_success": bool(abs(self.position[0]) < 0.1)}
+
+
+class DeadAction(OneAxis):
     def move(self, action):
         super().move(action * np.array([1, 0], np.float32))
 
@@ -17,14 +24,14 @@ class NoAction(Clean):
         super().move(self.np_random.uniform(-1, 1, 2).astype(np.float32))
 
 
-class LateAction(Clean):
+class LateAction(OneAxis):
     """The second number acts only near the end: nothing is wrong with it."""
 
     def move(self, action):
         super().move(action * np.array([1, self.steps > 40], np.float32))
 
 
-class HiddenAction(Clean):
+class HiddenAction(OneAxis):
     """The second number moves something that is not observed, and that is rewarded: it acts."""
 
     def start(self):
@@ -39,7 +46,7 @@ class HiddenAction(Clean):
         return super().reward() - 0.01 * abs(self.heat)
 
 
-class CostlyAction(Clean):
+class CostlyAction(OneAxis):
     """The second number costs, and moves nothing."""
 
     def move(self, action):
@@ -59,7 +66,7 @@ class Watched(CostlyAction):
         self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)
 
 
-class CopiedAction(Clean):
+class CopiedAction(OneAxis):
     """The last action is observed; the second number does nothing else."""
 
     def __init__(self):

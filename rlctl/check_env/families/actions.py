@@ -64,7 +64,7 @@ def compare_actions(context: Context) -> Iterator[Message]:
     with context.fresh() as instance:
         every = dimensions(instance.action_leaves)
         if not every:
-            raise NotJudged("no action of a known kind that can be varied")
+            raise NotJudged("no number of the action can be varied")
         trials = Trials(context, instance)
         trials.require_repeatable()
         effects: list[_Effect] = []

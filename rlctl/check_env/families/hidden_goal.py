@@ -39,7 +39,7 @@ class _Steps:
     seeds: NDArray[np.int64]
     numbers: NDArray[np.int64]
     """Which step of its episode each is."""
-    known: Numbers
+    features: Numbers
     """Observation before, observation after, action; in units of what is near. Shape (n, elements)."""
     rewards: Numbers
 
@@ -47,7 +47,7 @@ class _Steps:
 @check("RL114", *WITH_SEARCH)
 def find_hidden_goal(records: Records) -> Iterator[Finding]:
     steps = _steps(records, require_rewarded(records))
-    one, two = _alike(steps.known)
+    one, two = _alike(steps.features)
     differences = np.abs(steps.rewards[one] - steps.rewards[two])
     across = steps.seeds[one] != steps.seeds[two]
     # Of one episode, recorded twice perhaps, but at different times: chance in the reward would show.
@@ -83,21 +83,21 @@ def _steps(records: Records, episodes: list[Trajectory]) -> _Steps:
     parts = [part for each in episodes if (part := _steps_of(each, len(leaves))) is not None]
     if not parts:
         raise NotJudged("no whole observation was recorded")
-    seeds, numbers, known, rewards = (np.concatenate(each) for each in zip(*parts, strict=True))
+    seeds, numbers, features, rewards = (np.concatenate(each) for each in zip(*parts, strict=True))
     # Some, evenly, of the beginnings of episodes, where they are most alike, and as many of all others.
     halves = [np.flatnonzero(numbers <= 3), np.flatnonzero(numbers > 3)]
     chosen = np.concatenate([each[:: max(1, -(-len(each) * 2 // MOST_STEPS))] for each in halves])
-    near = NEAR * known.std(axis=0)
-    near[known.shape[1] - episodes[0].action_values.shape[1] :] *= NEAR_ACTION / NEAR
+    near = NEAR * features.std(axis=0)
+    near[features.shape[1] - episodes[0].action_values.shape[1] :] *= NEAR_ACTION / NEAR
     # Whole numbers, of places and kinds, are alike only if they are equal.
-    whole = (known == np.round(known)).all(axis=0)
+    whole = (features == np.round(features)).all(axis=0)
     near[whole] = np.minimum(near[whole], 0.5)
-    scaled = known[chosen] / np.where(near > 0, near, 1.0)
+    scaled = features[chosen] / np.where(near > 0, near, 1.0)
     return _Steps(seeds[chosen], numbers[chosen], scaled, rewards[chosen])
 
 
 def _steps_of(episode: Trajectory, leaves: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Numbers, Numbers] | None:
-    """Return seeds, numbers, what is known and rewards of an episode's steps; a last one that ends is left out."""
+    """Return seeds, numbers, features and rewards of an episode's steps; a last one that ends is left out."""
     steps = episode.steps - (episode.ended in ("terminated", "both", "raised"))
     series = [episode.observations.get(index) for index in range(leaves)]
     if steps < 1 or any(each is None or len(each.steps) != episode.steps + 1 for each in series):
@@ -106,19 +106,21 @@ def _steps_of(episode: Trajectory, leaves: int) -> tuple[NDArray[np.int64], NDAr
     observations = np.concatenate(flat, axis=1)
     if not np.isfinite(observations).all():
         return None
-    known = np.concatenate([observations[:steps], observations[1 : steps + 1], episode.action_values[:steps]], axis=1)
-    return np.full(steps, episode.seed), np.arange(1, steps + 1), known, episode.rewards[:steps]
+    features = np.concatenate(
+        [observations[:steps], observations[1 : steps + 1], episode.action_values[:steps]], axis=1
+    )
+    return np.full(steps, episode.seed), np.arange(1, steps + 1), features, episode.rewards[:steps]
 
 
-def _alike(known: Numbers) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _alike(features: Numbers) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the pairs of steps that are alike, in no number farther apart than 1: first of each, second of each."""
-    known = known - known.mean(axis=0)
-    squares = (known**2).sum(axis=1)
-    distances = squares[:, None] + squares[None, :] - 2 * known @ known.T
+    features = features - features.mean(axis=0)
+    squares = (features**2).sum(axis=1)
+    distances = squares[:, None] + squares[None, :] - 2 * features @ features.T
     # Rounding aside, no pair that is alike is farther apart than this.
-    most = known.shape[1] + 1e-9 * squares.max(initial=0.0)
+    most = features.shape[1] + 1e-9 * squares.max(initial=0.0)
     one, two = np.nonzero(np.triu(distances <= most, 1))
     step = max(1, -(-len(one) // MOST_PAIRS))
     one, two = one[::step], two[::step]
-    alike = (np.abs(known[one] - known[two]) <= 1.0).all(axis=1)
+    alike = (np.abs(features[one] - features[two]) <= 1.0).all(axis=1)
     return one[alike], two[alike]

@@ -1,4 +1,4 @@
-"""RL604 to RL606: what the reward makes worth doing, found by comparing recorded episodes."""
+"""RL604 to RL606: what the reward pays for, found by comparing recorded episodes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FAR_ABOVE = 5.0
 """The last reward of an episode is that of a goal, where success is not reported, if it stands out by so many times the
 spread of the rewards in its first half: a robot that falls while it walks fast ends with a good reward too."""
 CLEARLY = 0.1
-"""How much more hovering has to be worth than finishing."""
+"""How much more hovering has to earn than finishing."""
 NEARLY = 0.05
 """How much better than doing nothing something has to be, to be better."""
 FEWEST_COMPARED = 10
@@ -124,9 +124,9 @@ def find_paid_hovering(records: Records) -> Iterator[Finding]:
         step, expected = best.step + 1, f"below {best.finishing:.6g}"
         yield Finding(
             "RL605",
-            f"finishing at step {best.finished.steps} is worth {best.finishing:.4g} from step {step} on; stopping "
-            f"there instead earns {best.per_step:.3g} per step, worth {best.hovering:.4g} (discounted by {DISCOUNT} up "
-            f"to step {longest})",
+            f"finishing at step {best.finished.steps} earns {best.finishing:.4g} from step {step} on; stopping "
+            f"there instead earns {best.per_step:.3g} per step, {best.hovering:.4g} in all (discounted by {DISCOUNT} "
+            f"up to step {longest})",
             at_step(best.finished, step, value=best.hovering, expected=expected, per_step=best.per_step),
         )
 
@@ -179,7 +179,7 @@ def find_paid_idleness(records: Records) -> Iterator[Finding]:
     because = f"; {100 * share:.0f} % of it is the term {bonus!r}, which never changes" if bonus else ""
     yield Finding(
         "RL606",
-        f"doing nothing is worth {mean:.4g} over {steps} steps (discounted by {DISCOUNT}), the best of "
+        f"doing nothing earns {mean:.4g} over {steps} steps (discounted by {DISCOUNT}), the best of "
         f"{len(something)} other episodes {best:.4g}{because}",
         at_step(idle[0], steps, value=mean, best=best, term=bonus, share=share),
         Severity.WARNING if bonus else Severity.INFO,

@@ -1,9 +1,9 @@
 """Records a small search for good actions, so that rules see more of an environment than chance finds.
 
-All its episodes begin with the same seed, unless success comes by itself with it. The cross-entropy method comes first:
+All its episodes begin with the same seed, unless doing nothing succeeds with it. The cross-entropy method comes first:
 generations of sequences of a few held actions, each drawn around the best of those before. Then the best sequence is
 followed with another action from some step on; at last it stops shortly before its best moment, to see what standing
-still beside a goal is worth.
+still beside a goal earns.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class _Search:
         self._size = sum(int(np.prod(leaf.shape)) for leaf in self.instance.action_leaves)
 
     def do_nothing(self) -> Iterator[Message]:
-        """Play with zero actions, and stay with the first seed where that is no success."""
+        """Play with zero actions, and stay with the first seed where that does not succeed."""
         for seed in range(FIRST_SEED, FIRST_SEED + MOST_SEEDS):
             self._seed, self.attempts = seed, []
             yield from self.play([zero_action(self._space)] * self._length, "zero")

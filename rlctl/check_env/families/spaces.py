@@ -106,6 +106,6 @@ def find_unsupported_spaces(records: Records) -> Iterator[Finding]:
             else:
                 continue
             name = what + leaf_name(leaf).removeprefix("observation")
-            message = f"{name} is {'part ' if leaf.supported else ''}of a {kind} space, which SB3 has no network for"
+            message = f"{name} is {'part ' if leaf.supported else ''}of a {kind} space; SB3 has no network for it"
             yield Finding("RL109", message, {"element": name, "value": kind})
             break

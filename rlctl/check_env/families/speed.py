@@ -1,4 +1,4 @@
-"""RL9: speed. Training takes millions of steps; what each of them costs decides what can be done at all."""
+"""RL9: speed. Training takes millions of steps; the time of each decides what can be trained."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ MILLION = 1_000_000
 SLOW_STEPS_PER_S = 100.0
 """Below it a million steps, a small training, take about three hours on one core [steps/s]."""
 SLOW_RESET_S = 0.005
-"""A reset, or loading in it, below this is not worth a word, whatever its share of short episodes: PyBullet's
+"""A reset, or loading in it, below this is not reported, whatever its share of short episodes: PyBullet's
 resetSimulation of an empty world alone takes half a millisecond [s]."""
 MOST_RESET = 0.5
 """Share of an episode that reset takes from which most of training is spent in reset."""
 LITTLE_LOADING = 0.05
-"""Share of an episode below which loading in reset for more than `SLOW_RESET_S` is only worth knowing: environments
+"""Share of an episode below which loading in reset for more than `SLOW_RESET_S` is an info: environments
 that are stepped together wait for the one that resets, but rarely."""
 MOST_LOADING = 0.2
-"""Share of a step that loading or reading files takes from which that is worth the work to change."""
+"""Share of a step that loading or reading files takes from which that is a finding."""
 LEAST_DRAWING = 0.05
-"""Share of a step, or of a reset, below which drawing and waiting are not worth a word: a `render` that returns at
+"""Share of a step, or of a reset, below which drawing and waiting are not reported: a `render` that returns at
 once because there is nothing to show."""
 SMALLEST_IMAGE = 8
 """An observation with two axes at least this long is an image, so a camera is part of the task [pixels]."""

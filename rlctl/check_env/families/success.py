@@ -33,7 +33,7 @@ MANY_AT_START = 0.2
 """Part of the starts that may be successes by chance: a goal that is drawn near the robot now and then."""
 FEWEST_STARTS = 10
 FEWEST_EPISODES = 20
-"""Episodes from which it is worth saying that none succeeded."""
+"""Fewer episodes say little about whether one can succeed."""
 FEWEST_STEPS = 500
 """Steps of them: less is what raises, or ends, at once."""
 OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
