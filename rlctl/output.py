@@ -8,6 +8,7 @@ import json
 import os
 import stat
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -62,6 +63,12 @@ def _make_console(stream: TextIO) -> Console:
 
     width = None if stream.isatty() else _PIPED_WIDTH
     return Console(file=stream, highlight=False, width=width, soft_wrap=not stream.isatty())
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    """Print lines for people to stderr."""
+    for note in notes:
+        err().print(note, markup=False, style="dim")
 
 
 def write_result_json(target: str, content: Any) -> None:

@@ -13,7 +13,7 @@ from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_
 from rlctl.rollout.collect import Episode, run_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
-from rlctl.run import directory
+from rlctl.run import lookup
 from rlctl.run.policy import BatchActor, Policy, PolicyInfo, load_policy
 
 _ENVS = 32
@@ -99,13 +99,16 @@ def run_evaluation(request: EvalRequest, gates: Gates) -> Evaluation:
 
 def run_evaluations(request: EvalRequest, gates: Gates) -> list[Evaluation]:
     """Find the policy and evaluate it as `run_evaluation` does, in every stage that was asked for, with equal seeds."""
-    path, _ = directory.find_policy(request.run, request.checkpoint)
+    found = lookup.find_policy(request.run, request.checkpoint)
+    output.print_notes(found.notes)
+    path = found.file
     if path.suffix == ".safetensors":
         from rlctl.run.torch_policy import pin_threads
 
         pin_threads()
     policy = load_policy(path)
-    return [_evaluate(path, policy, spec, request, gates) for spec in _choose_specs(policy.info, request)]
+    specs = [found.locate(spec) for spec in _choose_specs(policy.info, request)]
+    return [_evaluate(path, policy, spec, request, gates) for spec in specs]
 
 
 def _choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:

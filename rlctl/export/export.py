@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.export.report import ExportReport, Port, format_agreement, format_closed_loop
+from rlctl.output import print_notes
 from rlctl.rollout.workers import Workers
-from rlctl.run import directory, files, onnx_file
+from rlctl.run import files, lookup, onnx_file
+from rlctl.run.lookup import FoundPolicy
 from rlctl.run.policy import PolicyInfo, read_policy
 
 if TYPE_CHECKING:
@@ -25,22 +27,25 @@ def export_onnx(run: str | None, *, checkpoint: str, output: Path | None) -> Exp
     that cannot be written as ONNX, and `AnswerIsNo` with the numbers if the file does not act as the policy does;
     then no file is left.
     """
-    policy_file, owner = directory.find_policy(run, checkpoint)
+    found = lookup.find_policy(run, checkpoint)
+    print_notes(found.notes)
+    policy_file, owner = found.file, found.run
     if policy_file.suffix == ".onnx":
         raise UsageError(f"{policy_file}: an ONNX file already; export the run or its .safetensors file")
     if output is None:
         output = owner.onnx_file if owner else policy_file.with_suffix(".onnx")
     if output.suffix != ".onnx":
         raise UsageError(f"--output {output}: the name of an ONNX file ends in .onnx")
-    return _export(policy_file, output)
+    return _export(found, output)
 
 
-def _export(policy_file: Path, target: Path) -> ExportReport:
+def _export(found: FoundPolicy, target: Path) -> ExportReport:
     from rlctl.export.verify import N_ENVS
 
+    policy_file = found.file
     info, tensors = read_policy(policy_file)
     # The environments are built while torch is imported.
-    with Workers(info.spec, N_ENVS) as workers:
+    with Workers(found.locate(info.spec), N_ENVS) as workers:
         from rlctl.export.actor import build
         from rlctl.run.torch_policy import TorchPolicy, pin_threads
 

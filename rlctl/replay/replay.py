@@ -14,9 +14,10 @@ from rlctl.replay.reproduce import print_warning, record_episode, verify_episode
 from rlctl.replay.scene import Env
 from rlctl.replay.window import open_window, show_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.run.directory import RunDirectory, find_policy
+from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import describe
-from rlctl.run.episode import load_episode, save_episode
+from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
+from rlctl.run.lookup import find_owner, find_policy, locate_task
 from rlctl.run.policy import Policy, load_policy
 
 
@@ -78,13 +79,19 @@ def _check_request(request: ReplayRequest) -> None:
 
 
 def _verify(path: Path) -> ReplayResult:
-    episode = load_episode(path)
+    episode = _load_episode(path)
     rollout, verification = verify_episode(episode, path)
     return ReplayResult(episode.info.spec.task, episode.info.policy, [_summarize(rollout)], verification)
 
 
-def _record_episode(path: Path, where: Path | None) -> ReplayResult:
+def _load_episode(path: Path) -> RecordedEpisode:
     episode = load_episode(path)
+    spec = dataclasses.replace(episode.info.spec, task=locate_task(episode.info.spec.task, find_owner(path)))
+    return dataclasses.replace(episode, info=episode.info.model_copy(update={"spec": spec}))
+
+
+def _record_episode(path: Path, where: Path | None) -> ReplayResult:
+    episode = _load_episode(path)
     recording = path.with_suffix(".rrd")
     if where is not None:
         recording = where if where.suffix == ".rrd" else where / recording.name
@@ -93,7 +100,7 @@ def _record_episode(path: Path, where: Path | None) -> ReplayResult:
 
 
 def _show_episode(path: Path) -> ReplayResult:
-    episode = load_episode(path)
+    episode = _load_episode(path)
     info, spec = episode.info, episode.info.spec
     with open_window(spec) as env:
         actions = recorded_actions(episode, env, path)
@@ -107,14 +114,16 @@ class _Actor:
     def __init__(self, request: ReplayRequest) -> None:
         self._output = request.output
         self._seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes)
-        self._file, self._run = find_policy(request.source, request.checkpoint)
+        found = find_policy(request.source, request.checkpoint)
+        output.print_notes(found.notes)
+        self._file, self._run = found.file, found.run
         if self._file.suffix == ".safetensors":
             from rlctl.run.torch_policy import pin_threads
 
             pin_threads()
         self._policy: Policy = load_policy(self._file)
         info = self._policy.info
-        self._spec: EnvSpec = info.derive_spec(request.task, request.changes)
+        self._spec: EnvSpec = found.locate(info.derive_spec(request.task, request.changes))
         self._name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
 
     def show(self) -> ReplayResult:

@@ -7,13 +7,12 @@ import datetime
 import errno
 import fcntl
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import registry
-from rlctl.errors import ArtifactError, UsageError, did_you_mean, short_repr
+from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.run import files
 
 if TYPE_CHECKING:
@@ -238,12 +237,13 @@ def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
             continue
         except OSError as error:
             raise ArtifactError(f"{folder}: cannot make a run folder: {error.strerror}") from None
-        _point_latest_to(root, folder / name)
+        point_latest_to(root, folder / name)
         return RunDirectory(folder / name)
     raise ArtifactError(f"{folder}: cannot make a run folder")
 
 
-def _point_latest_to(root: Path, run: Path) -> None:
+def point_latest_to(root: Path, run: Path) -> None:
+    """Let the link `latest` lead to a run."""
     beside = root / f".latest.{os.getpid()}"
     try:
         beside.unlink(missing_ok=True)
@@ -251,69 +251,3 @@ def _point_latest_to(root: Path, run: Path) -> None:
         beside.replace(root / "latest")
     except OSError:  # no links on this file system; runs are found by time without it
         beside.unlink(missing_ok=True)
-
-
-def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
-    """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing."""
-    if text is None or text == "latest":
-        # The link first: names go by a clock, which may have been set back since.
-        newest = _read_latest(root) or _repair_latest(root)
-        if newest is None:
-            raise ArtifactError(f"no run yet under {root.resolve()}; train one: rlctl train reach")
-        return newest
-    if (Path(text) / "run.json").is_file():
-        return RunDirectory(Path(text))
-    if Path(text).name == "latest" and _dangles(Path(text)):
-        return find_run("latest", Path(text).parent)
-    folder = root / registry.make_slug(text)
-    if (newest := _find_newest(folder, depth=1)) is not None:
-        return newest
-    if Path(text).is_dir():
-        raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
-    names = [each.name for each in root.iterdir() if each.is_dir()] if root.is_dir() else []
-    if registry.find(text):
-        raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}")
-    raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{did_you_mean(text, names)}")
-
-
-def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> tuple[Path, RunDirectory | None]:
-    """Return the policy file for a user's word, which may be a policy file itself, and its run if it has one."""
-    if text is not None and Path(text).suffix in (".safetensors", ".onnx"):
-        path = Path(text)
-        if not path.exists():
-            raise ArtifactError(f"{path}: no such file")
-        owner = path.parent.parent
-        return path, RunDirectory(owner) if (owner / "run.json").is_file() else None
-    run = find_run(text, root)
-    return run.policy_file(which), run
-
-
-def _repair_latest(root: Path) -> RunDirectory | None:
-    """Return the newest run, and point to it where the run that `latest` points to was removed."""
-    newest = _find_newest(root)
-    if newest is not None and _dangles(root / "latest"):
-        _point_latest_to(root, newest.path)
-    return newest
-
-
-def _dangles(link: Path) -> bool:
-    return link.is_symlink() and not link.exists()
-
-
-def _read_latest(root: Path) -> RunDirectory | None:
-    with contextlib.suppress(OSError, ValueError):  # no link, or one that leads elsewhere
-        run = root / os.readlink(root / "latest")
-        if (root / "latest").resolve().is_relative_to(root.resolve()) and (run / "run.json").is_file():
-            return RunDirectory(run)
-    return None
-
-
-_RUN_NAME = re.compile(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_s\d+(_\d+)?$")
-
-
-def _find_newest(root: Path, depth: int = 2) -> RunDirectory | None:
-    pattern = "*/run.json" if depth == 1 else "*/*/run.json"
-    runs = [file.parent for file in root.glob(pattern) if _RUN_NAME.match(file.parent.name)]
-    if not runs:
-        return None
-    return RunDirectory(max(runs, key=lambda run: (run.name[:19], (run / "run.json").stat().st_mtime_ns)))

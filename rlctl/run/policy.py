@@ -127,6 +127,18 @@ def compute_digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
     return content.hexdigest()
 
 
+def read_info(path: Path) -> PolicyInfo:
+    """Read what a policy file says of its policy, without its numbers; raises `ArtifactError` as `read_policy` does."""
+    from safetensors import SafetensorError, safe_open
+
+    untrusted.check_safetensors(path)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            return parse_info((file.metadata() or {}).get("rlctl"), path)
+    except (SafetensorError, OSError) as error:
+        raise ArtifactError(f"{path}: damaged, or not a .safetensors file: {error}") from None
+
+
 def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
     """Read a policy file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
     from safetensors import SafetensorError, safe_open

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
-from rlctl.run.directory import RunDirectory, find_run
+from rlctl.run.directory import RunDirectory
+from rlctl.run.lookup import find_run
 from rlctl.run.recipe_difference import find_difference
 from rlctl.runs.statistics import (
     Difference,

@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 
 from rlctl import output
-from rlctl.run.directory import RunDirectory, find_run
+from rlctl.run.directory import RunDirectory
+from rlctl.run.lookup import find_run
 from rlctl.run.memory import format_bytes
 from rlctl.runs.listing import as_json
 from rlctl.runs.summary import RunSummary, evaluations, read_table, summarize

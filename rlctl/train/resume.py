@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import ArtifactError, RecipeError, UsageError
-from rlctl.run import directory, files
+from rlctl.run import files, lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.recipe import Recipe, validate
 from rlctl.train import status
@@ -51,13 +51,13 @@ def load_start(word: str | None, settings: Mapping[str, Any], root: Path, *, for
     for key in settings:
         if key not in _MAY_CHANGE:
             raise UsageError(f"--resume goes on with the run's own recipe: {key} cannot be changed, only -n")
-    run = directory.find_run(word, root)
+    run = lookup.find_run(word, root)
     before = run.recipe()
     lock = run.lock()  # before looking: a process that is training removes old checkpoints
     try:
         recipe = validate({**before.model_dump(by_alias=True), **settings}, "recipe")
         before_status = run.status()
-        task = _task(before_status, run)
+        task = lookup.locate_task(_task(before_status, run), run)
         changes = status.describe_task_changes(before_status, task)
         if changes and not force:
             raise UsageError(

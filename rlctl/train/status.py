@@ -47,6 +47,7 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
         changes["resumed_at_step"] = resumed_at
     else:
         changes["started"] = _now()
+        changes["folder"] = os.getcwd()  # what a task's path may be relative to
     run.write_status(changes)
 
 

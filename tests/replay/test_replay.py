@@ -79,7 +79,16 @@ def test_result_as_json(run, tmp_path):
     content = as_json(run_replay(ReplayRequest(str(run.run.best_policy), episodes=2, output=tmp_path)))
     files = [str(tmp_path / name) for name in ("000000.rrd", "000001.rrd")]
     assert [episode["file"] for episode in content["episodes"]] == files
-    assert content["episodes"][0].keys() == {"file", "episode", "seed", "length", "return", "success"}
+    assert content["episodes"][0].keys() == {
+        "file",
+        "episode",
+        "seed",
+        "length",
+        "return",
+        "success",
+        "randomized",
+        "events",
+    }
     assert content["open"] == f"rerun {files[0]} {files[1]}"
     assert content["versions"].keys() >= {"rlctl", "pybullet"}
 

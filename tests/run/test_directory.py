@@ -5,7 +5,6 @@ import fcntl
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 
@@ -13,7 +12,7 @@ import pytest
 
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import directory
-from rlctl.run.directory import RunDirectory, find_policy, find_run
+from rlctl.run.directory import RunDirectory
 from rlctl.run.recipe import Recipe
 
 
@@ -70,90 +69,6 @@ def test_a_folder_that_cannot_be_made(tmp_path):
     assert error(ArtifactError, directory.create, "reach", 0, tmp_path / "runs").endswith(
         "runs/reach: cannot make a run folder: Not a directory"
     )
-
-
-def test_the_newest_run(root, make_run):
-    make_run("reach", "2026-01-01_10-00-00_s0")
-    newest = make_run("ant", "2026-01-03_10-00-00_s0")
-    reach = make_run("reach", "2026-01-02_10-00-00_s9")
-    (root / "reach" / "notes").mkdir()
-    assert find_run(None, root).path == find_run("latest", root).path == newest.path
-    assert find_run("reach", root).path == reach.path
-    assert find_run(str(newest.path), root).path == newest.path
-    assert find_run("some/where/ant.py:ant", root).path == newest.path
-
-
-@pytest.mark.parametrize("text", [None, "latest", "runs/latest"])
-def test_latest_points_to_the_newest_run_when_its_own_was_removed(root, make_run, text):
-    left = make_run("reach", "2026-01-01_10-00-00_s0")
-    removed = directory.create("ant", 0, root)
-    removed.write_status({"task": "ant"})
-    assert find_run(text, root).path.resolve() == removed.path
-    shutil.rmtree(removed.path)
-    assert not (root / "latest").exists()
-    assert find_run(text, root).path.resolve() == left.path
-    assert (root / "latest").resolve() == left.path
-
-
-def test_of_two_in_one_second_the_later(root, make_run):
-    first = make_run("reach", "2026-01-01_10-00-00_s0")
-    second = make_run("reach", "2026-01-01_10-00-00_s0_1")
-    os.utime(first.status_file, (1, 1))
-    assert find_run("reach", root).path == second.path
-
-
-def test_no_run_yet(root):
-    expected = f"no run yet under {root}; train one: rlctl train reach"
-    assert error(ArtifactError, find_run, None, root) == expected
-    assert error(ArtifactError, find_run, "reach", root) == (
-        f"no run of 'reach' yet under {root}; train one: rlctl train reach"
-    )
-    assert ArtifactError("").exit_code == 5
-
-
-def test_a_word_that_names_no_run(root, make_run, tmp_path):
-    make_run("reach", "2026-01-01_10-00-00_s0")
-    assert error(ArtifactError, find_run, "raech", root) == (
-        "no run 'raech': not a folder, and no task with a run. Did you mean 'reach'?"
-    )
-    (tmp_path / "stuff").mkdir()
-    assert error(ArtifactError, find_run, "stuff", root) == "stuff: not a run of rlctl: it has no run.json"
-
-
-def test_which_policy(root, make_run):
-    run = make_run("reach", "2026-01-01_10-00-00_s0")
-    path, owner = find_policy("reach", root=root)
-    assert path == run.best_policy
-    assert owner.path == run.path
-    assert find_policy(str(run.best_policy), root=root)[1].path == run.path
-    assert error(ArtifactError, find_policy, "reach", "last", root) == f"{run.path}: no last policy yet; it saved none"
-    assert error(UsageError, find_policy, "reach", "worst", root) == (
-        "--checkpoint 'worst': give best, last, or the step of a checkpoint"
-    )
-    assert error(ArtifactError, find_policy, "reach", "500", root) == (
-        f"{run.path}: no checkpoint at step 500; there are: none"
-    )
-    folder = run.checkpoint(1200)
-    folder.mkdir(parents=True)
-    (folder / "policy.safetensors").write_bytes(b"")
-    assert folder.name == "000001200"
-    assert find_policy("reach", "1200", root)[0] == folder / "policy.safetensors"
-    assert error(ArtifactError, find_policy, "reach", "500", root).endswith("there are: 1200")
-
-
-def test_no_best_policy_yet(root, make_run):
-    run = make_run("reach", "2026-01-01_10-00-00_s0", policy="last")
-    assert error(ArtifactError, find_policy, "reach", "best", root) == (
-        f"{run.path}: no best policy yet; train longer, or use --checkpoint last"
-    )
-    assert find_policy("reach", "last", root)[0] == run.last_policy
-
-
-def test_a_policy_file_itself(root, tmp_path):
-    file = tmp_path / "mine.safetensors"
-    assert error(ArtifactError, find_policy, str(file)) == f"{file}: no such file"
-    file.write_bytes(b"")
-    assert find_policy(str(file)) == (file, None)
 
 
 def test_half_written_checkpoints_do_not_count(root, make_run):

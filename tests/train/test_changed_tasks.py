@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import ArtifactError, Interrupted, TaskError, UsageError
-from rlctl.run import directory
+from rlctl.run import lookup
 from rlctl.train import checkpoint
 from tests.train.comparing import Killed, assert_same_run, replay_buffer, rows
 from tests.train.conftest import ENVS, TINY
@@ -52,7 +52,7 @@ def killed(train, kill_at, tmp_path):
         kill_at(64)
         with pytest.raises(Killed):
             train(env, settings, **request)
-        return directory.find_run("latest", tmp_path / "runs")
+        return lookup.find_run("latest", tmp_path / "runs")
 
     return run
 

@@ -5,7 +5,7 @@ import pytest
 from rlctl.errors import ArtifactError, TaskError, UsageError
 from rlctl.replay.replay import ReplayRequest, run_replay
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.run import directory
+from rlctl.run import lookup
 from rlctl.run.episode import load_episode
 from tests.train.comparing import Killed, rows
 from tests.train.conftest import FAULTY, TINY
@@ -27,7 +27,7 @@ def settings(tmp_path):
 
 
 def only_run(tmp_path):
-    return directory.find_run("latest", tmp_path / "runs")
+    return lookup.find_run("latest", tmp_path / "runs")
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_none_ever_succeeded(train, settings, tmp_path, rlctl):
     run = only_run(tmp_path)
     assert not run.evals_file.exists()
     with pytest.raises(ArtifactError, match="no best policy yet; train longer, or use --checkpoint last"):
-        directory.find_policy("latest", root=tmp_path / "runs")
+        lookup.find_policy("latest", root=tmp_path / "runs")
     assert run.last_policy.exists()
 
 

@@ -1,0 +1,177 @@
+"""From what the user typed for RUN to a run folder, a policy file, and what to say about the choice."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rlctl import registry
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import ArtifactError, did_you_mean
+from rlctl.run.directory import ROOT, RunDirectory, point_latest_to
+from rlctl.run.policy import PolicyInfo, read_info
+
+_MOST_COMPARED = 50  # older runs whose scores are looked at
+_RUN_NAME = re.compile(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_s\d+(_\d+)?$")
+
+
+@dataclasses.dataclass(frozen=True)
+class FoundPolicy:
+    """A policy file, and the run that it belongs to, if any."""
+
+    file: Path
+    run: RunDirectory | None
+    notes: tuple[str, ...] = ()
+    """What to tell a user who did not name the run: which it is, what was passed over, which older one was better."""
+
+    def locate(self, spec: EnvSpec) -> EnvSpec:
+        """Return `spec` with its task where it was when the run was trained; see `locate_task`."""
+        return dataclasses.replace(spec, task=locate_task(spec.task, self.run))
+
+
+def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
+    """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing."""
+    if text is None or text == "latest":
+        # The link first: names go by a clock, which may have been set back since.
+        newest = _read_latest(root) or _repair_latest(root)
+        if newest is None:
+            raise ArtifactError(f"no run yet under {root.resolve()}; train one: rlctl train reach")
+        return newest
+    if (Path(text) / "run.json").is_file():
+        return RunDirectory(Path(text))
+    if Path(text).name == "latest" and _dangles(Path(text)):
+        return find_run("latest", Path(text).parent)
+    if found := _list_newest_first(root / registry.make_slug(text), "*/run.json"):
+        return found[0]
+    if Path(text).is_dir():
+        raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
+    if Path(text).suffix == ".zip":
+        raise ArtifactError(
+            f"{text}: a .zip, as Stable-Baselines3 saves models, not a run; make a policy of it: "
+            f"rlctl runs import {text} --task TASK"
+        )
+    names = [each.name for each in root.iterdir() if each.is_dir()] if root.is_dir() else []
+    if registry.find(text):
+        raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}")
+    raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{did_you_mean(text, names)}")
+
+
+def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> FoundPolicy:
+    """Return the policy for a user's word, which may be a policy file itself.
+
+    A task's name stands for its newest run that has such a policy.
+    """
+    if text is not None and Path(text).suffix in (".safetensors", ".onnx"):
+        path = Path(text)
+        if not path.exists():
+            raise ArtifactError(f"{path}: no such file")
+        return FoundPolicy(path, find_owner(path))
+    run = find_run(text, root)
+    if text is not None and (Path(text) / "run.json").is_file():
+        return FoundPolicy(run.policy_file(which), run)
+    runs = _list_newest_first(run.path.parent, "*/run.json")
+    older = [each for each in runs if each.path.name < run.path.name] if text in (None, "latest") else runs[1:]
+    candidates = [run] if text in (None, "latest") else runs
+    for number, candidate in enumerate(candidates):
+        with contextlib.suppress(ArtifactError):
+            file = candidate.policy_file(which)
+            return FoundPolicy(file, candidate, _describe_choice(file, candidate, candidates[:number], older[number:]))
+    run.policy_file(which)  # which says why there is none
+    raise AssertionError
+
+
+def find_owner(file: Path) -> RunDirectory | None:
+    """Return the run that a policy, a checkpoint's policy or a recorded episode belongs to; None for a file alone."""
+    folders = file.absolute().parents[1:3]
+    return next((RunDirectory(each) for each in folders if (each / "run.json").is_file()), None)
+
+
+def locate_task(task: str, run: RunDirectory | None) -> str:
+    """Return a task with the whole path of its file, if it was named by a path from the folder of the training.
+
+    A run that has been moved to another folder finds the file there, by the path that was typed.
+    """
+    place, _, name = task.rpartition(":")
+    if run is None or not place.endswith(".py") or Path(place).expanduser().is_absolute():
+        return task
+    folder = run.status().get("folder")
+    if not isinstance(folder, str) or not (original := Path(folder) / place).is_file():
+        return task
+    here = Path(place)
+    moved = not run.path.resolve().is_relative_to(folder)
+    return task if here.is_file() and (moved or here.samefile(original)) else f"{original}:{name}"
+
+
+def _describe_choice(
+    file: Path, run: RunDirectory, passed_over: Sequence[RunDirectory], older: Sequence[RunDirectory]
+) -> tuple[str, ...]:
+    try:
+        info = read_info(file)
+    except ArtifactError:  # who loads it says the same
+        return ()
+    notes = [f"run {run.path}: policy of step {info.training_steps:,}, saved {_describe_age(file)} ago"]
+    if passed_over:
+        notes.append(f"passed over, without such a policy: {', '.join(str(each.path) for each in passed_over)}")
+    if (better := _find_better(info, older)) is not None:
+        notes.append(better)
+    return tuple(notes)
+
+
+def _find_better(info: PolicyInfo, older: Sequence[RunDirectory]) -> str | None:
+    """Describe the best older run of the same task, parameters and rewards, if it was better in its evaluations."""
+    found: list[tuple[float, RunDirectory, str]] = []
+    for run in older[:_MOST_COMPARED]:
+        with contextlib.suppress(ArtifactError):
+            other = read_info(run.policy_file("best"))
+            same = all(getattr(other.spec, key) == getattr(info.spec, key) for key in ("parameters", "reward_weights"))
+            if not same or info.evaluation is None or other.evaluation is None:
+                continue
+            ours, theirs, form = info.evaluation.success, other.evaluation.success, "success {:.1%} against {:.1%}"
+            if ours is None or theirs is None:
+                ours, theirs = info.evaluation.mean_return, other.evaluation.mean_return
+                form = "return {:.4g} against {:.4g}"
+            if theirs > ours:
+                found.append((theirs, run, form.format(theirs, ours)))
+    if not found:
+        return None
+    _, run, scores = max(found, key=lambda each: each[0])
+    return f"an older run was better in its evaluations: {run.path} ({scores})"
+
+
+def _describe_age(file: Path) -> str:
+    seconds = max(time.time() - file.stat().st_mtime, 0.0)
+    for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _read_latest(root: Path) -> RunDirectory | None:
+    with contextlib.suppress(OSError, ValueError):  # no link, or one that leads elsewhere
+        run = root / os.readlink(root / "latest")
+        if (root / "latest").resolve().is_relative_to(root.resolve()) and (run / "run.json").is_file():
+            return RunDirectory(run)
+    return None
+
+
+def _repair_latest(root: Path) -> RunDirectory | None:
+    """Return the newest run, and point to it where the run that `latest` points to was removed."""
+    newest = next(iter(_list_newest_first(root, "*/*/run.json")), None)
+    if newest is not None and _dangles(root / "latest"):
+        point_latest_to(root, newest.path)
+    return newest
+
+
+def _dangles(link: Path) -> bool:
+    return link.is_symlink() and not link.exists()
+
+
+def _list_newest_first(root: Path, pattern: str) -> list[RunDirectory]:
+    runs = [file.parent for file in root.glob(pattern) if _RUN_NAME.match(file.parent.name)]
+    runs.sort(key=lambda run: (run.name[:19], (run / "run.json").stat().st_mtime_ns), reverse=True)
+    return [RunDirectory(run) for run in runs]

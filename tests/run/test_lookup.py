@@ -1,0 +1,212 @@
+"""What a user's word for RUN stands for, and what is said about the choice."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.run import directory, lookup
+from rlctl.run.directory import RunDirectory
+from rlctl.run.env_info import EnvInfo
+from rlctl.run.lookup import find_policy, find_run
+from rlctl.run.policy import PolicyInfo, Score, save_policy
+
+
+@pytest.fixture
+def root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def make_run(root):
+    def make(task: str, name: str, policy: str | None = "best") -> RunDirectory:
+        run = RunDirectory(root / task / name)
+        run.path.mkdir(parents=True)
+        run.write_status({"task": task})
+        if policy:
+            (run.path / "policies").mkdir()
+            (run.path / "policies" / f"{policy}.safetensors").write_bytes(b"")
+        return run
+
+    return make
+
+
+def error(kind, call, *arguments):
+    with pytest.raises(kind) as caught:
+        call(*arguments)
+    return str(caught.value)
+
+
+def test_the_newest_run(root, make_run):
+    make_run("reach", "2026-01-01_10-00-00_s0")
+    newest = make_run("ant", "2026-01-03_10-00-00_s0")
+    reach = make_run("reach", "2026-01-02_10-00-00_s9")
+    (root / "reach" / "notes").mkdir()
+    assert find_run(None, root).path == find_run("latest", root).path == newest.path
+    assert find_run("reach", root).path == reach.path
+    assert find_run(str(newest.path), root).path == newest.path
+    assert find_run("some/where/ant.py:ant", root).path == newest.path
+
+
+def test_of_two_in_one_second_the_later(root, make_run):
+    first = make_run("reach", "2026-01-01_10-00-00_s0")
+    second = make_run("reach", "2026-01-01_10-00-00_s0_1")
+    os.utime(first.status_file, (1, 1))
+    assert find_run("reach", root).path == second.path
+
+
+def test_no_run_yet(root):
+    expected = f"no run yet under {root}; train one: rlctl train reach"
+    assert error(ArtifactError, find_run, None, root) == expected
+    assert error(ArtifactError, find_run, "reach", root) == (
+        f"no run of 'reach' yet under {root}; train one: rlctl train reach"
+    )
+    assert ArtifactError("").exit_code == 5
+
+
+def test_a_word_that_stands_for_no_run(root, make_run, tmp_path):
+    make_run("reach", "2026-01-01_10-00-00_s0")
+    assert error(ArtifactError, find_run, "raech", root) == (
+        "no run 'raech': not a folder, and no task with a run. Did you mean 'reach'?"
+    )
+    (tmp_path / "stuff").mkdir()
+    assert error(ArtifactError, find_run, "stuff", root) == "stuff: not a run of rlctl: it has no run.json"
+
+
+def test_which_policy(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    found = find_policy("reach", root=root)
+    assert found.file == run.best_policy
+    assert found.run.path == run.path
+    assert find_policy(str(run.best_policy), root=root).run.path == run.path
+    assert error(ArtifactError, find_policy, "reach", "last", root) == f"{run.path}: no last policy yet; it saved none"
+    assert error(UsageError, find_policy, "reach", "worst", root) == (
+        "--checkpoint 'worst': give best, last, or the step of a checkpoint"
+    )
+    assert error(ArtifactError, find_policy, "reach", "500", root) == (
+        f"{run.path}: no checkpoint at step 500; there are: none"
+    )
+    folder = run.checkpoint(1200)
+    folder.mkdir(parents=True)
+    (folder / "policy.safetensors").write_bytes(b"")
+    assert folder.name == "000001200"
+    assert find_policy("reach", "1200", root).file == folder / "policy.safetensors"
+    assert error(ArtifactError, find_policy, "reach", "500", root).endswith("there are: 1200")
+
+
+def test_no_best_policy_yet(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0", policy="last")
+    assert error(ArtifactError, find_policy, "reach", "best", root) == (
+        f"{run.path}: no best policy yet; train longer, or use --checkpoint last"
+    )
+    assert find_policy("reach", "last", root).file == run.last_policy
+
+
+def test_a_policy_file_itself(root, tmp_path):
+    file = tmp_path / "mine.safetensors"
+    assert error(ArtifactError, find_policy, str(file)) == f"{file}: no such file"
+    file.write_bytes(b"")
+    assert find_policy(str(file)) == lookup.FoundPolicy(file, None)
+
+
+BOX = {"type": "Box", "low": "-1.0", "high": "1.0", "shape": [1], "dtype": "float32"}
+
+
+def give_policy(run, success=None, mean_return=0.0, steps=1000, parameters=None):
+    info = PolicyInfo(
+        algo="ppo",
+        policy="MlpPolicy",
+        env=EnvInfo(observation_space=BOX, action_space=BOX),
+        spec=EnvSpec("reach", parameters or {}),
+        training_steps=steps,
+        evaluation=Score(success=success, mean_return=mean_return),
+    )
+    save_policy(run.best_policy, info, {"policy/x": np.zeros(1)})
+    os.utime(run.best_policy, (1e9, 1e9))
+
+
+def test_a_task_stands_for_its_newest_run_with_a_policy(root, make_run, monkeypatch):
+    first, second, third = (make_run("reach", f"2026-01-0{day}_10-00-00_s0") for day in (1, 2, 3))
+    third.best_policy.unlink()
+    give_policy(first, success=0.9)
+    give_policy(second, success=0.5)
+    monkeypatch.setattr(lookup.time, "time", lambda: 1e9 + 7200)
+    found = find_policy("reach", root=root)
+    assert found.file == second.best_policy
+    assert found.notes == (
+        f"run {second.path}: policy of step 1,000, saved 2 h ago",
+        f"passed over, without such a policy: {third.path}",
+        f"an older run was better in its evaluations: {first.path} (success 90.0% against 50.0%)",
+    )
+    # The newest run is what `latest` says, with a policy or not.
+    assert error(ArtifactError, find_policy, "latest", "best", root) == (
+        f"{third.path}: no best policy yet; train longer, or use --checkpoint last"
+    )
+    # Who names a run, or a file, knows which it is.
+    assert find_policy(str(first.path), root=root).notes == ()
+    assert find_policy(str(first.best_policy), root=root).notes == ()
+
+
+def test_only_runs_of_the_same_problem_are_compared(root, make_run):
+    first, second = (make_run("reach", f"2026-01-0{day}_10-00-00_s0") for day in (1, 2))
+    give_policy(first, mean_return=5.0, parameters={"tolerance": 0.5})
+    give_policy(second, mean_return=1.0)
+    assert len(find_policy("reach", root=root).notes) == 1
+    give_policy(first, mean_return=5.0)
+    assert find_policy(None, root=root).notes[1].endswith(f"{first.path} (return 5 against 1)")
+
+
+def test_no_run_of_a_task_has_a_policy(root, make_run):
+    runs = [make_run("reach", f"2026-01-0{day}_10-00-00_s0") for day in (1, 2)]
+    for run in runs:
+        run.best_policy.unlink()
+    assert error(ArtifactError, find_policy, "reach", "best", root).startswith(f"{runs[1].path}: no best policy yet; ")
+
+
+@pytest.mark.parametrize("text", [None, "latest", "runs/latest"])
+def test_latest_points_to_the_newest_run_when_its_own_was_removed(root, make_run, text):
+    left = make_run("reach", "2026-01-01_10-00-00_s0")
+    removed = directory.create("ant", 0, root)
+    removed.write_status({"task": "ant"})
+    assert find_run(text, root).path.resolve() == removed.path
+    shutil.rmtree(removed.path)
+    assert not (root / "latest").exists()
+    assert find_run(text, root).path.resolve() == left.path
+    assert (root / "latest").resolve() == left.path
+
+
+def test_a_model_of_sb3_is_told_what_it_is(root, make_run, tmp_path):
+    (tmp_path / "model.zip").write_bytes(b"PK")
+    assert error(ArtifactError, find_policy, "model.zip", "best", root) == (
+        "model.zip: a .zip, as Stable-Baselines3 saves models, not a run; make a policy of it: "
+        "rlctl runs import model.zip --task TASK"
+    )
+
+
+def test_a_task_by_path_is_found_from_other_folders(root, make_run, tmp_path, monkeypatch):
+    run = RunDirectory(tmp_path / "project" / "runs" / "Swing" / "2026-01-01_10-00-00_s0")
+    run.path.mkdir(parents=True)
+    original = tmp_path / "project" / "swing.py"
+    original.write_text("")
+    run.status_file.write_text(json.dumps({"task": "swing.py:Swing", "folder": str(tmp_path / "project")}))
+
+    def located(folder):
+        monkeypatch.chdir(folder)
+        return lookup.locate_task("swing.py:Swing", run)
+
+    (tmp_path / "other").mkdir()
+    assert located(tmp_path / "project") == "swing.py:Swing"
+    assert located(tmp_path / "other") == f"{original}:Swing"
+    (tmp_path / "other" / "swing.py").write_text("")  # by chance of the same name
+    assert located(tmp_path / "other") == f"{original}:Swing"
+    moved = RunDirectory(tmp_path / "other" / "runs" / "Swing" / run.path.name)
+    moved.path.parent.mkdir(parents=True)
+    run.path.rename(moved.path)
+    assert lookup.locate_task("swing.py:Swing", moved) == "swing.py:Swing"
+    assert lookup.locate_task("reach", moved) == "reach"
+    assert lookup.locate_task("swing.py:Swing", None) == "swing.py:Swing"
