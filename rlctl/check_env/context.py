@@ -36,7 +36,7 @@ class Context:
     def make(self, render_mode: RenderMode | None = None) -> Any:
         """Return a new environment; whatever the environment raises is an `RlctlError`."""
         self.stage = "import"
-        # Loaded before it is built, to tell an import error from a constructor's.
+        # Loaded before it is built, to distinguish an import error from a constructor's.
         self.progress.enter("load")
         registry.load(self.spec.task)
         self.stage = "constructor"

@@ -80,7 +80,7 @@ def _value(call: ast.Call, trace: TracebackType) -> str | None:
 
 
 def _pybullet_data() -> list[Path]:
-    """Return pybullet_data's folder if PyBullet searches it now, which it does not tell: a model of it is loaded."""
+    """Return pybullet_data's folder if PyBullet searches it now; to find out, a model of it is loaded."""
     pybullet, data = sys.modules.get("pybullet"), sys.modules.get("pybullet_data")
     if pybullet is None or data is None:
         return []

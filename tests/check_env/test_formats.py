@@ -154,7 +154,7 @@ def test_a_clean_environment_fits_on_a_screen():
     lines = plain.text(report).splitlines()
     assert len(lines) <= 24
     text = "\n".join(lines)
-    for expected in ("joint_positions (7)", "hand (3)", "seen", "action Box(-1.0, 1.0, (7,), float32)", "steps/s"):
+    for expected in ("joint_positions (7)", "hand (3)", "observed", "action Box(-1.0, 1.0, (7,), float32)", "steps/s"):
         assert expected in text
 
 

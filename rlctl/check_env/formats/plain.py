@@ -76,7 +76,7 @@ def _print_rule(out: Console, findings: list[Finding]) -> None:
     if out.is_terminal:
         out.print(Padding(body, (0, 0, 1, 2)))
         return
-    # Lines are not wrapped where nobody looks at them: one line each is easier to search.
+    # Not wrapped in files and pipes: one line each is easier to search.
     out.print(Text("\n").join(Text("  ").append_text(line) for line in body.split("\n")))
     out.print()
 
@@ -147,7 +147,7 @@ def _table(rows: list[Row]) -> Iterator[str]:
     names = [f"{row.name}{f' ({row.size})' if row.size > 1 else ''}" for row in shown]
     width = max((len(name) for name in names), default=0)
     for name, row in zip(names, shown, strict=True):
-        seen = f", seen {row.seen[0]:.4g} to {row.seen[1]:.4g}" if row.seen else ""
-        yield f"  {name:<{width}}  {row.low:.4g} to {row.high:.4g}{seen}"
+        observed = f", observed {row.observed[0]:.4g} to {row.observed[1]:.4g}" if row.observed else ""
+        yield f"  {name:<{width}}  {row.low:.4g} to {row.high:.4g}{observed}"
     if len(rows) > SHOWN_ROWS:
         yield f"  and {len(rows) - SHOWN_ROWS} more"

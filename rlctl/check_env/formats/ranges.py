@@ -1,4 +1,4 @@
-"""What an environment's observations and actions are: names, declared bounds, and the values that were seen."""
+"""What an environment's observations and actions are: names, declared bounds, and the values that were observed."""
 
 from __future__ import annotations
 
@@ -25,32 +25,26 @@ class Row:
     low: float
     """The lowest declared bound of its numbers."""
     high: float
-    seen: tuple[float, float] | None
+    observed: tuple[float, float] | None = None
     """Smallest and largest value that occurred; None where none was recorded."""
 
 
 def observation_rows(records: Records) -> list[Row]:
     """Return the parts of the observation, in order."""
-    built = records.built
-    rows: list[Row] = []
+    built, rows = records.built, []
     for index, leaf in enumerate(built.leaves if built else ()):
-        if built is not None and leaf.low is not None and leaf.high is not None:
-            seen = _seen([t.observations[index].values for t in records.alone if index in t.observations], leaf)
-            for name, part in _parts(built, leaf):
-                rows.append(_row(name, np.ravel(leaf.low)[part], np.ravel(leaf.high)[part], seen, part))
+        if built is not None and leaf.supported:
+            values = [each.observations[index].values for each in records.alone if index in each.observations]
+            flat = [each.reshape(len(each), -1).astype(np.float64) for each in values if each.size]
+            rows += [_row(name, leaf, part, flat) for name, part in _parts(built, leaf)]
     return rows
 
 
 def action_rows(records: Records) -> list[Row]:
-    """Return the parts of the action, in order; what was tried is not what will be, so nothing is said as seen."""
+    """Return the parts of the action, in order, without the values that were played: a learner plays others."""
     leaves = records.built.action_leaves if records.built else []
-    return [
-        _row(
-            leaf_name(leaf).replace("observation", "action"), np.ravel(leaf.low), np.ravel(leaf.high), None, slice(None)
-        )
-        for leaf in leaves
-        if leaf.low is not None and leaf.high is not None
-    ]
+    named = [(leaf_name(leaf).replace("observation", "action"), leaf) for leaf in leaves if leaf.supported]
+    return [_row(name, leaf, slice(None), []) for name, leaf in named]
 
 
 def _parts(built: Built, leaf: Leaf) -> Iterator[tuple[str, slice]]:
@@ -67,20 +61,9 @@ def _parts(built: Built, leaf: Leaf) -> Iterator[tuple[str, slice]]:
         yield leaf_name(leaf), slice(0, size)
 
 
-def _seen(values: list[NDArray[np.generic]], leaf: Leaf) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    rows = [each.reshape(len(each), -1).astype(np.float64) for each in values if each.size]
-    if not rows:
-        return None
+def _row(name: str, leaf: Leaf, part: slice, values: list[NDArray[np.float64]]) -> Row:
+    low, high = (np.ravel(np.asarray(bound, np.float64))[part] for bound in (leaf.low, leaf.high))
     with np.errstate(invalid="ignore"):
-        return np.min([r.min(axis=0) for r in rows], axis=0), np.max([r.max(axis=0) for r in rows], axis=0)
-
-
-def _row(
-    name: str,
-    low: NDArray[np.generic],
-    high: NDArray[np.generic],
-    seen: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
-    part: slice,
-) -> Row:
-    values = None if seen is None else (float(seen[0][part].min()), float(seen[1][part].max()))
-    return Row(name, low.size, float(low.astype(np.float64).min()), float(high.astype(np.float64).max()), values)
+        smallest, largest = ([float(function(each[:, part])) for each in values] for function in (np.min, np.max))
+    observed = (float(np.min(smallest)), float(np.max(largest))) if values else None
+    return Row(name, low.size, float(low.min()), float(high.max()), observed)

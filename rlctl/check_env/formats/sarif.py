@@ -77,12 +77,10 @@ def _artifact(file: Path) -> dict[str, str]:
 
 def _invocation(report: Report) -> dict[str, Any]:
     verdict = report.verdict
-    told = [{"level": "error", "message": {"text": f"{name} crashed:\n{why}"}} for name, why in verdict.crashed.items()]
-    told += [
-        {"level": "note", "message": {"text": f"{name} not judged: {why}"}} for name, why in verdict.not_judged.items()
-    ]
+    notes = [("error", f"{name} crashed:\n{trace}") for name, trace in verdict.crashed.items()]
+    notes += [("note", f"{name} not judged: {reason}") for name, reason in verdict.not_judged.items()]
     return {
         "executionSuccessful": not verdict.crashed,
         "exitCode": report.exit_code,
-        "toolExecutionNotifications": told,
+        "toolExecutionNotifications": [{"level": level, "message": {"text": text}} for level, text in notes],
     }
