@@ -11,6 +11,7 @@ from typing import Any
 
 from rlctl import env_spec
 from rlctl.check_env import families
+from rlctl.check_env.clock import read_clock
 from rlctl.check_env.context import Context
 from rlctl.check_env.experiment import Experiment
 from rlctl.check_env.failures import EnvironmentRaised, failure
@@ -50,15 +51,15 @@ def run(
 
 def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> Iterator[Message]:
     """Run the experiments; each has its share of the time that those before it have left."""
-    end = time.monotonic() + seconds
+    end = read_clock() + seconds
     shares = sum(each.share for each in chosen)
     for each in chosen:
-        started = time.monotonic()
+        started = read_clock()
         if each.name == "build":
             yield from _run(each, context)
             if not context.is_built:
                 return
-            end += time.monotonic() - started  # importing and building comes on top
+            end += read_clock() - started  # importing and building comes on top
         elif context.is_built and not context.instance.can_act:
             yield Skipped(each.name, "its action space is not a Gymnasium space")
         elif started > end:

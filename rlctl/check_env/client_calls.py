@@ -9,12 +9,12 @@ import functools
 import inspect
 import re
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
 
+from rlctl.check_env.clock import read_clock
 from rlctl.check_env.finding import Finding, Severity, list_names
 from rlctl.check_env.own_code import find_author
 
@@ -57,7 +57,7 @@ def record_calls() -> Iterator[dict[BulletCall, bool]]:
     """Find the calls without a client in the functions that run inside the `with` block, and whether each ran."""
     calls: dict[BulletCall, bool] = {}
     by_line: dict[CodeType, dict[int, list[BulletCall]]] = {}
-    before, end = sys.gettrace(), time.monotonic() + LONGEST_S
+    before, end = sys.gettrace(), read_clock() + LONGEST_S
 
     def enter(frame: FrameType, event: str, argument: Any) -> Any:
         code = frame.f_code
@@ -66,7 +66,7 @@ def record_calls() -> Iterator[dict[BulletCall, bool]]:
             for call in calls_without_client(code, frame.f_globals):
                 calls.setdefault(call, False)
                 lines.setdefault(call.line, []).append(call)
-        if time.monotonic() > end:
+        if read_clock() > end:
             sys.settrace(before)
         return run_line if by_line[code] else None
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-import time
 from collections.abc import Iterator
 from typing import Any, Literal
 
 from rlctl import env_spec, registry
+from rlctl.check_env.clock import read_clock
 from rlctl.check_env.failures import EnvironmentRaised, describe, failure
 from rlctl.check_env.instance import Budget, Instance
 from rlctl.check_env.leaves import leaves_of
@@ -27,7 +27,7 @@ class Context:
         self.progress = progress or Progress()
         self.stage = "import"
         """How far the last attempt to build an instance came: `import` or `constructor`."""
-        self.budget = Budget(time.monotonic())
+        self.budget = Budget(read_clock())
         """What the experiment that is running may use."""
         self.facts: dict[str, Any] = {}
         """The facts that earlier experiments of this process have sent."""

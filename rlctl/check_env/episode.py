@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from rlctl.check_env.actions import actions
+from rlctl.check_env.clock import read_clock
 from rlctl.check_env.failures import EnvironmentRaised
 from rlctl.check_env.instance import Instance
 from rlctl.check_env.returned import truth, type_name
@@ -57,7 +57,7 @@ class Episode:
         timer: Callable[..., Any] | None = None,
     ) -> None:
         """`actions` is a kind (see `check_env.actions`), drawn with `action_seed`, else with `seed`; or the name of
-        those that are `given`. `deadline` is on `time.monotonic`'s clock [s]. `timer` calls the environment's functions
+        those that are `given`. `deadline` is on `read_clock`'s clock [s]. `timer` calls the environment's functions
         for us."""
         self.instance = instance
         self.seed = seed
@@ -117,7 +117,7 @@ class Episode:
             self.ended = "both" if terminated and truncated else "terminated" if terminated else "truncated"
         elif self.steps >= self.max_steps:
             self.ended = "steps"
-        elif time.monotonic() > self.deadline:
+        elif read_clock() > self.deadline:
             self.ended = "time"
         return moment
 

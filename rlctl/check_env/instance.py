@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable
 from typing import Any
 
+from rlctl.check_env.clock import read_clock
 from rlctl.check_env.failures import EnvironmentRaised
 from rlctl.check_env.leaves import Leaf
 from rlctl.check_env.progress import Progress
@@ -17,16 +17,16 @@ class Budget:
     """What the episodes of an experiment may use together."""
 
     deadline: float
-    """On `time.monotonic`'s clock [s]."""
+    """On `read_clock`'s clock [s]."""
     bytes_left: int = 48 * 2**20
 
     @property
     def seconds_left(self) -> float:
-        return self.deadline - time.monotonic()
+        return self.deadline - read_clock()
 
     def end_within(self, seconds: float) -> float:
         """Return when something that may take so long ends at the latest, on the same clock [s]."""
-        return min(time.monotonic() + seconds, self.deadline)
+        return min(read_clock() + seconds, self.deadline)
 
 
 class Instance:

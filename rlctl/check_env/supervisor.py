@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 
 from rlctl.check_env import families
+from rlctl.check_env.clock import read_clock_of
 from rlctl.check_env.messages import Built, End, Failure, Finished, Message, Mistake, Skipped
 from rlctl.check_env.progress import Position, Progress
 from rlctl.check_env.wire import decode
@@ -54,10 +55,8 @@ class Child:
         """Lines that were written to stdout."""
         self.first_line = ""
         self.last_lines: deque[str] = deque(maxlen=_KEPT_LINES)
-        self.ends_at = time.monotonic() + seconds
         self._memory = anonymous_file()
         self._progress = Progress(self._memory)
-        self._changed = (-1, time.monotonic())
         self._readers = LineReader(self._count), LineReader(self._keep)
         arguments = {
             "process": name,
@@ -76,6 +75,9 @@ class Child:
         )
         for reader in self._readers:
             reader.close_descriptor()
+        self._changed = (-1, self._clock)
+        self.ends_at = self._clock + seconds
+        """On the process's own clock [s]."""
 
     def _count(self, line: str) -> None:
         if line and not line.startswith(_PYBULLETS):
@@ -96,14 +98,23 @@ class Child:
         """Say so if the call that the child is in takes longer than it may."""
         position = self.position
         if position.counter != self._changed[0]:
-            self._changed = (position.counter, time.monotonic())
+            self._changed = (position.counter, self._clock)
         limit_s = _limit_s(position, env_timeout_s)
-        return f"did not come back in {limit_s:g} s" if time.monotonic() - self._changed[1] > limit_s else None
+        return f"did not come back in {limit_s:g} s" if self._clock - self._changed[1] > limit_s else None
 
     @property
     def is_over_time(self) -> bool:
         """Whether it is a library's checker that takes too long: only such a one cannot be asked to stop."""
-        return self.name == "checkers" and time.monotonic() > self.ends_at
+        return self.name == "checkers" and self.seconds_left < 0
+
+    @property
+    def seconds_left(self) -> float:
+        """What is left of its budget [s]."""
+        return self.ends_at - self._clock
+
+    @property
+    def _clock(self) -> float:
+        return read_clock_of(self.process.process.pid)
 
     def fail(self, kind: str, error: str) -> Failure:
         """Return the failure that ends it."""
@@ -233,5 +244,5 @@ class Supervisor:
         """Have a new process do what is left of one that died or hung, once, if the environment worked before."""
         rest = child.experiments[1:]
         if rest and child.has_finished_one and child.name not in (*self._seconds_left, "checkers"):
-            self._seconds_left[child.name] = max(LEAST_REST_S, child.ends_at - time.monotonic())
+            self._seconds_left[child.name] = max(LEAST_REST_S, child.seconds_left)
             self._waiting = {child.name: rest, **self._waiting}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
-import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from rlctl.check_env.clock import read_clock
 from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
@@ -80,14 +80,14 @@ def measure_speed(context: Context) -> Iterator[Message]:
     """Play random episodes: first with nothing but a clock, then sampled."""
     instance, seconds = context.instance, min(LONGEST_S, context.budget.seconds_left)
     steps, resets = Stopwatch(), Stopwatch()
-    deadline = time.monotonic() + seconds / 2
+    deadline = read_clock() + seconds / 2
     _play(instance, steps, resets, TIMED_STEPS, deadline)
     _play(instance, steps, resets, TIMED_RESETS, deadline, only_reset=True)
     sampler = Sampler(find_own_code(instance.env), kind_of)
     in_step, in_reset = Samples(sampler), Samples(sampler)
     with sampler.running():
         for only_reset in (False, True):
-            deadline = time.monotonic() + min(seconds / 4, SAMPLED_S)
+            deadline = read_clock() + min(seconds / 4, SAMPLED_S)
             _play(instance, in_step, in_reset, MOST_STEPS, deadline, only_reset=only_reset)
     yield Fact(
         "speed",
@@ -114,7 +114,7 @@ def _play(
         return (of_reset if function == instance.env.reset else of_step)(function, *arguments, **keywords)
 
     number = 0
-    while calls > 0 and time.monotonic() < deadline:
+    while calls > 0 and read_clock() < deadline:
         steps = 0 if only_reset else calls
         seed = FIRST_SPEED_SEED + number
         episode = Episode(instance, seed, number=number, max_steps=steps, deadline=deadline, timer=timer)

@@ -1,0 +1,38 @@
+"""Time limits run on a clock that stands still while a process waits for a processor."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rlctl.check_env.clock import INTERVAL_S, read_clock, read_clock_of
+
+LINUX = pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="only Linux counts it")
+
+
+def test_waiting_for_something_else_counts():
+    before, begun = read_clock(), time.monotonic()
+    time.sleep(0.3)
+    assert 0.3 <= read_clock() - before <= time.monotonic() - begun + INTERVAL_S
+
+
+@LINUX
+def test_waiting_for_a_processor_does_not_count():
+    processor = min(os.sched_getaffinity(0))
+    code = f"import os; os.sched_setaffinity(0, [{processor}])\nwhile True: pass"
+    children = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(3)]
+    try:
+        time.sleep(0.5)  # to start
+        before = [read_clock_of(child.pid) for child in children]
+        begun = time.monotonic()
+        time.sleep(1.5)
+        passed = time.monotonic() - begun
+        spent = [read_clock_of(child.pid) - then for child, then in zip(children, before, strict=True)]
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+    assert sum(spent) < 2 * passed  # one processor for three: each has a third of the time, or less
