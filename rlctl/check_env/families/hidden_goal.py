@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.experiment import check
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
+from rlctl.check_env.finding import Finding, NotApplicable
 from rlctl.check_env.messages import Trajectory
 from rlctl.check_env.records import Records
 from rlctl.check_env.rewarded import WITH_SEARCH, require_rewarded
@@ -82,7 +82,7 @@ def _steps(records: Records, episodes: list[Trajectory]) -> _Steps:
         raise NotApplicable("images are not compared")
     parts = [part for each in episodes if (part := _steps_of(each, len(leaves))) is not None]
     if not parts:
-        raise NotJudged("no whole observation was recorded")
+        raise NotApplicable("no whole observation was recorded")
     seeds, numbers, features, rewards = (np.concatenate(each) for each in zip(*parts, strict=True))
     # Some, evenly, of the beginnings of episodes, where they are most alike, and as many of all others.
     halves = [np.flatnonzero(numbers <= 3), np.flatnonzero(numbers > 3)]
