@@ -20,6 +20,7 @@ class Cart(Clean):
     rlctl_ignore = dict.fromkeys(("RL902", "RL904"), "loads anew at every reset, so that each is exactly the same")
     fixed = False
     height = STANDING
+    model, flags = CART, 0
 
     def __init__(self):
         super().__init__(size=100.0)
@@ -37,7 +38,7 @@ class Cart(Clean):
         shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[50, 50, 0.5], physicsClientId=c)
         self.floor = p.createMultiBody(0.0, shape, basePosition=[0, 0, -0.5], physicsClientId=c)
         place = [*self.position.tolist(), self.height]
-        self.cart = p.loadURDF(CART, place, useFixedBase=self.fixed, physicsClientId=c)
+        self.cart = p.loadURDF(self.model, place, useFixedBase=self.fixed, flags=self.flags, physicsClientId=c)
         self.vary()
         self.read()
 
@@ -254,3 +255,21 @@ class ThroughBulletClient(Clean):
         if self.p is not None:
             self.p.disconnect()
         self.p = None
+
+
+class TipOfAKilogram(Cart):
+    """The tip has no <inertial>."""
+
+    model = CART.replace("cart.urdf", "cart_without_inertial.urdf")
+
+
+class FileInertia(Cart):
+    """The file's inertias are used; they are possible."""
+
+    flags = p.URDF_USE_INERTIA_FROM_FILE
+
+
+class HeavyInertia(FileInertia):
+    """The arm turns like a body of tons."""
+
+    model = CART.replace("cart.urdf", "cart_of_tons.urdf")

@@ -5,7 +5,7 @@ import pytest
 from rlctl.check_env.client_calls import calls_without_client
 from tests.check_env.judging import case, check_case, findings, found
 
-RULES = {f"RL{number}" for number in range(801, 809)}
+RULES = {f"RL{number}" for number in range(801, 810)}
 CART = "broken_physics.py:Cart"
 CASES = [
     case("broken_physics.py:NoGravity", ("RL801", "warning"), twin="broken_physics.py:Flat"),
@@ -18,6 +18,8 @@ CASES = [
     case("broken_physics.py:FixedBaseGetsMass", ("RL806", "warning"), twin="broken_physics.py:FixedCart"),
     case("broken_physics.py:StartsInTheFloor", ("RL807", "warning"), twin=CART),
     case("broken_physics.py:Drops", ("RL807", "info"), twin=CART),
+    case("broken_physics.py:TipOfAKilogram", ("RL809", "warning"), twin=CART),
+    case("broken_physics.py:HeavyInertia", ("RL809", "warning"), twin="broken_physics.py:FileInertia"),
     case("broken_physics.py:MayForgetClient", ("RL808", "warning"), twin="broken_physics.py:OverridesForgetful"),
 ]
 
@@ -115,3 +117,12 @@ def test_calls_are_read_as_they_are_meant(tmp_path):
         for name in ("wrong", "imports", "right", "rebound", "argument")
     }
     assert lines == {"wrong": [7, 8, 9], "imports": [13], "right": [], "rebound": [], "argument": []}
+
+
+def test_missing_mass_and_impossible_inertia_are_named():
+    assert the_finding("TipOfAKilogram").message == (
+        "cart_without_inertial.urdf, link 'tip': no <inertial>, so PyBullet gives it a mass of 1 kg. "
+        "Write its mass and inertia"
+    )
+    # An arm of 0.2 kg, 0.04 m x 0.04 m x 0.2 m, can have at most 0.2 * (0.04^2 + 0.04^2 + 0.2^2) = 0.0087 kg m^2.
+    assert "a moment of 1 kg m^2 is more than 0.2 kg within 0.21 m can have" in the_finding("HeavyInertia").message

@@ -51,6 +51,7 @@ from rlctl.check_env.families import (
     isolation,
     library_checkers,
     loading,
+    models,
     observations,
     physics,
     resources,
@@ -93,6 +94,7 @@ PROCESSES = {
         (
             isolation.compare_instances,
             physics.watch_worlds,
+            models.judge_models,
             actions.compare_actions,
             attributes.read_attributes,
             resources.build_in_worker,
@@ -113,7 +115,7 @@ CHECKERS = ("gymnasium checker", "sb3 checker")
 MODULES = (
     *(loading, observations, spaces, features, hidden_goal, interface, attributes, determinism, isolation),
     *(resources, episodes, rewards, incentives, success, hindsight, actions),
-    *(physics, speed),
+    *(physics, models, speed),
 )
 
 CHECKS = {each.rule: each for module in MODULES for each in vars(module).values() if isinstance(each, Check)}
