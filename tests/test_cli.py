@@ -65,8 +65,8 @@ def printing(write_module):
     return write_module("printing.py", PRINTING)
 
 
-def test_version(rlctl):
-    result = rlctl("--version")
+def test_version(installed_rlctl):
+    result = installed_rlctl("--version")
     assert (result.returncode, result.stdout, result.stderr) == (0, f"rlctl {package.__version__}\n", "")
 
 
@@ -130,9 +130,9 @@ def test_underscores_are_read_as_dashes(rlctl):
     assert rlctl("check_env", "reech").returncode == 2
 
 
-def test_a_plugins_traceback_stands_above_the_error(rlctl, write_module):
+def test_a_plugins_traceback_stands_above_the_error(installed_rlctl, write_module):
     write_module("broken.py", "raise RuntimeError('no robot')")
-    *above, last = rlctl("train", "broken.py:Env").stderr.splitlines()
+    *above, last = installed_rlctl("train", "broken.py:Env").stderr.splitlines()
     assert last == "error: task 'broken.py:Env': import failed: RuntimeError: no robot (broken.py:1)"
     assert above[0] == "Traceback (most recent call last):"
     assert any("broken.py" in line for line in above)

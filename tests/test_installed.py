@@ -7,6 +7,9 @@ import sys
 
 import pytest
 
+from rlctl import registry
+from rlctl.tasks.listing import describe_entry
+
 GOOD = """
     import gymnasium, numpy as np
     from gymnasium.spaces import Box
@@ -86,10 +89,12 @@ def test_the_table(rlctl, site):
     assert row.split() == ["good", "some-robots", "1.2", "sac"]
 
 
-def test_check_shows_what_raises_in_a_line_each(rlctl, importable):
-    tasks = listed(rlctl("tasks", "--check", "--json", "-", path=importable))
-    problems = {name: task["problem"] for (name, origin), task in tasks.items() if origin == "some-robots"}
-    del problems["reach"]  # as without --check
+def test_check_shows_what_raises_in_a_line_each(importable, monkeypatch):
+    monkeypatch.syspath_prepend(importable)
+    monkeypatch.setenv("PYTHONPATH", str(importable))
+    entries = [entry for entry in registry.list_installed() if entry.distribution == "some-robots"]
+    problems = {entry.name: describe_entry(entry, check=True).problem for entry in entries}
+    del problems["reach"]  # as without a check
     assert problems.pop("raises").startswith(f"{importable / 'some_robots/raises.yaml'}:2: expected the node content")
     assert problems.pop("unreadable").startswith(f"{importable / 'some_robots/unreadable.yaml'}: 'utf-8' codec can't")
     assert problems == {
@@ -99,7 +104,13 @@ def test_check_shows_what_raises_in_a_line_each(rlctl, importable):
         "absent": "module 'some_robots.absent' is missing",
         "nameless": "some_robots.good has no 'Bad'. It defines: Good.",
     }
-    assert tasks["reach", "rlctl"]["problem"] is None
+
+
+@pytest.mark.slow
+def test_the_check_of_all_tasks(rlctl, importable):
+    tasks = listed(rlctl("tasks", "--check", "--json", "-", path=importable))
+    assert tasks["vanishes", "some-robots"]["problem"] == "import ended the process with exit code 0"
+    assert [name for (name, origin), task in tasks.items() if origin == "rlctl" and task["problem"]] == []
 
 
 def test_a_broken_plugin_harms_only_itself(rlctl, importable, tmp_path):

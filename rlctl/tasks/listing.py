@@ -20,20 +20,22 @@ class ListedTask:
 
 def list_tasks(*, check: bool = False) -> list[ListedTask]:
     """List the installed tasks; `check` imports each in a child process."""
-    listed = []
-    for entry in registry.list_installed():
-        problem = entry.problem
-        algo = None
-        try:
-            algo = _read_algorithm(entry)
-        except RecipeError as error:
-            problem = problem or str(error)
-        except (OSError, UnicodeDecodeError) as error:
-            problem = problem or f"{entry.recipe_file}: {error}"
-        if check and problem is None:
-            problem = registry.check_import(entry)
-        listed.append(ListedTask(entry, algo, problem))
-    return listed
+    return [describe_entry(entry, check=check) for entry in registry.list_installed()]
+
+
+def describe_entry(entry: registry.TaskEntry, *, check: bool) -> ListedTask:
+    """Return the row of an installed task; `check` imports it in a child process."""
+    problem = entry.problem
+    algo = None
+    try:
+        algo = _read_algorithm(entry)
+    except RecipeError as error:
+        problem = problem or str(error)
+    except (OSError, UnicodeDecodeError) as error:
+        problem = problem or f"{entry.recipe_file}: {error}"
+    if check and problem is None:
+        problem = registry.check_import(entry)
+    return ListedTask(entry, algo, problem)
 
 
 def _read_algorithm(entry: registry.TaskEntry) -> str | None:

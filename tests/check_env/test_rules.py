@@ -94,11 +94,13 @@ def test_clean_is_clean(name):
     assert {*verdict.judged, *verdict.not_applicable} == set(RULES)
 
 
+OTHERS = ["MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1", "Taxi-v4", "CliffWalking-v1"]
+
+
 @pytest.mark.parametrize(
     "task",
-    ["Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1", "FrozenLake-v1", "Taxi-v4",
-     "CliffWalking-v1", "Blackjack-v1"],
-)  # fmt: skip
+    ["Pendulum-v1", "FrozenLake-v1", "Blackjack-v1", *(pytest.param(task, marks=pytest.mark.slow) for task in OTHERS)],
+)
 def test_gymnasiums_own_environments_have_no_errors(task):
     assert not {severity for _, severity in found(task)} & {"error"}
 
