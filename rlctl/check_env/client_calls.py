@@ -14,7 +14,6 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
 
-from rlctl.check_env.clock import read_clock
 from rlctl.check_env.finding import Finding, Severity, list_names
 from rlctl.check_env.own_code import find_author
 
@@ -34,8 +33,8 @@ FIRST_IS_CLIENT = {
 CLIENT_WORDS = re.compile(r"client|\bcid\b|_cid\b|server", re.IGNORECASE)
 """Names of a client that is passed by position."""
 MOST_CALLS, SHOWN = 20, 4
-LONGEST_S = 2.0
-"""Recording costs a fraction of a microsecond per call; after this time it stops [s]."""
+MOST_RECORDED = 2_000_000
+"""So many calls of Python functions are recorded, each of which takes a fraction of a microsecond longer."""
 
 
 @dataclasses.dataclass(frozen=True, order=True)
@@ -57,7 +56,7 @@ def record_calls() -> Iterator[dict[BulletCall, bool]]:
     """Find the calls without a client in the functions that run inside the `with` block, and whether each ran."""
     calls: dict[BulletCall, bool] = {}
     by_line: dict[CodeType, dict[int, list[BulletCall]]] = {}
-    before, end = sys.gettrace(), read_clock() + LONGEST_S
+    before, left = sys.gettrace(), iter(range(MOST_RECORDED))
 
     def enter(frame: FrameType, event: str, argument: Any) -> Any:
         code = frame.f_code
@@ -66,7 +65,7 @@ def record_calls() -> Iterator[dict[BulletCall, bool]]:
             for call in calls_without_client(code, frame.f_globals):
                 calls.setdefault(call, False)
                 lines.setdefault(call.line, []).append(call)
-        if read_clock() > end:
+        if next(left, None) is None:
             sys.settrace(before)
         return run_line if by_line[code] else None
 

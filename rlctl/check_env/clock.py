@@ -15,16 +15,17 @@ def read_clock() -> float:
     """Return the time of this process [s]; only differences have a meaning."""
     now = time.monotonic()
     if now - _last.read_at > INTERVAL_S:
-        _last.read_at, _last.waited_s = now, _read_waiting("self")
+        _last.read_at, _last.waited_s = now, read_waited_s("self")
     return now - _last.waited_s
 
 
 def read_clock_of(pid: int) -> float:
     """Return the time of another process [s]; only differences have a meaning."""
-    return time.monotonic() - _read_waiting(str(pid))
+    return time.monotonic() - read_waited_s(str(pid))
 
 
-def _read_waiting(process: str) -> float:
+def read_waited_s(process: str = "self") -> float:
+    """Return for how long a process, given by its id, has waited for a processor [s]; 0 where that is not counted."""
     try:
         return int(Path(f"/proc/{process}/schedstat").read_text().split()[1]) / 1e9
     except (OSError, IndexError):

@@ -23,31 +23,24 @@ from pathlib import Path
 from types import CodeType, FrameType, ModuleType
 from typing import Any
 
+from rlctl.check_env.clock import read_waited_s
+
 INTERVAL_S = 0.0005
 _FOLDER = f"{Path(__file__).parent}/"
-_SCHEDULER = Path("/proc/thread-self/schedstat")
-
-
-def clock() -> float:
-    """Return a time that stands still while this thread waits for a processor that others have [s]."""
-    try:
-        waited = int(_SCHEDULER.read_bytes().split()[1]) / 1e9
-    except (OSError, ValueError, IndexError):  # the system does not count it
-        waited = 0.0
-    return time.perf_counter() - waited
 
 
 class Stopwatch:
-    """Calls functions, and keeps how long each call took [s]."""
+    """Calls functions, and keeps how long each took without the time in which it waited for a processor [s]."""
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
 
     def __call__(self, function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
         """Call the function and return what it returns."""
-        started = clock()
+        waited_s, started = read_waited_s(), time.perf_counter()
         value = function(*arguments, **keywords)
-        self.seconds.append(max(0.0, clock() - started))
+        ended = time.perf_counter()
+        self.seconds.append(max(0.0, ended - started - (read_waited_s() - waited_s)))
         return value
 
 
@@ -142,7 +135,7 @@ class Sampler:
         """Take samples; raises what went wrong in taking them."""
         before = signal.signal(signal.SIGALRM, self._take)
         signal.siginterrupt(signal.SIGALRM, False)  # reading and writing in libraries goes on
-        self._last = clock()
+        self._last = _clock()
         signal.setitimer(signal.ITIMER_REAL, INTERVAL_S)
         try:
             yield
@@ -156,11 +149,11 @@ class Sampler:
         try:
             if self.into is not None and (stack := self._stack(frame)):
                 # The weight is the time since the last sample: no signal is handled inside a builtin.
-                self.into.add(stack, max(0.0, clock() - self._last))
+                self.into.add(stack, max(0.0, _clock() - self._last))
         except Exception as error:  # raised here it would be the environment's
             self._error = error
             return
-        self._last = clock()
+        self._last = _clock()
         signal.setitimer(signal.ITIMER_REAL, INTERVAL_S)
 
     def _stack(self, frame: FrameType | None) -> list[_Call]:
@@ -198,6 +191,10 @@ class Sampler:
         if key not in self._builtins:
             self._builtins[key] = _called(frame)
         return self._builtins[key]
+
+
+def _clock() -> float:
+    return time.perf_counter() - read_waited_s()
 
 
 def _operation(frame: FrameType) -> str:
