@@ -15,7 +15,7 @@ demo: $(VENV)/.installed
 test: $(VENV)/.dev
 	@said=$$(mktemp); $(MAKE) --no-print-directory lint > $$said 2>&1 & lint=$$!; \
 	trap 'kill $$lint 2> /dev/null; rm -f $$said' EXIT; \
-	$(BIN)/python -m pytest -n 2; tests=$$?; \
+	$(BIN)/python -m pytest -n 2 --dist worksteal; tests=$$?; \
 	wait $$lint; code=$$?; cat $$said; \
 	[ $$tests -eq 0 ] && [ $$code -eq 0 ]
 
@@ -23,10 +23,10 @@ test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow --timeout 3600
 
 test-crash: $(VENV)/.dev
-	$(BIN)/python -m pytest tests/crash -m "" -n 2 --timeout 3600
+	$(BIN)/python -m pytest tests/crash -m "" -n 2 --dist worksteal --timeout 3600
 
 test-all: lint
-	$(BIN)/python -m pytest -m "" -n 2 --timeout 3600
+	$(BIN)/python -m pytest -m "" -n 2 --dist worksteal --timeout 3600
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff format --check
