@@ -8,6 +8,7 @@ from tests.check_env.judging import FOLDER, found
 
 MODULES = [import_module(f"tests.check_env.{file.stem}") for file in sorted(FOLDER.glob("test_*.py"))]
 CASES = [case for module in MODULES for case in getattr(module, "CASES", [])]
+CLEAN = [task for module in MODULES for task in getattr(module, "CLEAN", [])]
 
 pytestmark = pytest.mark.slow
 
@@ -16,3 +17,8 @@ pytestmark = pytest.mark.slow
 def test_finds_the_mistake_and_only_that(case):
     assert found(case.broken) == case.expected
     assert not {rule for rule, _ in found(case.twin)} & set(case.rules)
+
+
+@pytest.mark.parametrize("task", CLEAN)
+def test_clean_is_clean(task):
+    assert found(task) == set()

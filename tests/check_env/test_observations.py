@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.check_env.families.features import copies_in
 from rlctl.check_env.judge import judge
-from tests.check_env.judging import case, check_case, findings, found, records_of
+from tests.check_env.judging import case, check_case, findings, found, records_of, rules_of
 
 BROKEN = "broken_observations.py"
 CASES = [
@@ -26,9 +26,12 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-@pytest.mark.parametrize("name", ["Wide", "Counter", "SomeFlags", "SeenGoal", "NoisyReward", "ShownChance"])
-def test_clean_is_clean(name):
-    assert found(f"{BROKEN}:{name}") == set()
+CLEAN = [f"{BROKEN}:{name}" for name in ("Wide", "Counter", "SomeFlags", "SeenGoal", "NoisyReward", "ShownChance")]
+
+
+@pytest.mark.parametrize("task", CLEAN)
+def test_clean_is_clean(task):
+    assert found(task, *rules_of("RL1")) == set()
 
 
 def finding_of(name):

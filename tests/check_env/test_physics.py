@@ -3,7 +3,7 @@
 import pytest
 
 from rlctl.check_env.client_calls import calls_without_client
-from tests.check_env.judging import case, check_case, findings, found
+from tests.check_env.judging import case, check_case, findings, found, rules_of
 
 RULES = {f"RL{number}" for number in range(801, 810)}
 CART = "broken_physics.py:Cart"
@@ -29,9 +29,12 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-@pytest.mark.parametrize("name", ["FixedCart", "ThroughBulletClient"])
-def test_worlds_without_a_mistake_are_clean(name):
-    assert found(f"broken_physics.py:{name}") == set()
+CLEAN = ["broken_physics.py:FixedCart", "broken_physics.py:ThroughBulletClient"]
+
+
+@pytest.mark.parametrize("task", CLEAN)
+def test_worlds_without_a_mistake_are_clean(task):
+    assert found(task, *rules_of("RL8")) == set()
 
 
 def the_finding(name):

@@ -36,11 +36,16 @@ def in_root(monkeypatch):
 @pytest.mark.parametrize(
     ("task", "expected", "message", "fix"),
     [
-        ("tests/check_env/broken_import.py:Anything", "RL001", "ZeroDivisionError: at import", "Import the module"),
+        ("tests/check_env/broken_import.py:Anything", "RL001", "ZeroDivisionError: at import", "Repair the line"),
         (f"{BROKEN}:RaisingConstructor", "RL007", "does not find 'robot.urdf', looked for in", "__file__"),
         (f"{BROKEN}:NeedsArgument", "RL006", "missing 1 required", "(--set task.gain=...)"),
         (f"{BROKEN}:NUMBER", "RL005", "NUMBER is a int, not a class", "case-sensitive"),
-        (f"{BROKEN}:NoEnvironment", "RL003", "NoEnvironment is no Gymnasium environment", "Inherit from gymnasium.Env"),
+        (
+            f"{BROKEN}:NoEnvironment",
+            "RL003",
+            "is not a Gymnasium environment",
+            "Inherit from gymnasium.Env",
+        ),
         (f"{BROKEN}:ExitsWhenBuilt", "RL004", "the process ended with exit code 7 in the constructor", "input"),
     ],
 )

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from rlctl.check_env.actions import action_at
 from rlctl.check_env.families.incentives import pair_up
 from rlctl.check_env.rewarded import discounted_steps, discounted_sum
-from tests.check_env.judging import case, check_case, findings, found, records_of
+from tests.check_env.judging import case, check_case, findings, found, records_of, rules_of
 
 BROKEN = "broken_rewards.py"
 
@@ -43,17 +43,22 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["FinalBonus", "FallsBadly", "FinishingPays", "PaysProgress", "Terms", "Float32Terms", "SparseTerm", "TimePenalty",
-     "Paid", "SuccessArray"],
-)  # fmt: skip
-def test_clean_is_clean(name):
-    assert found(f"{BROKEN}:{name}") == set()
+CLEAN = [
+    f"{BROKEN}:{name}"
+    for name in (
+        *("FinalBonus", "FallsBadly", "FinishingPays", "PaysProgress", "Terms", "Float32Terms", "SparseTerm"),
+        *("TimePenalty", "Paid", "SuccessArray"),
+    )
+]
+
+
+@pytest.mark.parametrize("task", CLEAN)
+def test_clean_is_clean(task):
+    assert found(task, *rules_of("RL6")) == set()
 
 
 def test_goal_that_ends_the_episode_is_no_failure():
-    assert found(f"{BROKEN}:EndsAtUntoldGoal") == {("RL609", "info")}
+    assert found(f"{BROKEN}:EndsAtUntoldGoal", *rules_of("RL6")) == {("RL609", "info")}
 
 
 def finding_of(name):

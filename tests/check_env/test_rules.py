@@ -81,9 +81,9 @@ def test_finds_the_mistake_and_only_that(case):
     "name",
     [
         "broken_envs.py:Clean",
-        "broken_envs.py:CleanDict",
-        "broken_envs.py:FixedStartNoise",
-        "broken_envs.py:OwnWorld",
+        pytest.param("broken_envs.py:CleanDict", marks=pytest.mark.slow),
+        pytest.param("broken_envs.py:FixedStartNoise", marks=pytest.mark.slow),
+        pytest.param("broken_envs.py:OwnWorld", marks=pytest.mark.slow),
         "reach",
     ],
 )
