@@ -127,25 +127,29 @@ class Sampler:
         self._is_own, self._kind_of = is_own, kind_of
         self._functions: dict[CodeType, tuple[str, bool]] = {}
         self._builtins: dict[tuple[CodeType, int], tuple[str, bool]] = {}
-        self._last = 0.0
+        self._is_running, self._last = False, 0.0
         self._error: Exception | None = None
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
         """Take samples; raises what went wrong in taking them."""
-        before = signal.signal(signal.SIGALRM, self._take)
+        handler = signal.signal(signal.SIGALRM, self._take)
         signal.siginterrupt(signal.SIGALRM, False)  # reading and writing in libraries goes on
-        self._last = _clock()
-        signal.setitimer(signal.ITIMER_REAL, INTERVAL_S)
+        self._is_running, self._last = True, _clock()
+        timer = signal.setitimer(signal.ITIMER_REAL, INTERVAL_S)
         try:
             yield
         finally:
+            self._is_running = False  # so that a signal that is on its way does not start the timer again
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, before)
+            signal.signal(signal.SIGALRM, handler)
+            signal.setitimer(signal.ITIMER_REAL, *timer)
         if self._error is not None:
             raise self._error
 
     def _take(self, number: int, frame: FrameType | None) -> None:
+        if not self._is_running:
+            return
         try:
             if self.into is not None and (stack := self._stack(frame)):
                 # The weight is the time since the last sample: no signal is handled inside a builtin.

@@ -200,10 +200,19 @@ def test_builtins_are_named_by_what_is_called():
 
 
 def test_an_exception_in_what_is_sampled_reaches_the_caller():
-    before = signal.getsignal(signal.SIGALRM)
     with pytest.raises(ValueError, match="not in list"):
         sampled(lambda: [].index(1))
-    assert signal.getsignal(signal.SIGALRM) is before
+
+
+def test_an_alarm_of_the_environment_goes_on():
+    handler = signal.getsignal(signal.SIGALRM)
+    before = signal.setitimer(signal.ITIMER_REAL, 1000.0)
+    try:
+        sampled(pause)
+        assert signal.getsignal(signal.SIGALRM) is handler
+        assert 900 < signal.getitimer(signal.ITIMER_REAL)[0] <= 1000
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, *before)
 
 
 def test_waiting_for_a_processor_does_not_count():
