@@ -32,6 +32,8 @@ def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> str | None:
     for body in scene.bodies:
         if body.ground_height is not None:
             _draw_ground(body, scene, timelines)
+        elif body.terrain is not None:
+            _draw_terrain(body.name, body.terrain, timelines)
         else:
             drawn = _draw_body(body, timelines, warn)
             if body.trunk is not None:
@@ -79,6 +81,22 @@ def _draw_ground(body: BodyMotion, scene: Scene, timelines: Timelines) -> None:
         ),
         static=True,
     )
+
+
+def _draw_terrain(name: str, points: NDArray[np.float64], timelines: Timelines) -> None:
+    """Draw rough ground as a mesh of two triangles per cell."""
+    rows, columns, _ = points.shape
+    corner = np.arange(rows * columns).reshape(rows, columns)[:-1, :-1].ravel()
+    right, above = corner + columns, corner + 1
+    triangles = np.concatenate([np.stack([corner, right, right + 1], 1), np.stack([corner, right + 1, above], 1)])
+    low, height = points[..., 2].min(), max(float(np.ptp(points[..., 2])), 1e-6)
+    shade = (0.8 + 0.6 * (points[..., 2] - low) / height).reshape(-1, 1)  # higher is lighter
+    mesh = rr.Mesh3D(
+        vertex_positions=points.reshape(-1, 3),
+        triangle_indices=triangles,
+        vertex_colors=np.clip(shade * np.array(_GROUND_COLOR), 0, 255).astype(np.uint8),
+    )
+    timelines.stream.log(_entity("world", name), mesh, static=True)
 
 
 def bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -44,6 +44,8 @@ class BodyMotion:
     fixed: bool
     ground_height: float | None
     """Height of the upper face [m] if the body is the flat ground."""
+    terrain: Array | None
+    """Points of rough ground [m], world frame, shape (along x, along y, 3)."""
     joint_names: list[str]
     joint_positions: Array
     """[rad or m], shape (T + 1, joints)."""
@@ -146,6 +148,7 @@ class _BodyReader:
             file=body.file,
             fixed=body.fixed,
             ground_height=self._ground_height(),
+            terrain=self.body.terrain,
             joint_names=body.joint_names,
             joint_positions=np.stack(self._joint_positions),
             joint_velocities=np.stack(self._joint_velocities),
@@ -158,7 +161,7 @@ class _BodyReader:
         )
 
     def _ground_height(self) -> float | None:
-        if len(self.links) > 1:
+        if len(self.links) > 1 or self.body.terrain is not None:
             return None
         low, high = pybullet.getAABB(self.body.id, -1, physicsClientId=self.client)
         if min(high[0] - low[0], high[1] - low[1]) < _GROUND_SIZE:

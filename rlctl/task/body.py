@@ -56,6 +56,8 @@ class Body(Motors):
         self.id = body_id
         self.file = file
         self.fixed = fixed
+        self.terrain: Array | None = None
+        """Points of rough ground [m], world frame, shape (along x, along y, 3); None for any other body."""
         self.inertia_from_file = False
         self.client = client
         self._substeps = substeps

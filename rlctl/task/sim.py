@@ -218,8 +218,11 @@ class Sim(Constraints):
         middle = (0.0, 0.0, float(heights.min() + heights.max()) / 2)
         body_id = pybullet.createMultiBody(0, shape, basePosition=middle, physicsClientId=self.client)
         pybullet.changeVisualShape(body_id, -1, rgbaColor=(*color, 1), physicsClientId=self.client)
-        self.bodies[name] = Body(self.client, self._substeps, name, body_id, Path("height field"), True)
-        return self.bodies[name]
+        body = Body(self.client, self._substeps, name, body_id, Path("height field"), True)
+        x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
+        body.terrain = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1)
+        self.bodies[name] = body
+        return body
 
     def add_marker(self, position: Sequence[float], radius: float, color: Sequence[float]) -> int:
         """Add a sphere that is seen but touches nothing; returns its id, for `move_marker`."""

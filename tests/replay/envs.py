@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from rlctl.task import Box, Event, Sim, Task, events
+from rlctl.task import Box, Event, Sim, Task, events, rough_heights
 
 
 @dataclass
@@ -46,6 +46,16 @@ class Tumble(Task):
 
     def markers(self) -> dict[str, np.ndarray]:
         return {"goal": np.array([self.time, 0.0, 0.2])}
+
+
+@dataclass
+class Rough(Tumble):
+    """The same on rough ground."""
+
+    def build(self, sim: Sim) -> None:
+        super().build(sim)
+        self.heights = rough_heights(0, size=(4, 3), cell=0.5, roughness=0.1)
+        sim.add_height_field("hills", self.heights, cell=0.5)
 
 
 class Pixels(gymnasium.Env):

@@ -252,6 +252,7 @@ def test_shapes_turn_with_their_link():
         file=Path("m.xml"),
         fixed=False,
         ground_height=None,
+        terrain=None,
         joint_names=[],
         joint_positions=np.zeros((1, 0)),
         joint_velocities=np.zeros((1, 0)),

@@ -7,6 +7,7 @@ from rerun.chunk import RrdReader
 from rlctl.errors import ArtifactError
 from rlctl.replay.curves import named_observations
 from rlctl.replay.rrd import write_rrd
+from rlctl.task import rough_heights
 from tests.replay.conftest import play, reach
 from tests.replay.reading import column, entities, properties, static
 
@@ -175,6 +176,24 @@ def test_ground_is_a_box_and_no_mesh(tumble):
     path, _, _ = tumble
     assert "/world/ground/planeLink/visual_0" not in entities(path)
     assert static(path, "/world/ground", "Boxes3D:half_sizes")
+
+
+def test_rough_ground_is_a_mesh_of_its_heights(tmp_path):
+    rollout, warnings = play("Rough", car="r2d2.urdf")
+    write_rrd(tmp_path / "rough.rrd", rollout, title="rough", warn=warnings.append)
+    assert warnings == []
+    # 4 m x 3 m in cells of 0.5 m: 9 x 7 points, 8 x 6 cells of two triangles.
+    points = np.array(static(tmp_path / "rough.rrd", "/world/hills", "Mesh3D:vertex_positions"))
+    triangles = np.array(static(tmp_path / "rough.rrd", "/world/hills", "Mesh3D:triangle_indices"))
+    assert (points.shape, triangles.shape) == ((9 * 7, 3), (2 * 8 * 6, 3))
+    np.testing.assert_allclose(points[0, :2], (-2.0, -1.5))
+    np.testing.assert_allclose(points[1, :2], (-2.0, -1.0))
+    heights = rough_heights(0, size=(4, 3), cell=0.5, roughness=0.1)
+    np.testing.assert_allclose(points[:, 2], heights.ravel(), atol=1e-6)
+    # Every triangle is half a cell, seen from above: 0.5 * 0.5 / 2 = 0.125 m^2.
+    first, second, third = (points[triangles[:, corner], :2] for corner in range(3))
+    (x1, y1), (x2, y2) = (second - first).T, (third - first).T
+    np.testing.assert_allclose((x1 * y2 - x2 * y1) / 2, 0.125, atol=1e-6)
 
 
 def test_moving_goal_moves(tumble):

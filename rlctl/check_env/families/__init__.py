@@ -60,6 +60,7 @@ from rlctl.check_env.families import (
     spaces,
     speed,
     success,
+    variants,
 )
 from rlctl.check_env.finding import RULES
 
@@ -97,6 +98,7 @@ PROCESSES = {
             models.judge_models,
             actions.compare_actions,
             attributes.read_attributes,
+            variants.play_variants,
             resources.build_in_worker,
             actions.exceed_bounds,
             interface.step_before_reset,
@@ -115,7 +117,7 @@ CHECKERS = ("gymnasium checker", "sb3 checker")
 MODULES = (
     *(loading, observations, spaces, features, hidden_goal, interface, attributes, determinism, isolation),
     *(resources, episodes, rewards, incentives, success, hindsight, actions),
-    *(physics, models, speed),
+    *(physics, models, speed, variants),
 )
 
 CHECKS = {each.rule: each for module in MODULES for each in vars(module).values() if isinstance(each, Check)}

@@ -1,0 +1,96 @@
+"""RL0, variants: what a recipe switches on in a task works too: its events, and the stages of its curriculum."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl import registry
+from rlctl.check_env.context import Context
+from rlctl.check_env.episode import Episode
+from rlctl.check_env.experiment import experiment
+from rlctl.check_env.failures import EnvironmentRaised, describe
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
+from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import RecipeError
+from rlctl.run.env_info import EnvInfo
+from rlctl.run.env_info import describe as describe_env
+from rlctl.run.recipe import validate
+
+STEPS = 60
+"""Of each variant: an event at an interval of a second acts in them."""
+
+
+@experiment("variants", "RL011", "RL012", share=2.0)
+def play_variants(context: Context) -> Iterator[Message]:
+    """Play the task with all of its events and with none, and each of its stages, and compare equal seeds."""
+    task: Any = registry.load(context.spec.task)
+    if not registry.is_task(task):
+        raise NotApplicable("events and stages are those of a rlctl.task.Task")
+    try:
+        repeats = _play(context, context.spec)[1]
+    except EnvironmentRaised:
+        raise NotJudged("the task raises whatever the events (RL2)") from None
+    if task.events:
+        yield from _play_events(context, repeats)
+    else:
+        yield Skipped("RL011", "the task has no events", applies=False)
+    if task.stages:
+        yield from _play_stages(context, task.stages)
+    else:
+        yield Skipped("RL012", "the task has no stages", applies=False)
+
+
+def _play_events(context: Context, repeats: bool) -> Iterator[Finding]:
+    for randomize in {True, False} - {context.spec.randomize}:
+        where = f"with randomize={str(randomize).lower()}"
+        try:
+            _, same = _play(context, dataclasses.replace(context.spec, randomize=randomize))
+        except EnvironmentRaised as error:
+            yield Finding("RL011", f"{where}: {describe(error.__cause__ or error)}")
+            continue
+        if repeats and not same:
+            fix = "Let the functions of events draw all chance from the generator that they are given."
+            yield Finding("RL011", f"{where}: equal seeds and actions give unequal episodes", fix=fix)
+
+
+def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[Finding]:
+    spec, first = context.spec, None
+    settings = {"task": spec.parameters, "events": spec.events, "randomize": spec.randomize, "stages": list(stages)}
+    try:
+        specs = validate(settings, "stages").env_specs(spec.task)
+    except RecipeError as error:
+        yield Finding("RL012", str(error))
+        return
+    for number, each in enumerate(specs, start=1):
+        try:
+            info, _ = _play(context, each)
+        except EnvironmentRaised as error:
+            yield Finding("RL012", f"stage {number} of {len(specs)}: {describe(error.__cause__ or error)}")
+            continue
+        first = first or info
+        if difference := info.find_difference(first, "stage 1's"):
+            fix = "One policy learns in all stages: leave out the task parameter that changes its spaces."
+            yield Finding("RL012", f"stage {number} of {len(specs)}: {difference}", fix=fix)
+
+
+def _play(context: Context, spec: EnvSpec) -> tuple[EnvInfo, bool]:
+    """Return what the environment of `spec` is, and whether two episodes of one seed in it are equal."""
+    with Context(spec, context.progress).fresh() as instance:
+        deadline = context.budget.deadline
+        episodes = [
+            np.concatenate([_flatten(moment.observation) for moment in episode])
+            for episode in (Episode(instance, FIRST_SEED, max_steps=STEPS, deadline=deadline) for _ in range(2))
+        ]
+        shortest = min(len(each) for each in episodes)  # where time was up
+        return describe_env(instance.env), bool(np.array_equal(episodes[0][:shortest], episodes[1][:shortest]))
+
+
+def _flatten(observation: Any) -> NDArray[np.float64]:
+    parts = observation.values() if isinstance(observation, dict) else [observation]
+    return np.concatenate([np.asarray(part, np.float64).ravel() for part in parts])

@@ -1,0 +1,82 @@
+"""Tasks that work as they are, and do not when a recipe switches their events on, or goes through their stages."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlctl.task import Event, events
+from rlctl_manipulation.reach import Reach
+
+RANDOM = np.random.default_rng()
+
+
+def shift_home(sim, rng):
+    """Draw from a generator of its own."""
+    arm = sim.body("arm")
+    by = float(RANDOM.uniform(-0.1, 0.1))
+    arm.set_joints(arm.joint_positions + by)
+    return {"by": by}
+
+
+def break_down(sim, rng):
+    """Raise when half a second has passed."""
+    if RANDOM is not None and sim.body("arm").joint_velocities.any():
+        raise RuntimeError("a gear broke")
+    return {}
+
+
+@dataclass
+class Sound(Reach):
+    stages = [
+        {"task": {"tolerance": 0.2}, "promote": {"success": 0.8}},
+        {"events": {"mass": {"factor": [0.9, 1.1]}}},
+    ]
+
+
+@dataclass
+class WrongBody(Reach):
+    events = {"mass": Event("reset", events.scale_mass, body="amr", factor=(0.8, 1.2))}
+
+
+@dataclass
+class OwnChance(Reach):
+    events = {"home": Event("start", shift_home)}
+
+
+@dataclass
+class BreaksDown(Reach):
+    events = {"gear": Event("interval", break_down, every_s=0.5)}
+
+
+@dataclass
+class NeedsItsEvents(Reach):
+    """What is on by itself is off in nothing that can be trained; nothing is wrong with it."""
+
+    events = {"mass": Event("reset", events.scale_mass, body="arm", factor=(0.8, 1.2), enabled=True)}
+
+
+@dataclass
+class WrongKey(Reach):
+    stages = [{"taks": {"tolerance": 0.2}, "promote": {"success": 0.8}}, {}]
+
+
+@dataclass
+class WrongParameter(Reach):
+    stages = [{"task": {"tolerence": 0.2}, "promote": {"success": 0.8}}, {}]
+
+
+@dataclass
+class WrongEvent(Reach):
+    stages = [{"promote": {"success": 0.8}}, {"events": {"masss": {"factor": [1, 2]}}}]
+
+
+@dataclass
+class OtherSpaces(Reach):
+    see_goal: bool = True
+
+    observation_units = {}
+    stages = [{"task": {"see_goal": False}, "promote": {"success": 0.8}}, {}]
+
+    def observe(self):
+        parts = super().observe()
+        return parts if self.see_goal else {name: parts[name] for name in ("joint_positions", "hand_to_goal")}

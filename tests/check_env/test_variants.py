@@ -1,0 +1,51 @@
+"""RL0, variants: the events and the stages of a task."""
+
+import pytest
+
+from tests.check_env.judging import FOLDER, case, check_case, findings, records_of
+
+ERROR = "error"
+SOUND = "broken_variants.py:Sound"
+CASES = [
+    case("broken_variants.py:WrongBody", ("RL011", ERROR), twin=SOUND),
+    case("broken_variants.py:OwnChance", ("RL011", ERROR), twin=SOUND),
+    case("broken_variants.py:BreaksDown", ("RL011", ERROR), twin="broken_variants.py:NeedsItsEvents"),
+    case("broken_variants.py:WrongKey", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:WrongParameter", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:WrongEvent", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:OtherSpaces", ("RL012", ERROR), twin=SOUND),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+@pytest.mark.parametrize(
+    ("name", "rule", "message"),
+    [
+        ("WrongBody", "RL011", "with randomize=true: events.mass: no body 'amr'. Did you mean 'arm'? "),
+        ("OwnChance", "RL011", "with randomize=true: equal seeds and actions give unequal episodes"),
+        ("BreaksDown", "RL011", "with randomize=true: RuntimeError: a gear broke (broken_variants.py:"),
+        ("WrongKey", "RL012", "stages: stage 1: no key 'taks'. Did you mean 'task'?"),
+        ("WrongParameter", "RL012", "stage 1 of 2: task.tolerence: WrongParameter has no parameter 'tolerence'."),
+        ("WrongEvent", "RL012", "stage 2 of 2: events: this task has no event 'masss'. Did you mean 'mass'?"),
+        ("OtherSpaces", "RL012", "stage 2 of 2: its observation space is Box"),
+    ],
+)
+def test_what_is_wrong_is_named(name, rule, message):
+    (finding,) = findings(f"broken_variants.py:{name}", rule)
+    assert finding.message.startswith(message), finding.message
+
+
+def test_a_task_that_randomises_is_judged_without_as_well(rlctl):
+    task = f"{FOLDER}/broken_variants.py:BreaksDown"
+    done = rlctl("check-env", task, "--select", "RL011,RL207", "--set", "randomize=true", timeout=120)
+    assert done.returncode == 1
+    assert "RuntimeError: a gear broke" in done.stdout
+
+
+def test_a_plain_environment_has_neither():
+    records = records_of("broken_envs.py:Clean", "variants")
+    assert not records.findings
