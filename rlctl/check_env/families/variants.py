@@ -29,8 +29,8 @@ STEPS = 60
 @experiment("variants", "RL011", "RL012", share=2.0)
 def play_variants(context: Context) -> Iterator[Message]:
     """Play the task with all of its events and with none, and each of its stages, and compare equal seeds."""
-    task: Any = registry.load(context.spec.task)
-    if not registry.is_task(task):
+    task: Any = getattr(getattr(context.instance.env, "unwrapped", None), "task", None)
+    if not registry.is_task(type(task)):
         raise NotApplicable("events and stages are those of a rlctl.task.Task")
     try:
         repeats = _play(context, context.spec)[1]
