@@ -92,11 +92,18 @@ class Body(Motors):
         """Return the indices of joints in joint arrays; raises `TaskError` for a name that the file does not have."""
         return self._find_joints(list(joints))
 
+    def _read_joints(self) -> Any:
+        raw = self._cache.get("raw joints")
+        if raw is None:
+            # None where a body has no joints.
+            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client) or ()
+            self._cache["raw joints"] = raw
+        return raw
+
     def _joint_states(self) -> tuple[Array, Array]:
         state = self._cache.get("joints")
         if state is None:
-            # None where a body has no joints.
-            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client) or ()
+            raw = self._read_joints()
             state = (np.array([joint[0] for joint in raw]), np.array([joint[1] for joint in raw]))
             self._cache["joints"] = state
         return state
@@ -119,7 +126,7 @@ class Body(Motors):
         """
         torques: Array | None = self._cache.get("torques")
         if torques is None:
-            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client) or ()
+            raw = self._read_joints()
             # PyBullet divides a substep's impulse by the time of the whole step.
             torques = self._substeps * np.array([joint[3] for joint in raw])
             if self._commanded is not None:
