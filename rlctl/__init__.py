@@ -9,7 +9,7 @@
     env_spec      what an environment is made from; registry: from a task's name to its class
     errors        every error that a user can cause, with its exit code
 
-From Python: `rlctl.make`, `rlctl.load_policy`; `docs/architecture.md` has the whole picture.
+From Python: `rlctl.make`, `train`, `evaluate`, `load_policy`; `docs/architecture.md` has the whole picture.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rlctl.env_spec import make
+    from rlctl.python_api import evaluate, train
     from rlctl.run.policy import load_policy
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "load_policy", "make"]
+__all__ = ["__version__", "evaluate", "load_policy", "make", "train"]
 
 
 def __getattr__(name: str) -> Any:
@@ -34,4 +35,16 @@ def __getattr__(name: str) -> Any:
         from rlctl.run.policy import load_policy
 
         return load_policy
+    if name == "evaluate":
+        from rlctl.python_api import evaluate, train  # noqa: F401 (the package of that name can be called as it)
+
+        return evaluate
+    if name == "train":
+        import importlib
+
+        return importlib.import_module("rlctl.train")  # which can be called; see there
     raise AttributeError(f"module 'rlctl' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 from typer.core import TyperGroup
 
-from rlctl import __version__
+from rlctl import __version__, completion, error_boundary
 from rlctl.errors import RlctlError, UsageError
 
 if TYPE_CHECKING:
@@ -51,11 +50,16 @@ OptionalTask = Annotated[
         metavar="TASK",
         help=TASK_FORMS,
         show_default=False,
+        autocompletion=completion.complete_task,
     ),
 ]
 Run = Annotated[
     Optional[str],  # noqa: UP045 (Typer evaluates it)
-    typer.Argument(help="Run folder, policy file, task name, or latest.", show_default="latest"),
+    typer.Argument(
+        help="Run folder, policy file, task name, or latest.",
+        show_default="latest",
+        autocompletion=completion.complete_run,
+    ),
 ]
 Set = Annotated[
     list[str],
@@ -145,7 +149,10 @@ def train(
     resume: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
-            metavar="RUN", help="Go on with a run instead: a folder, a task's name, or latest.", show_default=False
+            metavar="RUN",
+            help="Go on with a run instead: a folder, a task's name, or latest.",
+            show_default=False,
+            autocompletion=completion.complete_run,
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Go on with a run even if its task has changed.")] = False,
@@ -156,7 +163,11 @@ def train(
     settings: Set = [],  # noqa: B006
     algo: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.", show_default=False),
+        typer.Option(
+            help="ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.",
+            show_default=False,
+            autocompletion=completion.complete_algorithm,
+        ),
     ] = None,
     seed: Annotated[Optional[int], typer.Option(help="Seed of everything random.", show_default=False)] = None,  # noqa: UP045
     total_timesteps: Annotated[
@@ -266,7 +277,7 @@ def evaluate(
 @app.command()
 def export(
     run: Run = None,
-    onnx: Annotated[bool, typer.Option("--onnx", help="Write an ONNX file (the one format there is).")] = False,
+    onnx: Annotated[bool, typer.Option("--onnx", help="Write an ONNX file: the only format, so not needed.")] = True,
     checkpoint: Checkpoint = "best",
     output: Annotated[
         Optional[Path],  # noqa: UP045
@@ -278,8 +289,6 @@ def export(
 ) -> None:
     """Turn a policy into a self-contained ONNX file, and verify that it acts the same."""
     _claim_stdout()
-    if not onnx:
-        raise UsageError("say what to export to: rlctl export --onnx")
     from rlctl.export.export import export_onnx
     from rlctl.export.report import show
 
@@ -294,6 +303,7 @@ def replay(
             metavar="[RUN or EPISODE]",
             help="A run or policy to roll out, or a recorded episode (.npz).",
             show_default="latest",
+            autocompletion=completion.complete_run,
         ),
     ] = None,
     episodes: Annotated[int, typer.Option("--episodes", help="Episodes to roll out.", min=1)] = 1,
@@ -361,7 +371,10 @@ def tasks(
 
 @tasks_app.command("show")
 def show_task(
-    task: Annotated[str, typer.Argument(metavar="TASK", help=TASK_FORMS, show_default=False)],
+    task: Annotated[
+        str,
+        typer.Argument(metavar="TASK", help=TASK_FORMS, show_default=False, autocompletion=completion.complete_task),
+    ],
     json: Json = None,
 ) -> None:
     """Show what a task observes, does and rewards, what can be set, and how it is trained."""
@@ -508,72 +521,29 @@ def _parse_changes(settings: list[str]) -> EnvChanges:
 
 
 def main() -> None:
-    """Run the command line and end the process with its exit code: the one error boundary."""
+    """Run the command line and end the process with its exit code."""
+    error_boundary.prepare_streams()
     sys.exit(run(sys.argv[1:]))
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line; return the exit code."""
+    """Run a command line; return the exit code: the one error boundary."""
     try:
         code = app(arguments, standalone_mode=False)
-        _flush()
+        error_boundary.flush()
         return code if isinstance(code, int) else 0
     except RlctlError as error:
-        return _report(error)
+        return error_boundary.report(error)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        _close_stdout()
+        error_boundary.close_stdout()
         return 141
     except SystemExit as end:
         if isinstance(end.__context__, BrokenPipeError):  # what Typer and Rich make of it
-            _close_stdout()
+            error_boundary.close_stdout()
             return 141
         raise
     except Exception as error:
-        return _report_unexpected(error)
-
-
-def _flush() -> None:
-    from rlctl import output
-
-    if sys.stdout is not None and not sys.stdout.closed:  # a plugin may have closed it
-        sys.stdout.flush()
-    if output.results.cache_info().currsize:
-        output.results().flush()
-
-
-def _close_stdout() -> None:
-    # Whatever is still buffered for the closed stdout must not raise again when the interpreter ends.
-    from rlctl import output
-
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    if output.results.cache_info().currsize:
-        os.dup2(nowhere, output.results().fileno())
-
-
-def _report(error: RlctlError) -> int:
-    if error.details:
-        print(error.details.rstrip(), file=sys.stderr)
-    first, *rest = str(error).splitlines()
-    print(f"error: {first}", *rest, sep="\n", file=sys.stderr)
-    return error.exit_code
-
-
-def _report_unexpected(error: Exception) -> int:
-    usage = getattr(error, "exit_code", None)
-    show = getattr(error, "show", None)
-    if usage is not None and show is not None:  # Typer's own usage errors
-        show()
-        return int(usage)
-    if isinstance(error, OSError) and error.strerror:
-        place = f"{error.filename}: " if error.filename else ""
-        print(f"error: {place}{error.strerror}", file=sys.stderr)
-        return 5
-    import traceback
-
-    traceback.print_exc()
-    print(f"error: a bug in rlctl {__version__} or a library; please report it with the lines above", file=sys.stderr)
-    return 70
+        return error_boundary.report_unexpected(error)

@@ -27,7 +27,9 @@ def results() -> TextIO:
     """
     try:
         sys.stdout.flush()
-        stream = os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace")
+        # A terminal has its own encoding; files and pipes get UTF-8.
+        encoding = sys.stdout.encoding if sys.stdout.isatty() else "utf-8"
+        stream = os.fdopen(os.dup(1), "w", encoding=encoding, errors="replace")
     except (OSError, AttributeError):  # started without a stdout
         raise BrokenPipeError from None
     os.dup2(2, 1)
@@ -63,6 +65,11 @@ def _make_console(stream: TextIO) -> Console:
 
     width = None if stream.isatty() else _PIPED_WIDTH
     return Console(file=stream, highlight=False, width=width, soft_wrap=not stream.isatty())
+
+
+def is_utf8() -> bool:
+    """Say whether stderr, which shows progress, can show more than ASCII."""
+    return (getattr(sys.stderr, "encoding", None) or "").lower().startswith("utf")
 
 
 def print_notes(notes: Iterable[str]) -> None:

@@ -6,6 +6,7 @@ A task is written as an installed name (`reach`), `package.module:Class`, `path/
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import importlib
 import importlib.metadata
@@ -129,11 +130,26 @@ def load(task: str) -> Callable[..., Any]:
         return _load_gymnasium(task)
     if ":" in task:
         return _load_target(task, task)
+    if task.endswith(".py") and (file := Path(task).expanduser()).is_file():
+        classes = _list_classes(file)
+        forms = " or ".join(f"{task}:{name}" for name in classes) or f"{task}:CLASS; it defines no class"
+        raise UsageError(f"{task}: name the class in it: {forms}")
     names = [entry.name for entry in list_installed()]
     raise UsageError(
         f"no task {task!r}.{did_you_mean(task, names)} Installed: {', '.join(dict.fromkeys(names)) or 'none'}. "
         "Other forms: package.module:Class, path/to/file.py:Class, Pendulum-v1."
     )
+
+
+def _list_classes(file: Path) -> list[str]:
+    """Return the public classes that a file defines, without importing it: those that look like tasks, or all."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError, RecursionError):
+        return []
+    found = [node for node in tree.body if isinstance(node, ast.ClassDef) and not node.name.startswith("_")]
+    bases = {node.name: " ".join(map(ast.unparse, node.bases)) for node in found}
+    return [name for name, base in bases.items() if "Task" in base or "Env" in base] or list(bases)
 
 
 def is_task(constructor: Any) -> bool:

@@ -105,8 +105,16 @@ def test_no_arguments_show_the_help(rlctl):
             2,
             "error: command line: total_timesteps: expected a whole number in [1, 1e12], ",
         ),
-        (["eval", "--set", "seed=1"], 2, "error: --set seed: only task.* can be set here."),
-        (["export"], 2, "error: say what to export to: rlctl export --onnx"),
+        (["eval", "--set", "seed=1"], 2, "error: --set seed: only task.NAME, reward_weights.NAME, randomize and "),
+        (["export"], 5, "error: no run yet under "),
+        (
+            ["train", "reach", "--device", "gpu"],
+            2,
+            "error: --device 'gpu': no such device; give cpu, cuda, cuda:1, or ",
+        ),
+        (["eval", "--min-success", "95"], 2, "error: --min-success 95: a rate is between 0 and 1; 95 % is 0.95"),
+        (["train", "two.py"], 2, "error: two.py: name the class in it: two.py:Swing or two.py:Twirl"),
+        (["eval", "model.zip"], 5, "error: model.zip: a .zip, as Stable-Baselines3 saves models, not a run; make "),
         (["train", "broken.py:Env"], 3, "error: task 'broken.py:Env': import failed: RuntimeError: no robot (broken."),
         (["eval"], 5, "error: no run yet under "),
         (["eval", "reach"], 5, "error: no run of 'reach' yet under "),
@@ -117,6 +125,7 @@ def test_no_arguments_show_the_help(rlctl):
 )
 def test_errors_are_a_line_and_a_code(rlctl, write_module, arguments, code, message):
     write_module("broken.py", "raise RuntimeError('no robot')")
+    write_module("two.py", "class Swing(Task): ...\nclass _Own(Task): ...\nclass Twirl(gym.Env): ...\nclass Other: ...")
     result = rlctl(*arguments)
     assert result.returncode == code, result.stderr
     assert any(line.removeprefix("Error: ").startswith(message) for line in result.stderr.splitlines()), result.stderr

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 LAYERS = [
     {"__main__"},
     {"cli"},
+    {"error_boundary", "completion", "python_api"},
     {"train"},
     {"export", "replay", "tasks", "runs"},
     {"check_env", "eval"},
@@ -28,7 +29,13 @@ LAYERS = [
     {"errors", "__init__"},
 ]
 # Beside the order above.
-ALSO = {("output", "run"), ("__init__", "env_spec"), ("__init__", "run")}
+ALSO = {
+    ("output", "run"),
+    ("__init__", "env_spec"),
+    ("__init__", "run"),
+    ("__init__", "python_api"),
+    ("train", "python_api"),
+}
 NOT_AMONG_VERBS = {("export", "check_env"), ("replay", "check_env"), ("replay", "export")}
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 MAY_IMPORT_TORCH = {  # besides train/

@@ -65,6 +65,13 @@ class Gates:
     min_success_lower: float | None = None
     min_return: float | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("min_success", "min_success_lower"):
+            rate = getattr(self, name)
+            if rate is not None and not 0 <= rate <= 1:
+                hint = f"; {rate:g} % is {rate / 100:g}" if 1 < rate <= 100 else ""
+                raise UsageError(f"--{name.replace('_', '-')} {rate:g}: a rate is between 0 and 1{hint}")
+
     def check_possible(self, has_success: bool) -> None:
         """Raise `UsageError` for a gate on success where the environment does not report it."""
         if not has_success and (self.min_success is not None or self.min_success_lower is not None):
@@ -154,7 +161,7 @@ def _run_episodes(workers: Workers, policy: Policy, request: EvalRequest) -> lis
     console = output.err()
     if not console.is_terminal:
         return run_episodes(workers, actor, seeds)
-    with console.status("evaluating") as status:
+    with console.status("evaluating", spinner="dots" if output.is_utf8() else "line") as status:
         return run_episodes(
             workers, actor, seeds, on_episode=lambda done: status.update(f"evaluating: {done}/{len(seeds)} episodes")
         )

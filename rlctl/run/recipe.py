@@ -361,12 +361,16 @@ def fill_defaults(recipe: Recipe) -> Recipe:
 
 def parse_changes(settings: list[str]) -> EnvChanges:
     """Return what `--set` changes in an environment; raises `RecipeError` for a key that is not of one."""
-    values = parse_settings(settings)
+    return check_changes(parse_settings(settings), "--set")
+
+
+def check_changes(values: Mapping[str, Any], source: str) -> EnvChanges:
+    """Check the keys of a recipe that are about the environment; raises `RecipeError` for another key."""
     for key in values:
         if key not in _OF_THE_ENVIRONMENT:
             can = "task.NAME, reward_weights.NAME, randomize and events.NAME can be set here"
-            raise RecipeError(f"--set {key}: only {can}.{did_you_mean(key, _OF_THE_ENVIRONMENT)}")
-    recipe = validate(values, "--set")
+            raise RecipeError(f"{source} {key}: only {can}.{did_you_mean(key, _OF_THE_ENVIRONMENT)}")
+    recipe = validate(values, source)
     randomize = recipe.randomize if "randomize" in values else None
     return EnvChanges(recipe.task, recipe.reward_weights, randomize, recipe.events)
 

@@ -13,6 +13,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from rlctl.dict_spaces import split_space
 from rlctl.errors import RecipeError, UsageError, short_repr
 from rlctl.run.recipe import Normalize, Recipe
 from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
@@ -20,6 +21,7 @@ from rlctl.train import footprint
 from rlctl.train.hindsight import replay_arguments
 from rlctl.train.vec_env import WorkerVecEnv
 
+_CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
 _DETERMINISTIC_EXPLORERS = frozenset({"td3", "ddpg"})
 
 
@@ -34,6 +36,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     if name not in cls.policy_aliases:
         kind = "dictionaries" if isinstance(env.observation_space, spaces.Dict) else "images"
         raise RecipeError(f"{recipe.algo} cannot be used here: it has no network for {kind}")
+    _check_spaces(recipe.algo, env.observation_space, env.action_space)
     _check_rollout(recipe, env.num_envs)
     footprint.check(recipe, env.observation_space, env.action_space, env.num_envs)
     try:
@@ -61,6 +64,22 @@ def _check_device(device: str) -> None:
         raise UsageError(
             f"--device {device}: torch sees {torch.cuda.device_count()} CUDA devices here; use cpu or auto"
         )
+
+
+def _check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """Raise `RecipeError` for spaces that SB3 refuses in its own words, or not before training."""
+    actions = short_repr(action_space)
+    if algo == "dqn" and not isinstance(action_space, spaces.Discrete):
+        raise RecipeError(f"dqn cannot be used here: it needs Discrete actions, these are {actions}; try ppo or sac")
+    if algo in _CONTINUOUS and not isinstance(action_space, spaces.Box):
+        raise RecipeError(f"{algo} cannot be used here: it needs Box actions, these are {actions}; try ppo or dqn")
+    for key, part in split_space(observation_space).items():
+        if isinstance(part, spaces.Discrete) and part.start != 0:
+            name = f"observation {key!r}" if key else "the observation"
+            raise RecipeError(
+                f"{name} is {part}, and Stable-Baselines3 counts categories from 0: "
+                f"observe value - {part.start} in Discrete({part.n})"
+            )
 
 
 def _algorithm_kwargs(recipe: Recipe, action_space: spaces.Space[Any]) -> dict[str, Any]:

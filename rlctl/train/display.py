@@ -14,6 +14,7 @@ from typing import Any
 from rlctl import output
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
+_ASCII_BLOCKS = "_.-=+*#@"
 _CURVE = 200  # points that are kept; as many are drawn as there is room for
 _WIDE = 100  # columns of a terminal
 _LINE_EVERY_S = 5.0
@@ -23,10 +24,11 @@ def sparkline(values: list[float], low: float | None = None, high: float | None 
     """Draw values as a line of blocks, between `low` and `high` or their own range."""
     if not values:
         return ""
+    blocks = _BLOCKS if output.is_utf8() else _ASCII_BLOCKS
     low = min(values) if low is None else low
     high = max(values) if high is None else high
-    scale = (len(_BLOCKS) - 1) / (high - low) if high > low else 0.0
-    return "".join(_BLOCKS[round(min(max((value - low) * scale, 0), len(_BLOCKS) - 1))] for value in values)
+    scale = (len(blocks) - 1) / (high - low) if high > low else 0.0
+    return "".join(blocks[round(min(max((value - low) * scale, 0), len(blocks) - 1))] for value in values)
 
 
 def percent(rate: float | None) -> str:
@@ -266,7 +268,11 @@ class LiveDisplay(Display):
             terms = "  ".join(f"{name} {value:.4g}" for name, value in self._terms.items())
             lines.append(Text(f"  terms   {terms}", no_wrap=True, overflow="ellipsis"))
         for each in self._evaluations[-5:]:
-            lines.append(Text("  ✓ " + evaluation_line(*each), style="green" if each[3] else ""))
+            lines.append(
+                Text(
+                    ("  ✓ " if output.is_utf8() else "  + ") + evaluation_line(*each), style="green" if each[3] else ""
+                )
+            )
         return lines
 
 

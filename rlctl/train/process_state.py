@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,13 +14,28 @@ import numpy as np
 def preserve_process_state() -> Iterator[None]:
     """Restore what importing somebody's module may change and a training relies on.
 
-    That is the working directory, what numpy does about overflows, and the permissions of new files. Signal handlers
+    That is the working directory, the permissions of new files, and the defaults of numpy and torch. Signal handlers
     are set anew when the training begins.
     """
     mask = os.umask(0o077)
     os.umask(mask)
+    printing = np.get_printoptions()
     try:
         with contextlib.chdir("."), np.errstate():
             yield
     finally:
         os.umask(mask)
+        np.set_printoptions(**printing)
+        _restore_torch()
+
+
+def _restore_torch() -> None:
+    """Undo what torch was told, where a module has imported it: number type, device, gradients, determinism."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        return
+    torch.set_default_dtype(torch.float32)
+    torch.set_default_device(None)
+    torch.set_grad_enabled(True)
+    torch.use_deterministic_algorithms(False)
+    torch.autograd.set_detect_anomaly(False)

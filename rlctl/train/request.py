@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from rlctl.train.saving import Saver
 
 _EVAL_ENVS = 32
+_DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +76,8 @@ def run_training(request: TrainRequest) -> TrainResult:
     """Train, or go on with a run; returns when it is done. Raises `Interrupted` after a signal."""
     if (request.task is None) == (request.resume is None):
         raise UsageError("give a task to train, or --resume RUN to go on with a run; one of the two")
+    if not _DEVICE.fullmatch(request.device):  # now, and not after half a minute of imports
+        raise UsageError(f"--device {request.device!r}: no such device; give cpu, cuda, cuda:1, or auto")
     with StopSignals() as signals:
         start = _new(request) if request.task is not None else _load_start(request)
         try:

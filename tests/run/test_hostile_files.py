@@ -12,8 +12,9 @@ import pytest
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files
-from rlctl.run.directory import RunDirectory, find_policy
+from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
+from rlctl.run.lookup import FoundPolicy, find_policy
 
 INFO = EpisodeInfo(spec=EnvSpec("reach"), seed=1, total_reward=0.0, term_names=["distance"])
 
@@ -226,7 +227,7 @@ def test_what_is_no_file(kind, suffix, tmp_path):
 
 def test_a_policy_that_is_a_folder_is_not_called_missing(tmp_path):
     (tmp_path / "x.onnx").mkdir()
-    assert find_policy(str(tmp_path / "x.onnx")) == (tmp_path / "x.onnx", None)
+    assert find_policy(str(tmp_path / "x.onnx")) == FoundPolicy(tmp_path / "x.onnx", None)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".safetensors", ".onnx"])

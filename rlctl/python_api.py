@@ -1,0 +1,71 @@
+"""`rlctl.train` and `rlctl.evaluate`: the verbs from Python, with the keys of a recipe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rlctl.eval.evaluate import Evaluation
+    from rlctl.train.request import TrainResult
+
+
+def train(
+    task: str,
+    /,
+    *,
+    config: str | Path | None = None,
+    device: str = "cpu",
+    root: str | Path = "runs",
+    check: bool = True,
+    **recipe: Any,
+) -> TrainResult:
+    """Train as `rlctl train` does, and return the run with what it reached.
+
+    Keywords are the keys of a recipe, `docs/recipe.md`: `train("reach", seed=1, algo_kwargs={"gamma": 0.97})`. They go
+    over `config`, a recipe file. Call it from a script's `if __name__ == "__main__":`, which processes may import.
+    Raises what `rlctl.errors` has.
+    """
+    from rlctl.train.request import TrainRequest, run_training
+
+    request = TrainRequest(
+        task=task,
+        config=None if config is None else Path(config),
+        settings=recipe,
+        device=device,
+        root=Path(root),
+        check=check,
+    )
+    return run_training(request)
+
+
+def evaluate(
+    run: str | Path | None = None,
+    /,
+    *,
+    other_task: str | None = None,
+    checkpoint: str = "best",
+    episodes: int = 100,
+    seed: int = 0,
+    deterministic: bool = True,
+    **recipe: Any,
+) -> Evaluation:
+    """Evaluate as `rlctl eval` does, and return the numbers with every episode.
+
+    `run` is a run's folder, a policy file, a task's name or None for the latest run; `other_task` a task to evaluate
+    on instead of the one it was trained on. Further keywords are those keys of a recipe that are about the environment:
+    `task` (its parameters), `reward_weights`, `randomize`, `events`.
+    """
+    from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
+    from rlctl.run.recipe import check_changes
+
+    request = EvalRequest(
+        run=None if run is None else str(run),
+        task=other_task,
+        checkpoint=checkpoint,
+        episodes=episodes,
+        seed=seed,
+        changes=check_changes(recipe, "evaluate"),
+        deterministic=deterministic,
+    )
+    return run_evaluation(request, Gates())
