@@ -44,7 +44,7 @@ class Goal(Clean):
         return float(self.compute_reward(self.position, self.goal, {}))
 
     def info(self):
-        return {"is_success": self.reward() > -0.1}
+        return {"is_success": self.reward() > -0.25}
 
 
 class OtherReward(Goal):
@@ -54,7 +54,7 @@ class OtherReward(Goal):
         return super().reward() - 0.5
 
     def info(self):
-        return {"is_success": self.reward() > -0.6}
+        return {"is_success": self.reward() > -0.75}
 
 
 class OneByOne(Goal):
