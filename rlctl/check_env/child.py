@@ -85,9 +85,9 @@ def _run(experiment: Experiment, context: Context) -> Iterator[Message]:
             yield message
         is_complete = True
     except (NotJudged, NotApplicable) as reason:
-        for rule in experiment.rules or (experiment.name,):
-            if rule not in found:
-                yield Skipped(rule, str(reason), applies=isinstance(reason, NotJudged))
+        for name in (*experiment.rules, experiment.name):
+            if name not in found:
+                yield Skipped(name, str(reason), applies=isinstance(reason, NotJudged))
         is_complete = True
     except EnvironmentRaised as error:
         yield failure(error, context.progress)

@@ -119,6 +119,10 @@ def test_an_assertion_without_a_message_is_quoted(tmp_path):
     assert collect_complaints(check, gymnasium.make("CartPole-v1")) == [("error", "assert env is None")]
 
 
+def test_an_experiment_that_could_not_be_made_says_why():
+    assert verdict_of("broken_envs.py:Endless", "RL505").not_judged == {"RL505": "the episode did not come to an end"}
+
+
 def test_out_of_range_is_placed():
     (finding,) = findings("broken_envs.py:OutOfRange", "RL103")
     assert re.match(
