@@ -278,6 +278,12 @@ def _find_loaded(file: Path) -> Path:
 def _load_gymnasium(task: str) -> Callable[..., Any]:
     import gymnasium
 
+    spec = gymnasium.registry.get(task.rpartition(":")[2])
+    if spec is not None and isinstance(spec.entry_point, str):
+        module = spec.entry_point.partition(":")[0]
+        if _find_module_file(module) is not None:
+            _import_module(task, module)  # as in `load`: an import that fails is no constructor that fails
+
     def constructor(**parameters: Any) -> Any:
         try:
             return gymnasium.make(task, disable_env_checker=True, **parameters)
