@@ -125,12 +125,14 @@ class _Actor:
         info = self._policy.info
         self._spec: EnvSpec = found.locate(info.derive_spec(request.task, request.changes))
         self._name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
+        self._described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
 
     def show(self) -> ReplayResult:
         with open_window(self._spec) as env:
             self._check_fits(env)
             rollouts = show_episodes(env, self._spec, self._seeds, self._begin)
-        return ReplayResult(self._spec.task, self._name, [_summarize(rollout) for rollout in rollouts])
+        shown = [_summarize(rollout) for rollout in rollouts]
+        return ReplayResult(self._spec.task, self._name, shown, policy_file=self._described)
 
     def record(self) -> ReplayResult:
         from rlctl.replay.rrd import write_rrd
@@ -146,7 +148,7 @@ class _Actor:
                 title, several = f"{spec.task} / episode {recording.stem}", len(self._seeds) > 1
                 write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
                 done.append(_summarize(rollout, recording, episode))
-        return ReplayResult(spec.task, self._name, done)
+        return ReplayResult(spec.task, self._name, done, policy_file=self._described)
 
     def _check_fits(self, env: Env) -> None:
         self._policy.info.check_fits(describe(env), self._file)

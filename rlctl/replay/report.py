@@ -49,6 +49,8 @@ class ReplayResult:
     policy: str
     episodes: list[ReplayedEpisode]
     verification: Verification | None = None
+    policy_file: str = ""
+    """Where the policy is, and what it is; empty for a recorded episode."""
 
     def check(self) -> None:
         """Raise `AnswerIsNo` if a recorded episode could not be reproduced."""
@@ -66,8 +68,8 @@ def show(result: ReplayResult, json: str | None) -> None:
         _show_verification(result, result.verification)
         return
     out = output.out()
-    randomization = describe_randomization(result.episodes[0].events)
-    parts = [each for each in (result.policy, randomization) if each]
+    randomization = describe_randomization(result.episodes[0].events) if result.episodes else ""
+    parts = [each for each in (result.policy_file or result.policy, randomization) if each]
     out.print(f"{result.task}: {', '.join(parts)}" if parts else result.task, markup=False)
     for episode in result.episodes:
         out.print(_line(episode), markup=False)

@@ -32,11 +32,22 @@ class _LineFilter:
         self._second = 0
         self._lines = 0  # in this second
         self._left_out = 0
+        self._bullet_head = ""
+        self._bullet_warnings: set[str] = set()
 
     def line(self, text: str) -> None:
         # Many environments print the same line; once is enough.
         if text == self._last or text.startswith("pybullet build time"):
             return
+        # PyBullet's warnings have two lines, the second of which says what is wrong.
+        if text.startswith(("b3Warning[", "b3Error[")):
+            self._bullet_head = text.rstrip()
+            return
+        if self._bullet_head:
+            text, self._bullet_head = f"{self._bullet_head} {text}", ""
+            if text in self._bullet_warnings:
+                return
+            self._bullet_warnings.add(text)
         self._last = text
         second = int(time.monotonic())
         if second != self._second:

@@ -66,7 +66,7 @@ def test_command_line_from_a_run_to_the_command_that_opens_it(replay, run, tmp_p
     done = replay(run.run.path, "-o", "a b.rrd")
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    assert lines[0] == "reach: best.safetensors, ppo, step 64, not randomised"
+    assert lines[0] == f"reach: {run.run.best_policy} (ppo, step 64), not randomised"
     assert lines[1].startswith("a b.rrd: seed ")
     assert lines[2:] == [
         "open with: rerun 'a b.rrd'",

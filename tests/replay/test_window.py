@@ -1,6 +1,7 @@
 import time
 
 from rlctl.env_spec import EnvSpec
+from rlctl.replay.report import ReplayResult, show
 from rlctl.replay.window import show_episodes
 from rlctl.task.bullet import pybullet
 
@@ -32,3 +33,8 @@ def test_closing_the_window_ends_it_well():
 
     assert show_episodes(env, spec, [1, 2], lambda: choose) == []
     env.close()
+
+
+def test_a_window_that_was_closed_at_once_is_no_error(tmp_path):
+    show(ReplayResult("reach", "best.safetensors", []), str(tmp_path / "result.json"))
+    assert '"episodes": []' in (tmp_path / "result.json").read_text()

@@ -128,6 +128,16 @@ def test_what_is_printed_comes_line_by_line():
     assert told_of(b"one\ntwo\n\ntwo\ntwo\nthree") == ["one", "two", "", "two", "three"]
 
 
+def test_a_warning_of_pybullet_comes_once_and_whole():
+    warning = b"b3Warning[examples/Importers/URDF.cpp,126]:\nNo inertial data for link 'hand'\n"
+    other = b"b3Warning[examples/Importers/URDF.cpp,126]:\nNo inertial data for link 'wrist'\n"
+    assert told_of((warning + other) * 64 + b"done\n") == [
+        "b3Warning[examples/Importers/URDF.cpp,126]: No inertial data for link 'hand'",
+        "b3Warning[examples/Importers/URDF.cpp,126]: No inertial data for link 'wrist'",
+        "done",
+    ]
+
+
 def test_what_would_upset_a_terminal():
     assert told_of(b"\x1b[2J\x07\x00 caf\xc3\xa9 \xff\tend\r\n") == ["\ufffd[2J\ufffd\ufffd caf\u00e9 \ufffd\tend"]
     assert replace_control_characters("\u202eabc") == "\ufffdabc"
