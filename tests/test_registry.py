@@ -151,6 +151,14 @@ def test_gymnasium_ids(write_module, monkeypatch):
     assert EnvSpec("Pendulum-v1", {"g": 1.0, "max_episode_steps": 7}).make().spec.max_episode_steps == 7
 
 
+def test_a_gymnasium_id_whose_class_cannot_be_imported(write_module):
+    write_module("registers.py", "import gymnasium\ngymnasium.register('Late-v0', entry_point='late:Late')\n")
+    write_module("late.py", "1 / 0\n")
+    assert error(TaskError, "registers:Late-v0") == (
+        "task 'registers:Late-v0': import failed: ZeroDivisionError: division by zero (late.py:1)"
+    )
+
+
 def test_parameters_that_are_not_there(my_env):
     assert error(RecipeError, "my_env.py:MyEnv", {"gian": 1}) == (
         "task.gian: my_env.py:MyEnv has no parameter 'gian'. Did you mean 'gain'? It has: gain."
