@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rlctl.errors import TaskError
 from rlctl.task import Box, Event, Sim, Task, events, rewards
 
 # Seven joints of the arm, then the gripper's: turn, left finger, left tip, right finger, right tip. [rad]
@@ -26,6 +27,7 @@ BASE = (-0.1, 0.0, 0.07)  # [m], of the arm
 TRAY = (0.64, 0.075, -0.19)
 HAND_START = np.array([0.537, 0.0, 0.5])  # [m]
 HAND_LOW, HAND_HIGH = np.array([0.50, -0.17]), np.array([0.65, 0.22])  # [m], x and y that the hand is kept in
+BLOCK_X, BLOCK_Y = (0.48, 0.69), (-0.20, 0.25)  # [m], where fingers at the edge of that still get hold of a block
 STEP = np.array([0.005, 0.005])  # [m], of the hand at action 1
 TURN = 0.05  # [rad], of the gripper at action 1
 DESCENT, LIFT = 0.002, 0.004  # [m], per control step; the original lifts 1 mm in each of its steps of 1/240 s
@@ -85,6 +87,12 @@ class KukaGrasp(Task):
 
     def build(self, sim: Sim) -> None:
         """Load the arm, the tray and the block."""
+        for name, drawn, (low, high) in (("block_x", self.block_x, BLOCK_X), ("block_y", self.block_y, BLOCK_Y)):
+            if not low <= drawn[0] <= drawn[1] <= high:
+                raise TaskError(
+                    f"{name}: {drawn[0]:g} to {drawn[1]:g} m is out of the hand's reach. Stay between {low:g} and "
+                    f"{high:g}, the lower value first."
+                )
         sim.set_gravity(10.0)
         self.arm = sim.load("arm", "kuka_iiwa/kuka_with_gripper2.sdf")
         self.arm.set_base(BASE)

@@ -12,6 +12,10 @@ from rlctl.task.inertia import find_inertia_faults
 from rlctl_manipulation.gear_arm import BASE, ELBOW, GEAR, HOME, STOPS, TOOL, TORQUE, GearArm, stop_torque
 
 
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 def solve(point):
     """Angles of turn, shoulder and crank [rad] that bring the tool to a point [m]: law of cosines, elbow up."""
     x, y, z = point
@@ -38,7 +42,7 @@ def env():
     env.close()
 
 
-@pytest.mark.parametrize("held_for", [1, 10, 50])
+@pytest.mark.parametrize("held_for", [slow(1), 10, slow(50)])
 def test_the_linkage_and_the_gears_hold(env, held_for):
     """60 s of random torques, new ones every `held_for` control steps: 1 mm, 0.5 degrees."""
     task, rng = env.task, np.random.default_rng(held_for)
@@ -113,7 +117,7 @@ def grasp_and_lift(env, seed):
     return np.array(rows), info
 
 
-@pytest.mark.parametrize("stage", ["grasp", "lift"])
+@pytest.mark.parametrize("stage", [slow("grasp"), "lift"])
 def test_an_object_can_be_grasped_and_lifted(stage):
     env = TaskEnv(GearArm(stage=stage))
     lifted = []
@@ -156,8 +160,7 @@ def test_end_stops():
     assert stop_torque(3.0, 0.5, 2.9) == pytest.approx(-6.0)
 
 
-@pytest.mark.parametrize("stage", ["reach", "lift"])
-@pytest.mark.parametrize("randomize", [False, True])
+@pytest.mark.parametrize(("stage", "randomize"), [("lift", True), slow("lift", False), slow("reach", True)])
 def test_episodes_repeat_bit_for_bit(stage, randomize):
     def make():
         return TaskEnv(GearArm(stage=stage), events=EventSettings(randomize))
