@@ -134,7 +134,7 @@ def test_command_of_a_clean_environment(tmp_path):
 
 def test_command_of_a_broken_environment(tmp_path):
     file = tmp_path / "report.json"
-    run = rlctl(f"{BROKEN}:OutOfRange", "--set", "task.size=4.0", "--json", str(file))
+    run = rlctl(f"{BROKEN}:OftenOutOfRange", "--set", "task.size=4.0", "--json", str(file))
     assert (run.returncode, run.stdout) == (1, "")
     content = json.loads(file.read_text())
     (finding,) = content["findings"]
