@@ -134,7 +134,7 @@ def run_check(packages, tmp_path_factory):
         command = [sys.executable, "-m", "rlctl", "check-env", *task.split(), "--json", "report.json"]
         environ = {**os.environ, "PYTHONPATH": str(packages)}
         done = subprocess.run(
-            command, cwd=folder, env=environ, capture_output=True, text=True, timeout=400, check=False
+            command, cwd=folder, env=environ, capture_output=True, text=True, timeout=600, check=False
         )
         assert done.returncode in (0, 1, 3), done.stderr
         return read_result(done.returncode, json.loads((folder / "report.json").read_text()))
