@@ -7,7 +7,7 @@ import os
 import sys
 
 from rlctl import __version__
-from rlctl.errors import RlctlError
+from rlctl.errors import RlctlError, short_repr
 
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "can't allocate memory", "not enough memory")
 
@@ -61,7 +61,9 @@ def report_unexpected(error: Exception) -> int:
         show()
         return int(usage)
     if _is_out_of_memory(error):
-        print(f"error: not enough memory for this process ({_read_limit()}); use fewer --n-envs", file=sys.stderr)
+        text = short_repr(str(error), 120)
+        print(f"error: not enough memory ({_read_limit()}){text and f': {text}'}", file=sys.stderr)
+        print("close other programs, or use fewer --n-envs or a smaller algo_kwargs.buffer_size", file=sys.stderr)
         return 5
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""

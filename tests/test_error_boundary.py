@@ -51,4 +51,4 @@ def test_stderr_is_closed(tmp_path):
 )
 def test_memory_that_is_refused(error, capsys):
     assert error_boundary.report_unexpected(error) == 5
-    assert capsys.readouterr().err.startswith("error: not enough memory for this process (")
+    assert capsys.readouterr().err.startswith("error: not enough memory (")

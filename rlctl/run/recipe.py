@@ -6,6 +6,7 @@ A recipe is made from the task's packaged YAML, then `--config`, then `--set` an
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -357,6 +358,20 @@ def fill_defaults(recipe: Recipe) -> Recipe:
     if recipe.eval.every_steps is None:
         changes["eval"] = recipe.eval.model_copy(update={"every_steps": max(1, recipe.total_timesteps // 10)})
     return recipe.model_copy(update=changes)
+
+
+def describe_rounding(recipe: Recipe) -> str | None:
+    """Describe how many steps are trained where whole rollouts make clearly more of them than `total_timesteps`."""
+    if recipe.algo not in ON_POLICY:
+        return None
+    rollout = int(recipe.algo_kwargs.get("n_steps", 5)) * recipe.n_envs
+    steps = math.ceil(recipe.total_timesteps / rollout) * rollout
+    if steps <= 1.1 * recipe.total_timesteps:
+        return None
+    return (
+        f"{steps:,} steps will be trained, not {recipe.total_timesteps:,}: {recipe.algo} trains whole rollouts, of "
+        f"{rollout:,} steps here (n_steps x n_envs)"
+    )
 
 
 def parse_changes(settings: list[str]) -> EnvChanges:

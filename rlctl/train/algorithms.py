@@ -36,7 +36,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     if name not in cls.policy_aliases:
         kind = "dictionaries" if isinstance(env.observation_space, spaces.Dict) else "images"
         raise RecipeError(f"{recipe.algo} cannot be used here: it has no network for {kind}")
-    _check_spaces(recipe.algo, env.observation_space, env.action_space)
+    check_spaces(recipe.algo, env.observation_space, env.action_space)
     _check_rollout(recipe, env.num_envs)
     footprint.check(recipe, env.observation_space, env.action_space, env.num_envs)
     try:
@@ -48,7 +48,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
             device=device,
             **kwargs,
         )
-    except (AssertionError, ValueError, TypeError, RuntimeError, MemoryError) as error:
+    except (AssertionError, ValueError, TypeError, RuntimeError) as error:
         raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error), 300)}") from error
 
 
@@ -66,7 +66,7 @@ def _check_device(device: str) -> None:
         )
 
 
-def _check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """Raise `RecipeError` for spaces that SB3 refuses in its own words, or not before training."""
     actions = short_repr(action_space)
     if algo == "dqn" and not isinstance(action_space, spaces.Discrete):

@@ -17,7 +17,7 @@ from rlctl.rollout.workers import Workers
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.recipe import resolve
+from rlctl.run.recipe import describe_rounding, resolve
 from rlctl.train import status
 from rlctl.train.display import Display, make_display
 from rlctl.train.precheck import Precheck
@@ -92,7 +92,9 @@ def _new(request: TrainRequest) -> Start:
     with preserve_process_state():
         constructor: Any = registry.load(task)
     stages = constructor.stages if registry.is_task(constructor) else ()
-    return Start(task, resolve(task, request.config, request.settings, stages))
+    recipe = resolve(task, request.config, request.settings, stages)
+    note = describe_rounding(recipe)
+    return Start(task, recipe, notes=(note,) if note else ())
 
 
 def _load_start(request: TrainRequest) -> Start:
@@ -107,6 +109,9 @@ def _run(request: TrainRequest, start: Start, signals: StopSignals) -> TrainResu
     specs = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")
     title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
     with make_display(title, start.recipe.total_timesteps) as display:
+        if start.run is None:
+            for note in start.notes:
+                display.message(note)
         display.phase(f"building {start.recipe.n_envs} environments, importing PyTorch")
         # The workers build their environments, and the check runs, while this process imports torch.
         workers = _workers(specs[start.stage - 1], start.recipe.n_envs, request, display)

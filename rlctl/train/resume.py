@@ -30,7 +30,7 @@ class Start:
     lock: RunLock | None = None
     checkpoint: Checkpoint | None = None
     notes: tuple[str, ...] = ()
-    """Messages about the checkpoint."""
+    """Messages for the user, before the first step."""
     inexact: tuple[str, ...] = ()
     """Why the run cannot go on as if it had never stopped, as far as is known before it goes on."""
 
