@@ -5,6 +5,7 @@ import os
 # Each of the processes that run the tests has a core: threads of a library would only wait for each other.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
+import signal
 import subprocess
 import sys
 import textwrap
@@ -15,6 +16,9 @@ import pytest
 
 from rlctl.rollout.process_start import set_default_start
 from tests import fork_server
+
+
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup what is started here would ignore it
 
 
 @pytest.fixture(scope="session", autouse=True)
