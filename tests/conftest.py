@@ -17,7 +17,6 @@ import pytest
 from rlctl.rollout.process_start import set_default_start
 from tests import fork_server
 
-
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup what is started here would ignore it
 
 
