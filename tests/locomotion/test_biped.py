@@ -83,7 +83,7 @@ def test_it_falls_with_straight_legs(env):
             break
     assert terminated
     assert env.task.trunk.position[2] < 0.2  # [m]
-    assert info["reward_terms"]["fall"] == {"Biped": -5.0, "Biped3D": -15.0}[env.name]
+    assert info["reward_terms"]["fall"] == -15.0
     assert info["reward_terms"]["alive"] == info["reward_terms"]["forward_while_alive"] == 0.0
     assert info["is_success"] is False
 
