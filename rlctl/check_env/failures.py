@@ -40,8 +40,8 @@ def failure(error: EnvironmentRaised, progress: Progress) -> Failure:
 
 def describe(error: BaseException) -> str:
     """Return an exception in a line, with the place in the environment's code."""
-    if isinstance(error, RlctlError):
-        return str(error)
+    if isinstance(error, RlctlError):  # of the task layer, which names the task and the step itself
+        return f"{type(error).__name__}: {error}"
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _HERE not in Path(frame.filename).parents]
     own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
     place = f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""

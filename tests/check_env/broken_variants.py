@@ -26,6 +26,12 @@ def break_down(sim, rng):
 
 
 @dataclass
+class NotFinite(Reach):
+    def rewards(self, action):
+        return {**super().rewards(action), "distance": float("nan")}
+
+
+@dataclass
 class Sound(Reach):
     stages = [
         {"task": {"tolerance": 0.2}, "promote": {"success": 0.8}},

@@ -46,6 +46,11 @@ def test_a_task_that_randomises_is_judged_without_as_well(rlctl):
     assert "RuntimeError: a gear broke" in done.stdout
 
 
+def test_an_error_of_the_task_layer_is_named_as_one():
+    (finding,) = findings("broken_variants.py:NotFinite", "RL207")
+    assert finding.message == "step 1 raised TaskError: NotFinite: reward term 'distance' is nan at step 1"
+
+
 def test_a_plain_environment_has_neither():
     records = records_of("broken_envs.py:Clean", "variants")
     assert not records.findings

@@ -17,7 +17,7 @@ from rlctl.check_env.failures import EnvironmentRaised, describe
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import RecipeError
+from rlctl.errors import RecipeError, RlctlError
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.env_info import describe as describe_env
 from rlctl.run.recipe import validate
@@ -52,7 +52,7 @@ def _play_events(context: Context, repeats: bool) -> Iterator[Finding]:
         try:
             _, same = _play(context, dataclasses.replace(context.spec, randomize=randomize))
         except EnvironmentRaised as error:
-            yield Finding("RL011", f"{where}: {describe(error.__cause__ or error)}")
+            yield Finding("RL011", f"{where}: {_explain(error)}")
             continue
         if repeats and not same:
             fix = "Let the functions of events draw all chance from the generator that they are given."
@@ -71,7 +71,7 @@ def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[Finding]:
         try:
             info, _ = _play(context, each)
         except EnvironmentRaised as error:
-            yield Finding("RL012", f"stage {number} of {len(specs)}: {describe(error.__cause__ or error)}")
+            yield Finding("RL012", f"stage {number} of {len(specs)}: {_explain(error)}")
             continue
         first = first or info
         if difference := info.find_difference(first, "stage 1's"):
@@ -89,6 +89,11 @@ def _play(context: Context, spec: EnvSpec) -> tuple[EnvInfo, bool]:
         ]
         shortest = min(len(each) for each in episodes)  # where time was up
         return describe_env(instance.env), bool(np.array_equal(episodes[0][:shortest], episodes[1][:shortest]))
+
+
+def _explain(error: EnvironmentRaised) -> str:
+    cause = error.__cause__ or error
+    return str(cause) if isinstance(cause, RlctlError) else describe(cause)
 
 
 def _flatten(observation: Any) -> NDArray[np.float64]:
