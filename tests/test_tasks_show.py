@@ -221,3 +221,12 @@ def test_options_of_the_list_are_not_lost(rlctl):
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr == "error: options of `rlctl tasks show` come after its name\n"
     assert "Did you mean 'show'?" in rlctl("tasks", "sho").stderr
+
+
+def test_a_link_with_an_impossible_inertia_is_named(write_module, rlctl):
+    source = EVERYTHING.replace("def build(self, sim): ...", 'def build(self, sim): sim.load("block", "block.urdf")')
+    write_module("heavy.py", source)
+    done = rlctl("tasks", "show", "heavy:Everything")
+    assert done.returncode == 0, done.stderr
+    told = done.stdout.partition("model files")[2].split("\n\n")[0]
+    assert "block.urdf, link 'block_2_base_link': a moment of 1 kg m^2 is more than 0.02 kg within 0.1 m" in told
