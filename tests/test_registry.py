@@ -182,6 +182,21 @@ def test_what_only_tasks_have(my_env):
     assert error(RecipeError, "my_env.py:MyEnv", events={"a": {}}).startswith("events: my_env.py:MyEnv is a plain")
 
 
+def test_make_randomises_when_it_is_asked_to(my_env):
+    import rlctl
+
+    def acting(**options):
+        env = rlctl.make("reach", **options)
+        env.close()
+        return set(env.unwrapped.events)
+
+    assert acting() == set()
+    assert acting(events={"mass": {"factor": (0.9, 1.1)}}) == {"mass"}
+    assert acting(randomize=True) > {"mass"}
+    with pytest.raises(RecipeError, match=r"^randomize: my_env\.py:MyEnv is a plain Gymnasium environment"):
+        rlctl.make("my_env.py:MyEnv", randomize=True)
+
+
 @pytest.mark.parametrize(
     ("source", "message"),
     [
