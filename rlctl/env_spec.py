@@ -52,7 +52,7 @@ class EnvSpec:
     """The kind of file that names the task; empty where a person did. A file may name environments only."""
 
     def constructor(self) -> Callable[..., Any]:
-        """Import what makes the environment; raises `ArtifactError` if a file names it and it is no environment."""
+        """Import what makes the environment; raises `ArtifactError` if a file names it and it is not an environment."""
         return named_task.load(self.task, self.named_by) if self.named_by else load(self.task)
 
     def make(self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None) -> gymnasium.Env[Any, Any]:

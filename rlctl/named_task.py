@@ -29,12 +29,12 @@ _LARGEST = 10 * 2**20  # [bytes] of a source file that is looked into
 def load(task: str, named_by: str) -> Callable[..., Any]:
     """Import a task that `named_by` names, as `registry.load` does; raises `ArtifactError` unless it is one."""
     if not task.isprintable():
-        raise _make_error(task, named_by, "that is no name")
+        raise _make_error(task, named_by, "that is not a name")
     if registry.find(task) is None and ":" in task:
         _look_before_import(task, named_by)
     constructor = registry.load(task)
     if not _may_be_called(task, constructor):
-        raise _make_error(task, named_by, "that is no environment's class")
+        raise _make_error(task, named_by, "that is not an environment class")
     return constructor
 
 
@@ -47,7 +47,7 @@ def _make_error(task: str, named_by: str, why: str) -> ArtifactError:
 
 
 def _look_before_import(task: str, named_by: str) -> None:
-    """Raise `ArtifactError` for what is no place of an environment, as its source has it: importing runs code."""
+    """Raise `ArtifactError` for what cannot be an environment, judged by its source: importing it would run it."""
     by_id = _MODULE_ID.match(task)
     place, _, name = task.rpartition(":")
     file = registry.find_source_file(f"{place}:_")  # of a Gymnasium id, the module that registers it
@@ -60,7 +60,7 @@ def _look_before_import(task: str, named_by: str) -> None:
     source = _read_source(file)
     if by_id is not None:
         if "gymnasium" not in source:
-            raise _make_error(task, named_by, "its module does not speak of Gymnasium")
+            raise _make_error(task, named_by, "its module does not mention Gymnasium")
     elif not _defines(source, name.partition(".")[0]):
         raise _make_error(task, named_by, f"{file.name} does not define it")
 

@@ -183,7 +183,7 @@ def _write_all(descriptor: int, content: bytes) -> None:
     while rest:
         written = os.write(descriptor, rest)
         if written == 0:
-            raise OSError(errno.EIO, "the disk takes nothing")
+            raise OSError(errno.EIO, "the disk accepts no more data")
         rest = rest[written:]
 
 

@@ -112,7 +112,7 @@ def _describe_choice(
 ) -> tuple[str, ...]:
     try:
         info = read_info(file)
-    except ArtifactError:  # who loads it says the same
+    except ArtifactError:  # loading it reports the same
         return ()
     notes = [f"run {run.path}: policy of step {info.training_steps:,}, saved {_describe_age(file)} ago"]
     if passed_over:

@@ -20,7 +20,7 @@ from rlctl.run.onnx_file import METADATA_KEY
 from rlctl.run.policy import ROWS, Policy, PolicyInfo, State, parse_info
 
 SINGLE_INPUT = "obs"
-"""Name of the input of an observation that is no dictionary; those of a dictionary are named by their keys."""
+"""Name of the input of an observation that is not a dictionary; those of a dictionary are named by their keys."""
 ACTION = "action"
 STATE_INPUTS = ("state_h", "state_c")
 """LSTM state of a recurrent policy, each of shape (layers, batch, hidden); zeros when an episode begins."""
@@ -94,7 +94,7 @@ class OnnxPolicy(Policy):
         for name, (shape, dtype) in self._fields.items():
             value = np.asarray(given[name], dtype) if name in given else np.empty(())
             if name not in given or value.shape != shape:
-                raise ValueError(f"observation {name!r}: shape {value.shape}, the policy wants {shape}")
+                raise ValueError(f"observation {name!r}: shape {value.shape}, the policy expects {shape}")
             batch[name] = value[None]
         actions, self._state = self._run(batch, self._state, deterministic)
         return np.asarray(actions[0])

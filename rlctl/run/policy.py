@@ -207,7 +207,7 @@ class Policy(abc.ABC):
         self._own.deterministic = deterministic
         shapes = map_parts(np.shape, observation)
         if shapes != self._expected:
-            raise ValueError(f"observation of shape {shapes}, the policy wants {self._expected}")
+            raise ValueError(f"observation of shape {shapes}, the policy expects {self._expected}")
         batch = map_parts(lambda value: np.asarray(value)[None], observation)
         action = self._own.act(batch, np.array([0]), np.array([self._starts]))[0]
         self._starts = False

@@ -70,7 +70,7 @@ def explain_size(size: int) -> str | None:
 
 
 def check_safetensors(path: Path) -> None:
-    """Raise `ArtifactError` for what is no regular file, or would take more memory than a policy may."""
+    """Raise `ArtifactError` for what is not a regular file, or would take more memory than a policy may."""
     with open_file(path) as file:
         if (problem := explain_size(os.fstat(file.fileno()).st_size)) is not None:
             raise ArtifactError(f"{path}: too large: {problem}")
@@ -118,7 +118,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Read the arrays of an `.npz` file, by name.
 
     Sizes are checked before anything is unpacked: what the archive, and each array's own header, says. Raises
-    `ArtifactError` for what is no file or too large, and whatever numpy and zipfile raise for a damaged one.
+    `ArtifactError` for what is not a file, or is too large, and whatever numpy and zipfile raise for a damaged one.
     """
     with open_file(path) as file, zipfile.ZipFile(file) as archive:
         members = archive.infolist()
@@ -135,14 +135,14 @@ def _check_archive(members: list[zipfile.ZipInfo]) -> None:
     for each in members:
         name = each.filename
         if name in seen:
-            raise ValueError(f"{name!r} is in it twice")
+            raise ValueError(f"{name!r} is in the archive twice")
         seen.add(name)
         if name.startswith("/") or ".." in name.split("/"):
-            raise ValueError(f"{name!r} leads out of it")
+            raise ValueError(f"{name!r} points outside the archive")
         if not name.endswith(".npy") or each.is_dir():
             raise ValueError(f"{name!r} is not an array")
         if each.compress_type not in _PACKED:
-            raise ValueError(f"{name!r} is not packed as numpy does it")
+            raise ValueError(f"{name!r} is not compressed as numpy does it")
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:

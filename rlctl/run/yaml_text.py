@@ -46,7 +46,7 @@ class _Loader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = _check_key(key_node)
             if key in seen:
-                raise _make_error(f"key {key!r} is there twice", key_node)
+                raise _make_error(f"key {key!r} is given twice", key_node)
             seen.add(key)
         return super().construct_mapping(node, deep)
 

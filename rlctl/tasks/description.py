@@ -48,7 +48,7 @@ class Description:
     target: str
     """`package.module:Class`."""
     summary: str
-    """The first line of the class's docstring that is no heading."""
+    """The first line of the class's docstring that is not a heading."""
     distribution: str | None
     version: str | None
     file: str | None

@@ -69,8 +69,8 @@ def test_a_pickle_in_a_member(name, episode, tmp_path):
     ("members", "message"),
     [
         ([("evil.pkl", b"")], "'evil.pkl' is not an array"),
-        ([("../../x.npy", array_file(np.zeros(3)))], "'../../x.npy' leads out of it"),
-        ([("/tmp/x.npy", array_file(np.zeros(3)))], "'/tmp/x.npy' leads out of it"),
+        ([("../../x.npy", array_file(np.zeros(3)))], "'../../x.npy' points outside the archive"),
+        ([("/tmp/x.npy", array_file(np.zeros(3)))], "'/tmp/x.npy' points outside the archive"),
         ([("a.npy", header((10**12,)) + b"\0" * 80)], "'a.npy' is not as large as its header says"),
         ([("a.npy", header((-8,)))], "'a.npy' is not as large as its header says"),
         ([("a.npy", header((10**18,), "|S0"))], "'a.npy' is not as large as its header says"),
@@ -94,13 +94,13 @@ def test_members_that_are_refused(members, message, tmp_path):
 def test_a_member_that_is_there_twice(tmp_path):
     content = array_file(np.zeros(3))
     archive(tmp_path / "x.npz", [("a.npy", content), ("a.npy", content)])
-    with pytest.raises(ArtifactError, match=r"'a.npy' is in it twice$"):
+    with pytest.raises(ArtifactError, match=r"'a.npy' is in the archive twice$"):
         files.read_npz(tmp_path / "x.npz")
 
 
 def test_packing_that_lets_a_file_choose_the_memory(tmp_path):
     archive(tmp_path / "x.npz", [("a.npy", array_file(np.zeros(3)))], zipfile.ZIP_LZMA)
-    with pytest.raises(ArtifactError, match=r"'a.npy' is not packed as numpy does it$"):
+    with pytest.raises(ArtifactError, match=r"'a.npy' is not compressed as numpy does it$"):
         files.read_npz(tmp_path / "x.npz")
 
 

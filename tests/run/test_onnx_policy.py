@@ -96,7 +96,7 @@ def test_recurrent_state_of_a_batch(recurrent, observations):
 
 def test_observation_of_a_wrong_shape(pendulum):
     policy = load_policy(pendulum)
-    with pytest.raises(ValueError, match=r"observation 'obs': shape \(4,\), the policy wants \(3,\)"):
+    with pytest.raises(ValueError, match=r"observation 'obs': shape \(4,\), the policy expects \(3,\)"):
         policy.predict(np.zeros(4))
 
 

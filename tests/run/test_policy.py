@@ -234,10 +234,10 @@ def test_predict_is_numpy_in_numpy_out(path):
 
 def test_predict_with_a_wrong_shape(path, saved):
     policy = rlctl.load_policy(path)
-    with pytest.raises(ValueError, match=r"^observation of shape \(4,\), the policy wants \(5,\)$"):
+    with pytest.raises(ValueError, match=r"^observation of shape \(4,\), the policy expects \(5,\)$"):
         policy.predict(np.zeros(4))
-    with pytest.raises(ValueError, match=r"^observation of shape \(1, 5\), the policy wants \(5,\)$"):
+    with pytest.raises(ValueError, match=r"^observation of shape \(1, 5\), the policy expects \(5,\)$"):
         policy.predict(np.zeros((1, 5)))
     by_name = rlctl.load_policy(saved(policy="MultiInputPolicy", observation=DICT))
-    with pytest.raises(ValueError, match=r"^observation of shape {'a': \(3,\)}, the policy wants {'a': \(3,\), 'b': "):
+    with pytest.raises(ValueError, match=r"of shape {'a': \(3,\)}, the policy expects {'a': \(3,\), 'b': "):
         by_name.predict({"a": np.zeros(3)})

@@ -50,8 +50,8 @@ def test_not_a_number():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: 1\nb: 2\na: 3\n", "recipe.yaml:3: key 'a' is there twice"),
-        ("a:\n  b: 1\n  b: 2\n", "recipe.yaml:3: key 'b' is there twice"),
+        ("a: 1\nb: 2\na: 3\n", "recipe.yaml:3: key 'a' is given twice"),
+        ("a:\n  b: 1\n  b: 2\n", "recipe.yaml:3: key 'b' is given twice"),
         ("a: [1\n", "recipe.yaml:2: expected ',' or ']', but got '<stream end>'"),
         ("a:\tb: c", "recipe.yaml:1: found character '\\t' that cannot start any token"),
     ],
