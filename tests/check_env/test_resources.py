@@ -74,7 +74,7 @@ def test_too_few_resets_are_not_judged():
 
 def test_the_worker_says_what_it_raised():
     finding = the_finding("StartsProcess", "RL406")
-    assert finding.message.startswith("in a spawned, daemonic worker build raises task ")
+    assert finding.message.startswith("in a spawned, daemonic worker build raises TaskError: task ")
     assert "AssertionError: daemonic processes are not allowed to have children" in finding.message
     assert finding.evidence["call"] == "build"
     finding = the_finding("ExitsInWorker", "RL406")

@@ -40,8 +40,8 @@ def test_every_point_is_within_reach(env):
 def test_same_seed_same_episode(env):
     actions = np.random.default_rng(0).uniform(-1, 1, (10, 2)).astype(np.float32)
 
-    def live():
+    def play():
         first, _ = env.reset(seed=3)
         return np.stack([first, *(env.step(action)[0] for action in actions)])
 
-    assert np.array_equal(live(), live())
+    assert np.array_equal(play(), play())
