@@ -117,15 +117,23 @@ def test_stochastic_repeats_with_its_seed(reach_run):
 @pytest.mark.parametrize(
     ("gates", "message"),
     [
-        (Gates(min_success=1.1), r"success rate 0\.\d+ is below 1\.1"),
-        (Gates(min_success_lower=1.1), r"lower bound 0\.\d+ of the success rate is below 1\.1"),
+        (Gates(min_success=1.0), r"success rate 0\.\d+ is below 1"),
+        (Gates(min_success_lower=1.0), r"lower bound 0\.\d+ of the success rate is below 1"),
         (Gates(min_return=1e9), "mean return .* is below 1e"),
-        (Gates(min_success=1.1, min_return=1e9), "success rate .*; mean return"),
+        (Gates(min_success=1.0, min_return=1e9), "success rate .*; mean return"),
     ],
 )
 def test_gates(evaluation, gates, message):
     with pytest.raises(AnswerIsNo, match=message):
         gates.check(evaluation)
+
+
+@pytest.mark.parametrize("name", ["min_success", "min_success_lower"])
+def test_a_rate_is_between_0_and_1(name):
+    with pytest.raises(UsageError, match=r": a rate is between 0 and 1; 95 % is 0\.95$"):
+        Gates(**{name: 95})
+    with pytest.raises(UsageError, match=r": a rate is between 0 and 1$"):
+        Gates(**{name: -0.5})
 
 
 def test_a_gate_on_success_needs_success(tmp_path):
