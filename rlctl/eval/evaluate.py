@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from rlctl import output
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
-from rlctl.rollout.collect import Episode, run_episodes
+from rlctl.rollout.acting import Exploration, check_playable
+from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Workers
+from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import lookup
-from rlctl.run.policy import BatchActor, Policy, PolicyInfo, load_policy
-
-_ENVS = 32
+from rlctl.run.policy import PolicyInfo, load_policy, read_policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Evaluation:
     """The numbers of an evaluation."""
 
     policy_file: Path
-    policy: Policy
+    policy: PolicyInfo
     spec: EnvSpec
     events: dict[str, bool]
     """The events that the task offers, and whether each acted."""
@@ -99,7 +100,7 @@ class Gates:
 
 
 def run_evaluation(request: EvalRequest, gates: Gates) -> Evaluation:
-    """Find the policy, run its episodes, and return their statistics."""
+    """Find the policy, play its episodes, and return their statistics."""
     (evaluation,) = run_evaluations(request, gates)
     return evaluation
 
@@ -109,13 +110,28 @@ def run_evaluations(request: EvalRequest, gates: Gates) -> list[Evaluation]:
     found = lookup.find_policy(request.run, request.checkpoint)
     output.print_notes(found.notes)
     path = found.file
-    if path.suffix == ".safetensors":
-        from rlctl.run.torch_policy import pin_threads
-
-        pin_threads()
-    policy = load_policy(path)
+    policy = _load_policy(path, request.deterministic)
     specs = [found.locate(spec) for spec in _choose_specs(policy.info, request)]
     return [_evaluate(path, policy, spec, request, gates) for spec in specs]
+
+
+@dataclasses.dataclass(frozen=True)
+class _LoadedPolicy:
+    info: PolicyInfo
+    tensors: dict[str, NDArray[Any]] | None
+    """None for an exported file, which the workers load themselves."""
+
+
+def _load_policy(path: Path, deterministic: bool) -> _LoadedPolicy:
+    """Read and try a policy; raises `ArtifactError` for a damaged one."""
+    if path.suffix == ".onnx":
+        policy = load_policy(path)
+        if not deterministic:
+            raise UsageError("an exported policy cannot sample: only its deterministic action is in the ONNX file")
+        return _LoadedPolicy(policy.info, None)
+    info, tensors = read_policy(path)
+    check_playable(info, tensors, path)
+    return _LoadedPolicy(info, tensors)
 
 
 def _choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
@@ -139,36 +155,44 @@ def _choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
     return [request.changes.apply(info.stages[number - 1]) for number in numbers]
 
 
-def _evaluate(path: Path, policy: Policy, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
-    n_envs = min(request.n_envs or _ENVS, request.episodes)
+def _evaluate(path: Path, policy: _LoadedPolicy, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
+    n_envs = min(request.n_envs or available_cores(), request.episodes)
     with Workers(spec, n_envs, timeout_s=request.env_timeout_s) as workers:
         policy.info.check_fits(workers.info, path)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
-        episodes, events = _run_episodes(workers, policy, request), workers.info.events
-    evaluation = _summarize(path, policy, spec, events, request, episodes)
+        if policy.tensors is None:
+            workers.set_other_policy(str(path.resolve()))
+        else:
+            workers.set_policy(policy.info, policy.tensors)
+        episodes, events = _play(workers, request), workers.info.events
+    evaluation = _summarize(path, policy.info, spec, events, request, episodes)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
 
 
-def _run_episodes(workers: Workers, policy: Policy, request: EvalRequest) -> list[Episode]:
+def _play(workers: Workers, request: EvalRequest) -> list[Episode]:
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
-    actor = BatchActor(policy, workers.n_envs, deterministic=request.deterministic)
-    if not request.deterministic and "torch" in sys.modules:
-        import torch
-
-        torch.manual_seed(request.seed)
+    exploration = Exploration(stochastic=not request.deterministic)
     console = output.err()
     if not console.is_terminal:
-        return run_episodes(workers, actor, seeds)
+        return play_episodes(workers, seeds, exploration)
     with console.status("evaluating", spinner="dots" if output.is_utf8() else "line") as status:
-        return run_episodes(
-            workers, actor, seeds, on_episode=lambda done: status.update(f"evaluating: {done}/{len(seeds)} episodes")
+        return play_episodes(
+            workers,
+            seeds,
+            exploration,
+            on_episode=lambda done: status.update(f"evaluating: {done}/{len(seeds)} episodes"),
         )
 
 
 def _summarize(
-    path: Path, policy: Policy, spec: EnvSpec, events: dict[str, bool], request: EvalRequest, episodes: list[Episode]
+    path: Path,
+    policy: PolicyInfo,
+    spec: EnvSpec,
+    events: dict[str, bool],
+    request: EvalRequest,
+    episodes: list[Episode],
 ) -> Evaluation:
     results = [episode.result for episode in episodes]
     distances = [result.final_distance for result in results if result.final_distance is not None]

@@ -70,7 +70,7 @@ def show(result: Evaluation, json: str | None) -> None:
     out = output.out()
     _show_head(result)
     if result.spec.stage:
-        out.print(f"stage {result.spec.stage} of {len(result.policy.info.stages)}")
+        out.print(f"stage {result.spec.stage} of {len(result.policy.stages)}")
     if result.success_rate is not None and result.success_interval is not None:
         low, high = result.success_interval
         out.print(f"success rate {result.success_rate:.1%}  (95 % interval {low:.1%} to {high:.1%})")
@@ -88,7 +88,7 @@ def show(result: Evaluation, json: str | None) -> None:
 
 
 def _show_head(result: Evaluation) -> None:
-    out, info = output.out(), result.policy.info
+    out, info = output.out(), result.policy
     mode = "" if result.deterministic else ", sampled actions"
     out.print(f"{result.spec.task}: {result.policy_file} ({info.algo}, step {info.training_steps:,})", markup=False)
     randomization = describe_randomization(result.events)
@@ -101,7 +101,7 @@ def _format_spread(spread: Spread) -> list[str]:
 
 def as_json(result: Evaluation) -> dict[str, Any]:
     """Return the result as plain data."""
-    info = result.policy.info
+    info = result.policy
     return {
         "task": {"name": result.spec.task, "parameters": dict(result.spec.parameters)},
         **({"stage": result.spec.stage} if result.spec.stage else {}),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.export.report import ExportReport, Port, format_agreement, format_closed_loop
 from rlctl.output import print_notes
-from rlctl.rollout.workers import Workers
+from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import files, lookup, onnx_file
 from rlctl.run.lookup import FoundPolicy
 from rlctl.run.policy import PolicyInfo, read_policy
@@ -16,7 +16,7 @@ from rlctl.run.policy import PolicyInfo, read_policy
 if TYPE_CHECKING:
     import onnx
 
-    from rlctl.export.verify import Verification
+    from rlctl.export.verify import PolicyFiles, Verification
 
 
 def export_onnx(run: str | None, *, checkpoint: str, output: Path | None) -> ExportReport:
@@ -40,13 +40,12 @@ def export_onnx(run: str | None, *, checkpoint: str, output: Path | None) -> Exp
 
 
 def _export(found: FoundPolicy, target: Path) -> ExportReport:
-    from rlctl.export.verify import N_ENVS
-
     policy_file = found.file
     info, tensors = read_policy(policy_file)
     # The environments are built while torch is imported.
-    with Workers(found.locate(info.spec), N_ENVS) as workers:
+    with Workers(found.locate(info.spec), available_cores()) as workers:
         from rlctl.export.actor import build
+        from rlctl.export.verify import PolicyFiles
         from rlctl.run.torch_policy import TorchPolicy, pin_threads
 
         pin_threads()
@@ -57,7 +56,7 @@ def _export(found: FoundPolicy, target: Path) -> ExportReport:
 
         def write(part: Path) -> None:
             part.write_bytes(onnx_file.encode(model))
-            reports.append(_verify(policy_file, target, part, policy, model, workers))
+            reports.append(_verify(policy_file, target, PolicyFiles(tensors, part), policy, model, workers))
 
         files.write_with(target, write)
     return reports[0]
@@ -77,14 +76,14 @@ def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) ->
 
 
 def _verify(
-    policy_file: Path, target: Path, part: Path, policy: Any, model: onnx.ModelProto, workers: Workers
+    policy_file: Path, target: Path, played: PolicyFiles, policy: Any, model: onnx.ModelProto, workers: Workers
 ) -> ExportReport:
     from rlctl.export.latency import measure
     from rlctl.export.verify import verify
     from rlctl.run.onnx_policy import OnnxPolicy
 
-    exported = OnnxPolicy.load(part)
-    seen = verify(policy, exported, workers)
+    exported = OnnxPolicy.load(played.onnx)
+    seen = verify(policy, exported, played, workers)
     if not seen.passed:
         raise AnswerIsNo(_explain_failure(policy_file, target, policy.info.spec.task, seen))
     info = policy.info
@@ -94,7 +93,7 @@ def _verify(
         task=info.spec.task,
         algo=info.algo,
         training_steps=info.training_steps,
-        size=part.stat().st_size,
+        size=played.onnx.stat().st_size,
         opset=model.opset_import[0].version,
         inputs=_list_ports(exported.session.get_inputs()),
         outputs=_list_ports(exported.session.get_outputs()),

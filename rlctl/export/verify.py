@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import Observations, take_row
+from rlctl.dict_spaces import stack, take_row
 from rlctl.export.agreement import Agreement, Comparison
-from rlctl.rollout.collect import Episode, run_episodes
+from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
 from rlctl.run.onnx_policy import OnnxPolicy
@@ -22,13 +23,12 @@ MAX_RETURN_DIFFERENCE = 1e-3
 """Largest difference of an episode's return, relative."""
 MIN_OBSERVATIONS = 1000
 EPISODES = 20
-"""Episodes run in closed loop by each of the two policies."""
-N_ENVS = 10
+"""Episodes played in closed loop by each of the two policies."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ClosedLoop:
-    """The same episodes, run once by each policy."""
+    """The same episodes, played once with each policy."""
 
     episodes: int
     same_success: int
@@ -47,38 +47,68 @@ class ClosedLoop:
 
 @dataclasses.dataclass(frozen=True)
 class Verification:
-    """What was seen when two policies were compared."""
+    """The result of comparing two policies."""
 
     agreement: Agreement
     closed_loop: ClosedLoop
 
     @property
     def passed(self) -> bool:
-        """Whether actions and episodes agree."""
         return self.agreement.agrees and self.closed_loop.agrees
 
 
-def verify(torch_policy: TorchPolicy, onnx_policy: OnnxPolicy, workers: Workers) -> Verification:
-    """Run the same episodes with both policies; on every observation of either, ask both.
+def verify(torch_policy: TorchPolicy, onnx_policy: OnnxPolicy, files: PolicyFiles, workers: Workers) -> Verification:
+    """Play the same episodes with both files; on every observation of either, ask torch and ONNX.
 
-    Rollouts go on until `MIN_OBSERVATIONS` were seen. Raises `TaskError` if the environment fails.
+    Rollouts go on until `MIN_OBSERVATIONS` were compared. Raises `TaskError` if the environment fails.
     """
     comparison = Comparison(torch_policy)
-
-    def run(seeds: Sequence[int], *, torch_drives: bool) -> list[Episode]:
-        actor = _SideBySide(torch_policy, onnx_policy, workers.n_envs, comparison, torch_drives=torch_drives)
-        return run_episodes(workers, actor, seeds)
-
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
-    expected = run(seeds, torch_drives=True)
-    done = run(seeds, torch_drives=False)
-    done_so_far = EPISODES
+    workers.set_policy(torch_policy.info, files.tensors)
+    expected = play_episodes(workers, seeds, record=True)
+    _compare_actions(torch_policy, onnx_policy, expected, comparison)
+    played = EPISODES
     while comparison.observations < MIN_OBSERVATIONS:
         missing = MIN_OBSERVATIONS / comparison.observations - 1.0
-        wanted = done_so_far + max(1, round(1.1 * missing * done_so_far))
-        run(episode_seeds(0, Stream.VERIFY, wanted)[done_so_far:], torch_drives=True)
-        done_so_far = wanted
+        total = played + max(1, round(1.1 * missing * played))
+        more = play_episodes(workers, episode_seeds(0, Stream.VERIFY, total)[played:], record=True)
+        _compare_actions(torch_policy, onnx_policy, more, comparison)
+        played = total
+    workers.set_other_policy(str(files.onnx.resolve()))
+    done = play_episodes(workers, seeds, record=True)
+    compared = comparison.observations
+    _compare_actions(torch_policy, onnx_policy, done, comparison)
+    comparison.observations = compared  # those of one policy's rollouts are counted
     return Verification(comparison.result(), compare_episodes(expected, done))
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyFiles:
+    """What the workers play: a policy file's tensors, and the exported file."""
+
+    tensors: dict[str, NDArray[Any]]
+    onnx: Path
+
+
+def _compare_actions(
+    torch_policy: TorchPolicy, onnx_policy: OnnxPolicy, episodes: Sequence[Episode], comparison: Comparison
+) -> None:
+    """Ask both policies on all observations of some episodes, step by step, each with its own recurrent state.
+
+    The ONNX policy runs in full batches, and for the first episode alone as well.
+    """
+    trajectories = [episode.trajectory for episode in episodes if episode.trajectory is not None]
+    of_torch, of_onnx = (BatchActor(policy, len(episodes)) for policy in (torch_policy, onnx_policy))
+    onnx_policy.reset()
+    for step in range(max(len(each.actions) for each in trajectories)):
+        rows = np.array([row for row, each in enumerate(trajectories) if step < len(each.actions)])
+        observations = stack([take_row(trajectories[row].observations, step) for row in rows])
+        starts = np.full(len(rows), step == 0)
+        expected = of_torch.act(observations, rows, starts)
+        comparison.add(expected, of_onnx.act(observations, rows, starts))
+        if rows[0] == 0:
+            comparison.add(expected[:1], onnx_policy.predict(take_row(observations, 0))[None])
+        comparison.observations += len(rows)
 
 
 def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> ClosedLoop:
@@ -97,38 +127,3 @@ def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> Cl
         mean_return=float(returns[:, 0].mean()),
         mean_return_onnx=float(returns[:, 1].mean()),
     )
-
-
-class _SideBySide:
-    """Acts with one policy and asks the other too; each keeps its own recurrent state.
-
-    The ONNX policy runs in full batches, and for the first environment alone as well.
-    """
-
-    def __init__(
-        self,
-        torch_policy: TorchPolicy,
-        onnx_policy: OnnxPolicy,
-        n_envs: int,
-        comparison: Comparison,
-        *,
-        torch_drives: bool,
-    ) -> None:
-        self._torch = BatchActor(torch_policy, n_envs)
-        self._onnx = BatchActor(onnx_policy, n_envs)
-        self._alone = onnx_policy
-        self._comparison = comparison
-        self._torch_drives = torch_drives
-
-    def act(self, observations: Observations, rows: NDArray[np.int64], starts: NDArray[np.bool_]) -> NDArray[Any]:
-        expected = self._torch.act(observations, rows, starts)
-        actions = self._onnx.act(observations, rows, starts)
-        self._comparison.add(expected, actions)
-        if rows[0] == 0:
-            if starts[0]:
-                self._alone.reset()
-            self._comparison.add(expected[:1], self._alone.predict(take_row(observations, 0))[None])
-        if not self._torch_drives:
-            return actions
-        self._comparison.observations += len(rows)
-        return expected

@@ -1,30 +1,21 @@
-"""Playing a list of episodes with a policy, on many environments."""
+"""Playing a list of episodes, each whole inside a worker."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl import dict_spaces
-from rlctl.dict_spaces import Observations
+from rlctl.dict_spaces import Observations, join
 from rlctl.errors import EpisodeFailed
+from rlctl.rollout.acting import Exploration
 from rlctl.rollout.workers import EpisodeResult, Workers
 
-
-class Actor(Protocol):
-    """Chooses actions for several environments at once; may keep a state per row (a recurrent state)."""
-
-    def act(self, observations: Observations, rows: NDArray[np.int64], starts: NDArray[np.bool_]) -> NDArray[Any]:
-        """Return an action per observation.
-
-        `observations` has a row per element of `rows`, the environment of each; `starts`
-        marks which of them begin an episode.
-        """
-        ...
+_SEGMENT = 1000
+"""Steps after which the main process takes what was recorded of a long episode."""
 
 
 @dataclasses.dataclass
@@ -51,85 +42,97 @@ class Episode:
     trajectory: Trajectory | None = None
 
 
-def run_episodes(
+def play_episodes(
     workers: Workers,
-    actor: Actor,
     seeds: Sequence[int],
+    exploration: Exploration = Exploration(),  # noqa: B008 (it cannot change)
     *,
     record: bool = False,
     on_episode: Callable[[int], None] | None = None,
+    check: Callable[[], None] | None = None,
 ) -> list[Episode]:
-    """Play an episode per seed and return them in the order of `seeds`.
+    """Play an episode per seed with the workers' policy and return them in the order of `seeds`.
 
-    Which environment plays which episode does not matter: an episode follows from its seed and the policy alone.
-    `on_episode` is called with the number of episodes done.
+    Each worker plays in its first environment. Which one plays which episode does not matter: an episode follows from
+    its seed and the policy alone. `on_episode` is called with the number of episodes done, and `check` several times a
+    second; it may raise to leave, and the workers have to be closed then.
     """
-    arrays = workers.arrays
-    arrays.next_seed[:] = -1
-    arrays.record[:] = record and bool(workers.info.reward_weights)  # a plain environment has no terms
-    workers.reset(dict.fromkeys(range(workers.n_envs), -1))
+    steps = min(workers.info.max_steps or _SEGMENT, _SEGMENT)
     waiting = list(enumerate(seeds))[::-1]
-    running: dict[int, int] = {}
-    recorders: dict[int, _Recorder] = {}
+    running: dict[int, _Recorder] = {}
     episodes: dict[int, Episode] = {}
-    starts = np.ones(workers.n_envs, np.bool_)
-    free = list(range(min(workers.n_envs, len(seeds))))
-    while True:
-        first = {}
-        for env in free:
-            if waiting:
-                running[env], first[env] = waiting.pop()
-                recorders[env] = _Recorder()
-                starts[env] = True
-        if first:
-            workers.reset(first)
-        if not running:
-            break
-        rows = np.fromiter(sorted(running), np.int64, len(running))
-        observations = workers.observations(rows)
-        actions = actor.act(observations, rows, starts[rows])
-        arrays.action[rows] = actions
-        starts[rows] = False
+
+    def begin(env: int) -> None:
+        if waiting:
+            index, seed = waiting.pop()
+            running[env] = _Recorder(index, record)
+            play(env, seed)
+
+    def play(env: int, seed: int) -> None:
+        terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms
+        workers.start_playing({env: seed}, steps, exploration, until_end=True, record=terms)
+
+    for env in workers.first_envs:
+        begin(env)
+    while running:
+        before = workers.playing
         try:
-            ended = workers.step()
+            ended = {result.env: result for result in workers.finish_playing(first=True, check=check)}
         except EpisodeFailed as error:
-            if error.env in recorders and record:
-                error.actions = recorders[error.env].actions(arrays.action[error.env])[: error.step]
+            if record and error.env in running:
+                error.actions = running[error.env].failed_actions(workers, error)
             raise
-        if record:
-            for index, env in enumerate(rows.tolist()):
-                recorders[env].add(dict_spaces.take_row(observations, index), actions[index], arrays, env)
-        for result in ended:
-            index = running.pop(result.env)
-            trajectory = None
-            if record:
-                last = dict_spaces.take_row(workers.final_observations([result.env]), 0)
-                trajectory = recorders[result.env].trajectory(last)
-            episodes[index] = Episode(index, result.seed, result, trajectory)
+        for worker in sorted(before - workers.playing):
+            env = workers.first_envs[worker]
+            result = ended.get(env)
+            recorder = running[env]
+            recorder.add(workers, env, steps if result is None else result.row + 1)
+            if result is None:
+                play(env, -1)
+                continue
+            del running[env]
+            episodes[recorder.index] = Episode(recorder.index, result.seed, result, recorder.finish())
             if on_episode:
                 on_episode(len(episodes))
-        free = [result.env for result in ended]
+            begin(env)
     return [episodes[index] for index in range(len(seeds))]
 
 
 class _Recorder:
-    def __init__(self) -> None:
-        self._observations: list[Any] = []
-        self._actions: list[Any] = []
-        self._rewards: list[float] = []
-        self._terms: list[Any] = []
+    """Keeps what the segments of one episode have recorded."""
 
-    def add(self, observation: Any, action: Any, arrays: Any, env: int) -> None:
-        self._observations.append(observation)
-        self._actions.append(np.array(action))
-        self._rewards.append(float(arrays.reward[env]))
-        self._terms.append(arrays.terms[env].copy())
+    def __init__(self, index: int, record: bool) -> None:
+        self.index = index
+        self._record = record
+        self._steps = 0
+        self._observations: list[dict[str, NDArray[Any]]] = []
+        self._actions: list[NDArray[Any]] = []
+        self._rewards: list[NDArray[np.float64]] = []
+        self._terms: list[NDArray[np.float64]] = []
 
-    def actions(self, now: Any) -> NDArray[Any]:
-        """Return the actions up to `now`, that of a step that was not done."""
-        return np.stack([*self._actions, np.array(now)])
+    def add(self, workers: Workers, env: int, steps: int) -> None:
+        """Copy the first steps of an environment's segment."""
+        self._steps += steps
+        if not self._record:
+            return
+        segment = workers.arrays.segment
+        first = 1 if self._observations else 0  # the last observation of the segment before
+        self._observations.append(
+            {key: rows[env, first : steps + 1].copy() for key, rows in segment.observation.items()}
+        )
+        self._actions.append(segment.action[env, :steps].copy())
+        self._rewards.append(segment.reward[env, :steps].copy())
+        self._terms.append(segment.terms[env, :steps].copy())
 
-    def trajectory(self, last: Any) -> Trajectory:
-        steps = [*self._observations, last]
-        observations = dict_spaces.stack(steps)
-        return Trajectory(observations, np.stack(self._actions), np.array(self._rewards), np.stack(self._terms))
+    def failed_actions(self, workers: Workers, error: EpisodeFailed) -> NDArray[Any]:
+        """Return the actions up to that of the step that failed."""
+        segment = workers.arrays.segment
+        return np.concatenate([*self._actions, segment.action[error.env, : error.step - self._steps]])
+
+    def finish(self) -> Trajectory | None:
+        """Return the whole episode, if it was to be recorded."""
+        if not self._record:
+            return None
+        parts = {key: np.concatenate([each[key] for each in self._observations]) for key in self._observations[0]}
+        actions, rewards, terms = (np.concatenate(each) for each in (self._actions, self._rewards, self._terms))
+        return Trajectory(join(parts), actions, rewards, terms)

@@ -1,6 +1,6 @@
 """Rewards for exchanged goals, computed by an environment in another process: for hindsight replay.
 
-The request is a short prefix and both arrays as safetensors; the answer, numbers as JSON.
+The request is both arrays as safetensors; the answer, numbers as JSON.
 """
 
 from __future__ import annotations
@@ -13,20 +13,17 @@ from safetensors.numpy import load, save
 
 from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
 
-PREFIX = b"rewards "
-"""How the message begins."""
-
 
 def encode_request(achieved: NDArray[Any], desired: NDArray[Any]) -> bytes:
     """Return the message that requests the rewards of goals; both of shape (n, *goal)."""
     goals = {"achieved": achieved, "desired": desired}
     # safetensors writes the memory as it lies, so that columns would be taken for rows.
-    return PREFIX + save({name: np.ascontiguousarray(each) for name, each in goals.items()})
+    return save({name: np.ascontiguousarray(each) for name, each in goals.items()})
 
 
 def compute_answer(env: Any, message: bytes) -> list[float]:
     """Return the n rewards of a request; raises `TaskError` for anything but n finite numbers."""
-    goals = load(message.removeprefix(PREFIX))
+    goals = load(message)
     count = len(goals["achieved"])
     infos: list[dict[str, Any]] = [{} for _ in range(count)]
     try:

@@ -42,6 +42,16 @@ class ActionHistory:
         if len(self._rows) * actions.nbytes > MAX_BYTES:
             self._drop(self._first + 1)
 
+    def add_segment(self, actions: NDArray[Any], ended: Iterable[tuple[int, int]]) -> None:
+        """Store a segment, shape (n_envs, steps, ...), in which episodes ended: (environment, row) each."""
+        first = self._first + len(self._rows)
+        self._rows.extend(actions.swapaxes(0, 1).copy())
+        for env, row in ended:
+            self._began[env] = first + row + 1
+        if excess := max(0, len(self._rows) * actions[:, 0].nbytes - MAX_BYTES):
+            self._drop(self._first + -(-excess // actions[:, 0].nbytes))
+        self._drop(int(self._began.min()))
+
     def begin(self, envs: Iterable[int]) -> None:
         """Begin episodes in some environments with the next step."""
         self._began[list(envs)] = self._first + len(self._rows)

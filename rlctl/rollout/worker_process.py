@@ -1,33 +1,38 @@
-"""What runs in a worker: a few environments, stepped in turn. Started by `workers.py`; imports no torch.
+"""What runs in a worker: a few environments, and a policy that plays them. Started by `workers.py`; imports no torch.
 
-Messages are JSON. The main process sends a command; the worker answers once, with `error` if one was raised, and
-with the episodes that ended. Observations, actions, rewards and flags travel in shared memory.
+The main process sends a message (`messages.py`); the worker answers once, as JSON, with `error` if one was raised, and
+with the episodes that ended. Observations, actions, rewards, flags and a policy's numbers are in shared memory.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import gc
 import itertools
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from rlctl.dict_spaces import SINGLE, split, split_space
 from rlctl.env_spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
-from rlctl.rollout import goal_rewards, returned_values
+from rlctl.rollout import goal_rewards, messages, returned_values
+from rlctl.rollout.acting import Exploration, OnnxPlayer, Player, PolicyPlayer, RandomPlayer
 from rlctl.rollout.failures import FailedInEpisode, encode_error
-from rlctl.rollout.process_group import end_with_parent
 from rlctl.rollout.returned_values import InvalidReturn
-from rlctl.rollout.shared_arrays import SharedArrays, observation_fields
+from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.rollout.shared_arrays import SharedArrays, map_arrays, observation_fields
 from rlctl.rollout.worker_output import write_stderr
 from rlctl.run.env_info import describe
+from rlctl.run.policy import PolicyInfo
 from rlctl.task.env import TaskEnv
 
 
@@ -78,37 +83,67 @@ class _Episode:
         }
 
 
-class _Worker:
-    def __init__(self, descriptor: int, spec: EnvSpec, first: int, count: int, total: int) -> None:
-        envs = make_several(spec, count)
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What a worker is for: `count` of `total` environments, from number `first` on."""
+
+    memory: int
+    """Descriptor of the file of the shared arrays."""
+    numbers: int
+    """Descriptor of the file of a policy's numbers."""
+    first: int
+    count: int
+    total: int
+
+
+class Worker:
+    """A few environments and what plays them."""
+
+    def __init__(self, job: Job, spec: EnvSpec) -> None:
+        envs = make_several(spec, job.count)
+        self.job = job
         self.info = describe(envs[0])
-        self.first = first
-        self.term_names = list(self.info.reward_weights)
-        self.episodes = [_Episode(env, first + i) for i, env in enumerate(envs)]
+        self.episodes = [_Episode(env, job.first + i) for i, env in enumerate(envs)]
         space = envs[0].observation_space
+        self.space, self.action_space = space, envs[0].action_space
         self.fields = observation_fields(space)
         self.categories = {key: returned_values.category_bounds(part) for key, part in split_space(space).items()}
-        self.space = space
-        # A task's environment has looked at its observation itself.
+        # A task's environment has checked its observation itself.
         self.checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
-        self.action_space = envs[0].action_space
         self.discrete = isinstance(self.action_space, spaces.Discrete)
-        self.total = total
-        self.descriptor = descriptor
         self.arrays: SharedArrays
+        self.player: Player
+        self._states: NDArray[Any] | None = None
 
-    def attach(self) -> None:
-        self.arrays = SharedArrays(self.descriptor, self.total, self.space, self.action_space, len(self.term_names))
+    def attach(self, message: messages.Attach) -> None:
+        """Map the shared arrays."""
+        terms = len(self.info.reward_weights)
+        self.arrays = SharedArrays(
+            self.job.memory, self.job.total, (self.space, self.action_space), terms, message.steps
+        )
 
-    def store(self, target: dict[str, Any], episode: _Episode, observation: Any) -> None:
+    def load_policy(self, message: messages.LoadPolicy) -> None:
+        """Act with another policy from now on."""
+        self._states = None
+        if message.onnx_file is not None:
+            self.player = OnnxPlayer(message.onnx_file)
+        elif message.info is None:
+            self.player = RandomPlayer(self.action_space)
+        else:
+            layout = {name: (tuple(shape), np.dtype(dtype)) for name, shape, dtype in message.layout}
+            tensors = map_arrays(self.job.numbers, layout)
+            self._states = tensors.pop("state", None)
+            self.player = PolicyPlayer(PolicyInfo.model_validate(message.info), tensors)
+
+    def store(self, target: dict[str, Any], index: int, episode: _Episode, observation: Any) -> None:
+        """Write an observation into row `index` of the arrays of `target`, and check it."""
         if self.checked:
-            target[SINGLE][episode.index] = observation
+            target[SINGLE][index] = observation
             return
         parts = split(observation)
         if parts.keys() != target.keys():
             raise InvalidReturn(f"observation has the keys {sorted(parts)}, the space has {sorted(target)}")
         for key, value in parts.items():
-            row = target[key]
             shape, dtype = self.fields[key]
             value = np.asarray(value)
             if value.shape != shape:
@@ -125,60 +160,122 @@ class _Worker:
             limits = self.categories[key]
             if limits is not None and not ((limits[0] <= value) & (value <= limits[1])).all():
                 raise InvalidReturn(f"{_named(key)} is {value}, the space has {limits[0]} to {limits[1]}")
-            row[episode.index] = value
+            target[key][index] = value
 
     def note_cast(self, episode: _Episode, key: str, value: Any) -> None:
+        """Count an observation that comes with a dtype that its space's cannot hold."""
         returned_values.check_numeric(value, _named(key))
         if not np.can_cast(value.dtype, self.fields[key][1]):
             count = self.arrays.cast[episode.index, 0] + 1
             self.arrays.cast[episode.index] = count, ord(value.dtype.char), list(self.fields).index(key)
 
-    def reset(self, pairs: list[tuple[int, int]]) -> list[dict[str, Any]]:
-        for index, seed in pairs:
-            episode = self.episodes[index - self.first]
+    def reset(self, message: messages.Reset) -> None:
+        """Begin episodes, or let environments rest."""
+        for index, seed in message.seeds:
+            episode = self.episodes[index - self.job.first]
             if seed < 0:
                 episode.active = False
             else:
                 self.call_in_episode(episode, self.begin, seed)
-        return []
 
-    def replay_actions(self, episodes: list[tuple[int, int, int]], data: bytes) -> list[dict[str, Any]]:
+    def begin(self, episode: _Episode, seed: int) -> None:
+        """Begin an episode; its first observation is the present one."""
+        self.arrays.inside[episode.index] = seed, 0, -1
+        self.store(self.arrays.observation, episode.index, episode, episode.start(seed))
+
+    def replay_actions(self, message: messages.ReplayActions, data: bytes) -> list[dict[str, Any]]:
         """Begin episodes, (environment, seed, steps) each, and take the steps that led to where they were."""
         row = self.arrays.action[0]
         actions = iter(np.frombuffer(data, row.dtype).reshape(-1, *row.shape))
         ended: list[dict[str, Any]] = []
-        for index, seed, steps in episodes:
+        for index, seed, steps in message.episodes:
             self.arrays.next_seed[index] = -1
+            episode, taken = self.episodes[index - self.job.first], list(itertools.islice(actions, steps))
             try:
-                self.replay_episode(index, seed, list(itertools.islice(actions, steps)), ended)
+                self.call_in_episode(episode, self.begin, seed)
+                for action in taken:
+                    self.arrays.action[index] = action
+                    if episode.active:
+                        self.call_in_episode(episode, self.step_one, ended)
             except FailedInEpisode as failure:
                 # It did not fail the first time, so its state differs now: it may begin its next episode.
-                self.episodes[index - self.first].active = False
+                episode.active = False
                 ended.append({"env": index})
                 write_stderr(f"{failure} when it was replayed")
         return ended
 
-    def replay_episode(self, index: int, seed: int, actions: list[Any], ended: list[dict[str, Any]]) -> None:
-        episode = self.episodes[index - self.first]
-        self.call_in_episode(episode, self.begin, seed)
-        for action in actions:
-            self.arrays.action[index] = action
-            if episode.active:
-                self.call_in_episode(episode, self.step_one, ended)
+    def play(self, message: messages.Play) -> list[dict[str, Any]]:
+        """Play a segment in some environments, one after the other; return the episodes that ended."""
+        ended: list[dict[str, Any]] = []
+        if isinstance(self.player, PolicyPlayer):
+            self.player.exploration = Exploration(**message.exploration)
+        started = message.episodes_started or [0] * len(message.envs)
+        for index, seed, number in zip(message.envs, message.begin, started, strict=True):
+            next_seeds = _training_seeds(message.run_seed, index, number)
+            self.call_in_episode(self.episodes[index - self.job.first], self.play_one, message, ended, seed, next_seeds)
+        return ended
 
-    def begin(self, episode: _Episode, seed: int) -> None:
-        self.arrays.inside[episode.index] = seed, 0
-        self.store(self.arrays.observation, episode, episode.start(seed))
-
-    def close(self) -> None:
-        for episode in self.episodes:
-            try:
-                episode.env.close()
-            except BaseException as error:  # its episodes are over
-                write_stderr(f"warning: closing environment {episode.index}: {describe_exception(error)}")
-        self.episodes = []
+    def play_one(
+        self,
+        episode: _Episode,
+        message: messages.Play,
+        ended: list[dict[str, Any]],
+        seed: int,
+        next_seeds: Iterator[int],
+    ) -> None:
+        """Play up to `message.steps` steps of one environment into its rows of the segment."""
+        arrays, index, player = self.arrays, episode.index, self.player
+        segment = arrays.segment
+        inside = arrays.inside
+        now = {key: rows[index] for key, rows in segment.observation.items()}
+        single = now.get(SINGLE)
+        stored, taken, rewards = segment.stored[index], segment.action[index], segment.reward[index]
+        state = None if self._states is None else self._states[index]
+        if seed >= 0:
+            self.begin(episode, seed)
+            if state is not None:
+                state[:] = 0.0
+        if player.state is not None and state is not None:
+            player.state[:] = state
+        for key, rows in now.items():
+            rows[0] = arrays.observation[key][index]
+        player.begin_segment(episode.seed, episode.step)
+        row = 0
+        while row < message.steps:
+            observation = single[row] if single is not None else {key: rows[row] for key, rows in now.items()}
+            chosen, action = player.act(observation, episode.seed, episode.step)
+            stored[row] = np.ravel(chosen)
+            taken[row] = action
+            episode.step += 1
+            inside[index] = episode.seed, episode.step, row
+            observation, reward, terminated, truncated, info = self.take_step(episode, taken[row])
+            rewards[row] = reward
+            segment.terminated[index, row], segment.truncated[index, row] = terminated, truncated
+            if message.record:
+                segment.terms[index, row] = list(info["metrics"].values())
+            row += 1
+            if not (terminated or truncated):
+                self.store(now, row, episode, observation)
+                continue
+            ended.append({**episode.summary(info), "row": row - 1})
+            if message.until_end and not message.episodes_started:
+                self.store(now, row, episode, observation)
+                episode.active = False
+                break
+            self.store({key: rows[index] for key, rows in segment.final.items()}, row - 1, episode, observation)
+            inside[index] = (seed := next(next_seeds)), 0, row
+            self.store(now, row, episode, episode.start(seed))
+            if player.state is not None:
+                player.state[:] = 0.0
+            if message.until_end:
+                break
+        for key, rows in now.items():
+            arrays.observation[key][index] = rows[row]
+        if player.state is not None and state is not None:
+            state[:] = player.state
 
     def step(self) -> list[dict[str, Any]]:
+        """Step all active environments once, with the actions of `arrays.action`."""
         ended: list[dict[str, Any]] = []
         for episode in self.episodes:
             if episode.active:
@@ -186,10 +283,29 @@ class _Worker:
         return ended
 
     def step_one(self, episode: _Episode, ended: list[dict[str, Any]]) -> None:
+        """Step an environment with its row of `arrays.action`; begin the next episode where one ends."""
         arrays, index = self.arrays, episode.index
-        action = arrays.action[index]
         episode.step += 1
         arrays.inside[index, 1] = episode.step
+        observation, reward, terminated, truncated, info = self.take_step(episode, arrays.action[index])
+        arrays.reward[index] = reward
+        arrays.terminated[index] = terminated
+        arrays.truncated[index] = truncated
+        if arrays.record[index]:
+            arrays.terms[index] = list(info["metrics"].values())
+        if not (terminated or truncated):
+            self.store(arrays.observation, index, episode, observation)
+            return
+        self.store(arrays.final, index, episode, observation)
+        ended.append(episode.summary(info))
+        seed = int(arrays.next_seed[index])
+        if seed >= 0:
+            self.begin(episode, seed)
+        else:
+            episode.active = False
+
+    def take_step(self, episode: _Episode, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step an environment, and return what it returned, checked; the observation is checked where it is stored."""
         given = episode.env.step(int(action) if self.discrete else action.copy())
         if given.__class__ is not tuple or len(given) != 5:
             given = returned_values.check_tuple(given, returned_values.STEP, "step")
@@ -201,43 +317,35 @@ class _Worker:
         if info.__class__ is not dict:
             returned_values.check_info(info)
         if terminated.__class__ is not bool or truncated.__class__ is not bool:
-            terminated, truncated = (
-                returned_values.to_bool(terminated, "terminated"),
-                returned_values.to_bool(truncated, "truncated"),
-            )
+            terminated = returned_values.to_bool(terminated, "terminated")
+            truncated = returned_values.to_bool(truncated, "truncated")
         episode.count(reward, info)
-        arrays.reward[index] = reward
-        arrays.terminated[index] = terminated
-        arrays.truncated[index] = truncated
-        if arrays.record[index]:
-            arrays.terms[index] = list(info["metrics"].values())
-        if not (terminated or truncated):
-            self.store(arrays.observation, episode, observation)
-            return
-        self.store(arrays.final, episode, observation)
-        ended.append(episode.summary(info))
-        seed = int(arrays.next_seed[index])
-        if seed >= 0:
-            self.begin(episode, seed)
-        else:
-            episode.active = False
+        return observation, reward, terminated, truncated, info
 
-    def call_in_episode(self, episode: _Episode, call: Callable[[_Episode, Any], None], argument: Any) -> None:
+    def call_in_episode(self, episode: _Episode, call: Callable[..., None], *arguments: Any) -> None:
+        """Call what may run the code of an environment; raises `FailedInEpisode` for anything it raises."""
         try:
-            call(episode, argument)
+            call(episode, *arguments)
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             raise FailedInEpisode(episode.index, episode.seed, episode.step) from error
         self.arrays.inside[episode.index, 1] = -1
 
+    def close(self) -> None:
+        """Close the environments."""
+        for episode in self.episodes:
+            try:
+                episode.env.close()
+            except BaseException as error:  # its episodes are over
+                write_stderr(f"warning: closing environment {episode.index}: {describe_exception(error)}")
+        self.episodes = []
 
-def main() -> None:
-    """Serve commands until the connection closes. Arguments: connection, descriptor, and the job as JSON."""
+
+def main(connection: Connection, spec: dict[str, Any], job: dict[str, Any]) -> None:
+    """Serve messages until the connection closes."""
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # lines are forwarded at once
-    job = json.loads(sys.argv[3])
-    end_with_parent(job["parent"], int(sys.argv[4]))
     try:
-        _serve(job)
-    except (BrokenPipeError, ConnectionResetError):  # the main process has heard enough
+        _serve(connection, Job(**job), spec)
+    except (BrokenPipeError, ConnectionResetError):  # the main process needs no more answers
         return
     except OSError as error:
         reason = error.strerror
@@ -247,60 +355,66 @@ def main() -> None:
         sys.exit(1)
 
 
-def _named(key: str) -> str:
-    return f"observation {key!r}" if key else "observation"
+def _serve(connection: Connection, job: Job, spec: dict[str, Any]) -> None:
+    worker: Worker | None = None
 
+    def build(spec: dict[str, Any]) -> dict[str, Any]:
+        nonlocal worker
+        if worker is not None:
+            worker.close()
+            worker = None
+            gc.unfreeze()
+            gc.collect()  # environments may hold themselves in cycles
+        worker = Worker(job, EnvSpec(**spec))
+        gc.freeze()  # what is there now stays; collections need not look at it again
+        return {"info": worker.info.model_dump()}
 
-def _serve(job: dict[str, Any]) -> None:
-    connection = Connection(int(sys.argv[1]))
+    def answer(message: messages.Message) -> dict[str, Any]:
+        if isinstance(message, messages.Build):
+            return build(message.spec)
+        assert worker is not None  # it was built before anything else is asked
+        match message:
+            case messages.Play():
+                return {"ended": worker.play(message)}
+            case messages.Step():
+                return {"ended": worker.step()}
+            case messages.ReplayActions():
+                return {"ended": worker.replay_actions(message, connection.recv_bytes())}
+            case messages.ComputeRewards():
+                return {"rewards": goal_rewards.compute_answer(worker.episodes[0].env, connection.recv_bytes())}
+            case messages.Attach():
+                worker.attach(message)
+            case messages.LoadPolicy():
+                worker.load_policy(message)
+            case messages.Reset():
+                worker.reset(message)
+        return {}
 
-    def answer(**content: Any) -> None:
+    def send(call: Callable[[], dict[str, Any]]) -> bool:
+        try:
+            content = call()
+        except BaseException as error:
+            content = {"error": encode_error(error)}
         connection.send_bytes(json.dumps(content).encode())
+        return "error" not in content
 
-    try:
-        worker = _built(job, job["spec"])
-    except BaseException as error:
-        answer(error=encode_error(error))
+    if not send(lambda: build(spec)):
         return
-    answer(info=worker.info.model_dump())
     while True:
         try:
-            message = connection.recv_bytes()
+            content = connection.recv_bytes()
         except (EOFError, ConnectionResetError):
             break
-        try:
-            if message == b"step":
-                ended = worker.step()
-            elif message == b"attach":
-                worker.attach()
-                ended = []
-            elif message.startswith(goal_rewards.PREFIX):
-                answer(rewards=goal_rewards.compute_answer(worker.episodes[0].env, message))
-                continue
-            elif message.startswith(b"{"):
-                worker.close()
-                gc.unfreeze()
-                gc.collect()  # environments may hold themselves in cycles
-                worker = _built(job, json.loads(message))
-                answer(info=worker.info.model_dump())
-                continue
-            elif message.startswith(b"replay_actions "):
-                ended = worker.replay_actions(
-                    json.loads(message.removeprefix(b"replay_actions ")), connection.recv_bytes()
-                )
-            else:
-                ended = worker.reset(json.loads(message))
-        except BaseException as error:
-            answer(error=encode_error(error))
-            continue
-        if ended:
-            answer(ended=ended)
-        else:
-            connection.send_bytes(b"")
-    worker.close()
+        send(functools.partial(answer, messages.decode(content)))
+    if worker is not None:
+        worker.close()
 
 
-def _built(job: dict[str, Any], spec: dict[str, Any]) -> _Worker:
-    worker = _Worker(int(sys.argv[2]), EnvSpec(**spec), job["first"], job["count"], job["total"])
-    gc.freeze()  # what is there now stays; collections need not look at it again
-    return worker
+def _training_seeds(run_seed: int, env: int, episode: int) -> Iterator[int]:
+    """Yield the seeds of an environment's training episodes, from a number on."""
+    for number in itertools.count(episode):
+        yield EpisodeAddress(run_seed, Stream.TRAIN, env, number).seed
+
+
+def _named(key: str) -> str:
+    return f"observation {key!r}" if key else "observation"

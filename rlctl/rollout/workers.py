@@ -1,7 +1,7 @@
-"""Many environments on few processes: W workers, each stepping K environments in turn.
+"""Many environments on few processes: W workers, each with K environments that it plays one after the other.
 
-Observations, actions, rewards and flags are in shared memory; pipes only say "go", "done", and which episodes
-ended. Workers are fresh interpreters, never forks, with one thread each.
+Observations, actions, rewards, flags and a policy's numbers are in shared memory; messages say what to do, and answers
+which episodes ended. Workers are fresh interpreters, never forks, with one thread each.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ import itertools
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
-from multiprocessing.connection import Connection, wait
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from multiprocessing.connection import wait
 from typing import Any
 
 import numpy as np
@@ -26,31 +25,23 @@ from numpy.typing import NDArray
 from rlctl import errors
 from rlctl.dict_spaces import Observations, join
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import EpisodeFailed, RlctlError, TaskError
-from rlctl.rollout import goal_rewards
-from rlctl.rollout.process_group import block_signals, end
-from rlctl.rollout.process_start import Process, StartProcess, default_start
-from rlctl.rollout.shared_arrays import SharedArrays, anonymous_file
+from rlctl.errors import DivergedError, EpisodeFailed, RlctlError, TaskError
+from rlctl.rollout import goal_rewards, messages
+from rlctl.rollout.acting import Exploration
+from rlctl.rollout.child_process import ChildProcess
+from rlctl.rollout.process_start import StartProcess
+from rlctl.rollout.shared_arrays import SharedArrays, anonymous_file, map_arrays
 from rlctl.rollout.worker_output import forward
 from rlctl.run.env_info import EnvInfo
-
-# Started this way a worker finds what its parent finds, and the caller's script is not run again.
-# Who stops a service signals all of its processes, and the main process decides: ignored before anything slow is
-# imported, and held back until then. Processes that environments start decide for themselves.
-_BOOTSTRAP = (
-    "import signal; numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP); "
-    "[signal.signal(number, lambda *_: None) for number in numbers]; "
-    "signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers); "
-    "import json, sys; "
-    "sys.path[:] = json.loads(sys.argv[3])['sys_path']; "
-    "from rlctl.rollout.worker_process import main; main()"
-)
+from rlctl.run.numpy_policy import select_actor_tensors
+from rlctl.run.policy import PolicyInfo
 
 # A PyBullet world is one block of 28 MB, which huge pages fill in half the time. Other C libraries ignore this.
 _TUNED = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 
 BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0
+_CHECK_EVERY_S = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +55,8 @@ class EpisodeResult:
     success: bool | None
     terms: dict[str, float]
     final_distance: float | None
+    row: int = dataclasses.field(default=-1, compare=False)
+    """The row of the segment in which it ended."""
 
 
 class Workers:
@@ -89,22 +82,24 @@ class Workers:
         self.n_envs = n_envs
         self.timeout_s = timeout_s
         self._spec = spec
-        self._start_process = start or default_start()
+        self._start_process = start
         n_workers = min(n_envs, n_workers or available_cores())
         bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
         self._ranges = list(itertools.pairwise(bounds))
-        self._memory = anonymous_file()
-        self._processes: list[Process] = []
-        self._connections: list[Connection] = []
-        self._lifelines: list[int] = []
-        self._ready = False
         self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
-        read_end, self._printing = os.pipe()
+        self._memory, self._numbers_memory = anonymous_file(), anonymous_file()
+        self._numbers: dict[str, NDArray[Any]] = {}
+        self._policy_layout: tuple[Any, ...] = ()
+        self._processes: list[ChildProcess] = []
+        self._pending: set[int] = set()
+        self._steps = 0
+        self._ready = False
+        read_end, printing = os.pipe()
         self._output = threading.Thread(target=forward, args=(read_end, on_output or _to_stderr), daemon=True)
         self._output.start()
         try:
             for first, last in self._ranges:
-                self._start(first, last - first)
+                self._start(first, last - first, printing)
         except OSError as error:
             self.close()
             raise TaskError(f"task {spec.task!r}: no worker can be started: {error.strerror or error}") from None
@@ -112,41 +107,26 @@ class Workers:
             self.close()
             raise
         finally:
-            os.close(self._printing)
+            os.close(printing)
 
-    def _start(self, first: int, count: int) -> None:
-        ours, theirs = socket.socketpair()
-        # The end of a pipe that nobody writes to: its hang-up shows the worker that this process is gone.
-        lifeline, our_end = os.pipe()
-        self._lifelines.append(our_end)
-        job = {
-            "spec": dataclasses.asdict(self._spec),
-            "first": first,
-            "count": count,
-            "total": self.n_envs,
-            "sys_path": sys.path,
-            "parent": os.getpid(),
-        }
-        environment = {
-            **_TUNED,
-            **os.environ,
-            "OMP_NUM_THREADS": "1",
-            "OPENBLAS_NUM_THREADS": "1",
-            "MKL_NUM_THREADS": "1",
-        }
-        passed = (theirs.fileno(), self._memory, lifeline)
-        with theirs, open(lifeline, "rb"), block_signals():
-            process = self._start_process(
-                [sys.executable, "-c", _BOOTSTRAP, *map(str, passed[:2]), json.dumps(job), str(lifeline)],
-                pass_fds=passed,
-                stdin=subprocess.DEVNULL,
-                stdout=self._printing,
-                stderr=self._printing,
-                env=environment,
-                process_group=0,
+    def _start(self, first: int, count: int, printing: int) -> None:
+        descriptors = (self._memory, self._numbers_memory)
+        job = dict(zip(("memory", "numbers"), descriptors, strict=True))
+        self._processes.append(
+            ChildProcess(
+                "rlctl.rollout.worker_process:main",
+                {
+                    "spec": dataclasses.asdict(self._spec),
+                    "job": {**job, "first": first, "count": count, "total": self.n_envs},
+                },
+                stdout=printing,
+                stderr=printing,
+                descriptors=descriptors,
+                environment={name: value for name, value in _TUNED.items() if name not in os.environ},
+                start=self._start_process,
             )
-        self._processes.append(process)
-        self._connections.append(Connection(ours.detach()))
+        )
+        self._pending.add(len(self._processes) - 1)
 
     @property
     def spec(self) -> EnvSpec:
@@ -165,18 +145,36 @@ class Workers:
         self._wait_until_built()
         return self._arrays
 
+    @property
+    def first_envs(self) -> list[int]:
+        """The first environment of each worker."""
+        return [low for low, _ in self._ranges]
+
     def _wait_until_built(self) -> None:
         if self._ready:
             return
-        answers = self._answers(range(len(self._processes)), max(BUILD_TIMEOUT_S, self.timeout_s), "being built")
+        answers = self._wait_for_all(max(BUILD_TIMEOUT_S, self.timeout_s), "being built")
         self._info = EnvInfo.model_validate(answers[0]["info"])
-        observation_space, action_space = self._info.spaces()
-        terms = len(self._info.reward_weights)
-        self._arrays = SharedArrays(self._memory, self.n_envs, observation_space, action_space, terms)
-        self._arrays.inside[:] = -1
+        self._policy_layout = ()
         self._ready = True
-        self._send_all(b"attach")
-        self._answers(range(len(self._processes)), self.timeout_s, "attaching")
+        self._attach(max(self._steps, 1))
+
+    def _attach(self, steps: int) -> None:
+        self._steps = steps
+        self._arrays = SharedArrays(
+            self._memory, self.n_envs, self._info.spaces(), len(self._info.reward_weights), steps
+        )
+        self._arrays.inside[:] = -1
+        self._ask_all(messages.Attach(steps), "attaching")
+
+    def make_room(self, steps: int) -> None:
+        """Let segments have up to `steps` steps. `arrays` are other ones then."""
+        self._wait_until_built()
+        if self._steps < steps:
+            kept = {key: values.copy() for key, values in self._arrays.observation.items()}
+            self._attach(steps)
+            for key, values in kept.items():
+                self._arrays.observation[key][:] = values
 
     def rebuild(self, spec: EnvSpec) -> EnvInfo:
         """Close the environments and build those of another spec in their place; return what they are.
@@ -186,18 +184,16 @@ class Workers:
         self._wait_until_built()
         self._spec = spec
         self._ready = False
-        self._send_all(json.dumps(dataclasses.asdict(spec)).encode())
+        for worker in range(len(self._processes)):
+            self._send(worker, messages.Build(dataclasses.asdict(spec)))
         return self.info
 
     def reset(self, seeds: dict[int, int]) -> None:
         """Start an episode in some environments: environment index -> seed; a negative one lets it rest."""
         self._wait_until_built()
-        by_worker: dict[int, list[tuple[int, int]]] = {}
-        for index, seed in seeds.items():
-            by_worker.setdefault(self._owner[index], []).append((index, seed))
-        for worker, pairs in by_worker.items():
-            self._send(worker, json.dumps(pairs).encode())
-        self._answers(by_worker, self.timeout_s, "resetting")
+        for worker, envs in self._by_worker(seeds).items():
+            self._send(worker, messages.Reset([[env, seeds[env]] for env in envs]))
+        self._wait_for_all(self.timeout_s, "resetting")
 
     def replay_actions(self, episodes: Mapping[int, tuple[int, NDArray[Any]]]) -> set[int]:
         """Begin episodes, environment index -> (seed, actions so far), and take those steps.
@@ -205,40 +201,94 @@ class Workers:
         Return the environments whose episode ended on the way: they are not where they were.
         """
         self._wait_until_built()
-        by_worker: dict[int, list[int]] = {}
-        for env in episodes:
-            by_worker.setdefault(self._owner[env], []).append(env)
-        for worker, envs in by_worker.items():
-            heads = [(env, episodes[env][0], len(episodes[env][1])) for env in envs]
-            dtype = self._arrays.action.dtype
-            self._send(worker, b"replay_actions " + json.dumps(heads).encode())
-            self._send(worker, b"".join(episodes[env][1].astype(dtype).tobytes() for env in envs))
-        answers = self._answers(by_worker, self.timeout_s, "replaying episodes")
-        return {each["env"] for answer in answers.values() for each in answer.get("ended", ())}
+        dtype = self._arrays.action.dtype
+        for worker, envs in self._by_worker(episodes).items():
+            heads = [[env, episodes[env][0], len(episodes[env][1])] for env in envs]
+            content = b"".join(episodes[env][1].astype(dtype).tobytes() for env in envs)
+            self._send(worker, messages.ReplayActions(heads), content)
+        answers = self._wait_for_all(self.timeout_s, "replaying episodes")
+        return {each["env"] for answer in answers.values() for each in answer["ended"]}
+
+    def set_policy(self, info: PolicyInfo, tensors: Mapping[str, NDArray[Any]]) -> None:
+        """Act with the present numbers of a policy, of a policy file's names, from the next segment on."""
+        self._wait_until_built()
+        numbers = select_actor_tensors(info, tensors)
+        if (hidden := numbers.get("policy/lstm_actor.weight_hh_l0")) is not None:
+            layers = sum("weight_hh" in name for name in numbers)
+            numbers["state"] = np.zeros((self.n_envs, 2, layers, hidden.shape[1]), np.float32)
+        layout = [(name, list(values.shape), str(values.dtype)) for name, values in numbers.items()]
+        structure = (info.algo, info.policy_kwargs, info.clip_observation, layout)
+        if structure != self._policy_layout:
+            self._policy_layout = structure
+            self._numbers = map_arrays(
+                self._numbers_memory, {name: (tuple(shape), np.dtype(dtype)) for name, shape, dtype in layout}
+            )
+        else:
+            numbers.pop("state", None)
+            layout = []
+        for name, values in numbers.items():
+            self._numbers[name][...] = values
+        if layout:
+            self._ask_all(messages.LoadPolicy(info.model_dump(mode="json"), layout), "loading the policy")
+
+    def set_other_policy(self, onnx_file: str | None = None) -> None:
+        """Act with an exported policy, or with random actions if no file is given."""
+        self._wait_until_built()
+        self._policy_layout = ()
+        self._ask_all(messages.LoadPolicy(onnx_file=onnx_file), "loading the policy")
+
+    @property
+    def recurrent_state(self) -> NDArray[np.float32] | None:
+        """Hidden and cell state of each environment's episode, shape (n_envs, 2, layers, hidden); None without."""
+        return self._numbers.get("state") if self._policy_layout else None
+
+    def start_playing(
+        self,
+        begin: Mapping[int, int],
+        steps: int,
+        exploration: Exploration,
+        *,
+        until_end: bool = False,
+        record: bool = False,
+        run_seed: int = 0,
+        episodes_started: Sequence[int] = (),
+    ) -> None:
+        """Begin to play up to `steps` steps in each of some environments, into their rows of `arrays.segment`.
+
+        `begin` has the seed of the episode to begin with, negative to go on with the running one. Where an episode ends
+        the next one begins, by its address in the training of `run_seed`, with the number that `episodes_started` has
+        for the environment; with `until_end` the environment stops there, and without numbers none begins.
+        """
+        self.make_room(steps)
+        for worker, envs in self._by_worker(begin).items():
+            started = [episodes_started[env] for env in envs] if episodes_started else []
+            seeds = [begin[env] for env in envs]
+            self._send(
+                worker,
+                messages.Play(
+                    envs, seeds, steps, dataclasses.asdict(exploration), until_end, record, run_seed, started
+                ),
+            )
+
+    def finish_playing(self, *, first: bool = False, check: Callable[[], None] | None = None) -> list[EpisodeResult]:
+        """Wait for all workers that play, or for the `first`; return the episodes that ended, by environment and row.
+
+        `check` is called several times a second, and may raise to leave.
+        """
+        answers = self._wait(self.timeout_s, "stepping", first=first, check=check)
+        return _results(answers)
+
+    @property
+    def playing(self) -> set[int]:
+        """The workers that have not answered yet."""
+        return set(self._pending)
 
     def step(self) -> list[EpisodeResult]:
         """Step every active environment with the row of `arrays.action`; return the episodes that ended.
 
         An environment whose episode ended starts the one of `arrays.next_seed`, or rests if that is negative.
         """
-        self._send_all(b"step")
-        answers = self._answers(range(len(self._processes)), self.timeout_s, "stepping")
-        ended = []
-        # In the order of the environments, not of the answers: what is decided from the last ones must repeat.
-        for _, answer in sorted(answers.items()):
-            for each in answer.get("ended", ()):
-                ended.append(
-                    EpisodeResult(
-                        each["env"],
-                        each["seed"],
-                        each["return"],
-                        each["length"],
-                        each["success"],
-                        each["terms"],
-                        each["final_distance"],
-                    )
-                )
-        return ended
+        return _results(self._ask_all(messages.Step(), "stepping"))
 
     def compute_rewards(self, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.float64]:
         """Return the rewards that environment 0 computes for steps that reached one goal and were to reach another.
@@ -247,8 +297,8 @@ class Workers:
         does not return n finite numbers.
         """
         self._wait_until_built()
-        self._send(0, goal_rewards.encode_request(achieved, desired))
-        answers = self._answers([0], self.timeout_s, "in compute_reward")
+        self._send(0, messages.ComputeRewards(), goal_rewards.encode_request(achieved, desired))
+        answers = self._wait_for_all(self.timeout_s, "in compute_reward")
         return np.array(answers[0]["rewards"], np.float64)
 
     def observations(self, rows: Any = slice(None)) -> Observations:
@@ -259,40 +309,63 @@ class Workers:
         """Return a copy of the last observations of episodes that just ended."""
         return _copy_rows(self.arrays.final, rows)
 
-    def _send_all(self, message: bytes) -> None:
+    def _by_worker(self, envs: Iterable[int]) -> dict[int, list[int]]:
+        groups: dict[int, list[int]] = {}
+        for env in envs:
+            groups.setdefault(self._owner[env], []).append(env)
+        return groups
+
+    def _ask_all(self, message: messages.Message, doing: str) -> dict[int, Any]:
         for worker in range(len(self._processes)):
             self._send(worker, message)
+        return self._wait_for_all(self.timeout_s, doing)
 
-    def _send(self, worker: int, message: bytes) -> None:
+    def _send(self, worker: int, message: messages.Message, content: bytes | None = None) -> None:
+        connection = self._processes[worker].connection
         try:
-            self._connections[worker].send_bytes(message)
+            connection.send_bytes(messages.encode(message))
+            if content is not None:
+                connection.send_bytes(content)
         except OSError:
-            self._fail(self._death(worker, "idle"))
+            self._fail(self._describe_death(worker, "idle"))
+        self._pending.add(worker)
 
-    def _answers(self, workers: Any, timeout_s: float, doing: str) -> dict[int, Any]:
-        """Wait for one answer from each of some workers."""
-        pending = {self._connections[worker]: worker for worker in workers}
+    def _wait_for_all(self, timeout_s: float, doing: str) -> dict[int, Any]:
+        return self._wait(timeout_s, doing)
+
+    def _wait(
+        self, timeout_s: float, doing: str, *, first: bool = False, check: Callable[[], None] | None = None
+    ) -> dict[int, Any]:
+        """Wait for the answer of every worker that was asked, or of the first ones."""
         answers: dict[int, Any] = {}
         deadline = time.monotonic() + timeout_s
         progress = self._progress()
-        while pending:
-            ready = wait(list(pending), timeout=max(0.0, deadline - time.monotonic()))
-            if not ready:
-                # A worker answers once for all its environments: only one that stands still for so long hangs.
+        while self._pending and not (first and answers):
+            if check is not None:
+                check()
+            connections = {self._processes[worker].connection: worker for worker in self._pending}
+            left = max(0.0, deadline - time.monotonic())
+            ready = wait(list(connections), timeout=left if check is None else min(left, _CHECK_EVERY_S))
+            if not ready and time.monotonic() >= deadline:
+                # A worker answers once for many steps: only one that stands still for so long hangs.
                 if progress == (progress := self._progress()):
-                    self._fail(self._hang(list(pending.values()), timeout_s, doing))
+                    self._fail(self._describe_hang(min(self._pending), timeout_s, doing))
                 deadline = time.monotonic() + timeout_s
             for connection in ready:
-                worker = pending.pop(connection)
-                try:
-                    content = self._connections[worker].recv_bytes()
-                except (EOFError, OSError):
-                    self._fail(self._death(worker, doing))
-                answer = json.loads(content) if content else {}
-                if "error" in answer:
-                    self._fail(self._raised(answer["error"]))
-                answers[worker] = answer
+                worker = connections[connection]  # type: ignore[index]
+                answers[worker] = self._receive(worker, doing)
         return answers
+
+    def _receive(self, worker: int, doing: str) -> Any:
+        try:
+            content = self._processes[worker].connection.recv_bytes()
+        except (EOFError, OSError):
+            self._fail(self._describe_death(worker, doing))
+        self._pending.discard(worker)
+        answer = json.loads(content)
+        if "error" in answer:
+            self._fail(self._make_error(answer["error"]))
+        return answer
 
     def _progress(self) -> bytes:
         """Return what changes whenever an environment begins or ends a call."""
@@ -302,7 +375,7 @@ class Workers:
         self.close(grace_s=0.0)
         raise error from None
 
-    def _raised(self, error: dict[str, Any]) -> RlctlError:
+    def _make_error(self, error: dict[str, Any]) -> RlctlError:
         message = error["message"]
         kind = getattr(errors, error["kind"], TaskError) if error["kind"] else TaskError
         where = (error["env"], error["seed"], error["step"]) if "env" in error else None
@@ -313,7 +386,7 @@ class Workers:
             failed = EpisodeFailed(message, *where, hint=self._hint, details=details)
             if kind is TaskError:
                 return failed
-            message = str(failed)
+            message = str(failed) if kind is not DivergedError else str(failed).partition("; ")[0]
         result: RlctlError = kind(message, details=details)
         return result
 
@@ -321,53 +394,70 @@ class Workers:
     def _hint(self) -> str:
         return f"to see it alone: rlctl check-env {self._spec.task}"
 
-    def _stopped(self, worker: int, message: str) -> TaskError:
+    def _name_episode(self, worker: int, message: str) -> TaskError:
         """Name the episode a worker was in when it stopped answering, or the environments it ran."""
         low, high = self._ranges[worker]
         if self._ready:
-            for env, (seed, step) in enumerate(self._arrays.inside[low:high].tolist(), start=low):
+            for env, (seed, step, _) in enumerate(self._arrays.inside[low:high].tolist(), start=low):
                 if step >= 0:
                     return EpisodeFailed(message, env, seed, step, hint=self._hint)
         return TaskError(f"{message}\nit ran the environments {low} to {high - 1}")
 
-    def _death(self, worker: int, doing: str) -> TaskError:
+    def _describe_death(self, worker: int, doing: str) -> TaskError:
         try:
-            code = self._processes[worker].wait(timeout=5.0)
+            code = self._processes[worker].process.wait(timeout=5.0)
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         except subprocess.TimeoutExpired:
             how = "it closed its connection"
         if how == "SIGKILL":
             how += ": the system does that when memory runs out; fewer environments (--n-envs) need less"
-        return self._stopped(worker, f"task {self._spec.task!r}: worker {worker} died while {doing} ({how})")
+        return self._name_episode(worker, f"task {self._spec.task!r}: worker {worker} died while {doing} ({how})")
 
-    def _hang(self, workers: list[int], timeout_s: float, doing: str) -> TaskError:
-        return self._stopped(
-            workers[0],
+    def _describe_hang(self, worker: int, timeout_s: float, doing: str) -> TaskError:
+        return self._name_episode(
+            worker,
             f"task {self._spec.task!r}: no answer for {timeout_s:g} s while {doing}; "
             "if that may take so long, raise --env-timeout",
         )
 
     def close(self, grace_s: float = 2.0) -> None:
         """End the workers; those that do not end within `grace_s` are killed. A second call does nothing."""
-        for connection in self._connections:
-            connection.close()
-        self._connections = []
+        for process in self._processes:
+            process.connection.close()
         deadline = time.monotonic() + grace_s
         for process in self._processes:
-            end(process, deadline)
+            process.close(max(0.0, deadline - time.monotonic()))
         self._processes = []
-        while self._lifelines:  # not before they have ended: it kills them
-            os.close(self._lifelines.pop())
+        self._pending = set()
         self._output.join(timeout=1.0)
-        if self._memory >= 0:
-            os.close(self._memory)
-            self._memory = -1
+        for descriptor in (self._memory, self._numbers_memory):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._memory = self._numbers_memory = -1
 
     def __enter__(self) -> Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _results(answers: Mapping[int, Any]) -> list[EpisodeResult]:
+    """Return the episodes of some answers, in the order of the environments: what follows from them must repeat."""
+    return [
+        EpisodeResult(
+            each["env"],
+            each["seed"],
+            each["return"],
+            each["length"],
+            each["success"],
+            each["terms"],
+            each["final_distance"],
+            each.get("row", -1),
+        )
+        for _, answer in sorted(answers.items())
+        for each in answer["ended"]
+    ]
 
 
 def _copy_rows(arrays: dict[str, NDArray[Any]], rows: Any) -> Observations:

@@ -109,6 +109,8 @@ class Recipe(_Section):
     """Running normalisation of observations and rewards."""
     frame_stack: Whole = Field(1, ge=1, le=1000)
     """How many of the last observations the policy gets."""
+    overlap: Switch = True
+    """Whether off-policy algorithms learn while environments play, with a policy one chunk of `train_freq` older."""
     n_envs: Whole = Field(8, ge=1, le=_MOST_ENVS)
     """Environments stepped side by side."""
     total_timesteps: Whole = Field(300_000, ge=1, le=_MOST_STEPS)

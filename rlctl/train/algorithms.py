@@ -9,16 +9,17 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from rlctl.dict_spaces import split_space
 from rlctl.errors import RecipeError, UsageError, short_repr
-from rlctl.run.recipe import Normalize, Recipe
+from rlctl.run.recipe import ON_POLICY, Normalize, Recipe
 from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
 from rlctl.train import footprint
 from rlctl.train.hindsight import replay_arguments
+from rlctl.train.off_policy import ChunkRollouts
+from rlctl.train.on_policy import SegmentRollouts
 from rlctl.train.vec_env import WorkerVecEnv
 
 _CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
@@ -28,8 +29,8 @@ _DETERMINISTIC_EXPLORERS = frozenset({"td3", "ddpg"})
 def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm:
     """Build the model of a recipe on vector environments; raises `RecipeError` for what does not fit."""
     _check_device(device)
-    cls = ALGORITHMS[recipe.algo]
-    kwargs = _algorithm_kwargs(recipe, env.action_space)
+    cls = _playing_class(recipe)
+    kwargs = _algorithm_kwargs(recipe)
     if recipe.her is not None:
         kwargs = {**replay_arguments(recipe, recipe.her, env.workers.info), **kwargs}
     name = policy_name(recipe.algo, env.observation_space)
@@ -40,7 +41,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     _check_rollout(recipe, env.num_envs)
     footprint.check(recipe, env.observation_space, env.action_space, env.num_envs)
     try:
-        return cls(
+        model: BaseAlgorithm = cls(
             name,
             wrap_normalize(env, recipe.normalize, kwargs.get("gamma", 0.99)),
             policy_kwargs=_policy_kwargs(recipe),
@@ -48,8 +49,34 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
             device=device,
             **kwargs,
         )
+        _use_fused_adam(model)
+        return model
     except (AssertionError, ValueError, TypeError, RuntimeError) as error:
         raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error), 300)}") from error
+
+
+def _use_fused_adam(model: BaseAlgorithm) -> None:
+    """Let Adam update all weights in one call; it computes the same, and a small network's update is mostly calls."""
+    parts = [model, *(getattr(model.policy, name, None) for name in ("actor", "critic")), model.policy]
+    for part in parts:
+        for name in ("optimizer", "ent_coef_optimizer"):
+            optimizer = getattr(part, name, None)
+            if isinstance(optimizer, torch.optim.Adam):
+                for group in optimizer.param_groups:
+                    group["fused"] = True
+
+
+def _playing_class(recipe: Recipe) -> type[BaseAlgorithm]:
+    """Return SB3's algorithm with our way to play: in workers, many steps at once."""
+    cls = ALGORITHMS[recipe.algo]
+    rollouts = SegmentRollouts if recipe.algo in ON_POLICY else ChunkRollouts
+    content: dict[str, Any] = {"algorithm_name": recipe.algo}
+    if rollouts is ChunkRollouts:
+        # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
+        content["overlap"] = recipe.overlap and recipe.her is None
+        default = 0.1 if recipe.algo in _DETERMINISTIC_EXPLORERS else 0.0  # else they would not explore at all
+        content["action_noise_scale"] = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
+    return type(cls.__name__, (rollouts, cls), content)
 
 
 def _check_device(device: str) -> None:
@@ -82,14 +109,9 @@ def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: 
             )
 
 
-def _algorithm_kwargs(recipe: Recipe, action_space: spaces.Space[Any]) -> dict[str, Any]:
+def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:
     kwargs = {name: _convert(value) for name, value in recipe.algo_kwargs.items()}
-    if recipe.algo in _DETERMINISTIC_EXPLORERS:
-        # Their policies are deterministic: without noise they would not explore at all.
-        kwargs.setdefault("action_noise", 0.1)
-    if isinstance(sigma := kwargs.get("action_noise"), int | float) and action_space.shape is not None:
-        size = int(np.prod(action_space.shape))
-        kwargs["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, float(sigma)))
+    kwargs.pop("action_noise", None)  # the workers add it
     return kwargs
 
 

@@ -16,7 +16,7 @@ def explain_fault(
     error: TaskError, run: RunDirectory, env: WorkerVecEnv, saver: Saver, keeper: EpisodeKeeper
 ) -> TaskError:
     """Keep the actions of the training episode that failed, and return the error with what to do next."""
-    if isinstance(error, EpisodeFailed):
+    if isinstance(error, EpisodeFailed) and error.actions is None:
         actions = env.history.of(error.env)
         # A reset that fails is that of the next episode: none of the actions is its own.
         error.actions = None if actions is None else actions[: error.step]

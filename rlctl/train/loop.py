@@ -87,12 +87,16 @@ class TrainingLoop(BaseCallback):
 
     def _on_step(self) -> bool:
         self.display.steps(self.model.num_timesteps)
+        self.announce_stop()
+        return True
+
+    def announce_stop(self) -> None:
+        """Show, once, that a signal has been taken."""
         if self.stop_signal is not None and not self._stop_announced:
             self._stop_announced = True
             self.display.message(
                 "stopping after this update, with a checkpoint; press Ctrl-C again to stop immediately"
             )
-        return True
 
     def _on_rollout_start(self) -> None:
         resumed, self._resumed = self._resumed, None
@@ -229,7 +233,7 @@ class TrainingLoop(BaseCallback):
         packed = self._pack()
         self.display.phase("evaluating")
         try:
-            self._record_evaluation(self._evaluator.run(self.model, *packed, self._raise_if_stop_requested), packed)
+            self._record_evaluation(self._evaluator.run(*packed, self._raise_if_stop_requested), packed)
         except _StopRequested:
             assert self.stop_signal is not None
             self._stop(self.stop_signal, at_end=at_end)

@@ -13,7 +13,7 @@ from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
 from rlctl.named_task import RUN
-from rlctl.rollout.workers import Workers
+from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.env_info import EnvInfo
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from rlctl.train.progress import Progress
     from rlctl.train.saving import Saver
 
-_EVAL_ENVS = 32
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
 
 
@@ -170,7 +169,7 @@ def _train(
             display.message(f"warning: {run.path}: no locks on this file system: let no second process write this run")
         saver = _saver(request, start, run, lock, learner, display)
         evaluator = Evaluator(
-            recipe, lambda: _workers(specs[-1], min(recipe.eval.episodes, _EVAL_ENVS), request, display)
+            recipe, lambda: _workers(specs[-1], min(recipe.eval.episodes, available_cores()), request, display)
         )
         loop = TrainingLoop(run, recipe, learner, evaluator, saver, display, start.checkpoint)
         display.run_folder(run.path, run.metrics_file, run.evals_file)

@@ -5,10 +5,8 @@ The environments' part is in `vec_env.py`, the replay buffer's in `replay_segmen
 
 from __future__ import annotations
 
-import contextlib
 import random
 from collections import deque
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,6 +23,7 @@ Tensors = dict[str, NDArray[Any]]
 
 _COUNTERS = (
     "num_timesteps", "_n_updates", "_episode_num", "_n_calls", "exploration_rate", "_current_progress_remaining",
+    "steps_to_learn",
 )  # fmt: skip
 # What gSDE explores with until it draws again.
 _EXPLORATION = ("exploration_mat", "exploration_matrices")
@@ -96,21 +95,6 @@ def restore_randomness(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, 
     for name in _EXPLORATION:
         if f"exploration/{name}" in tensors:
             setattr(explorer, name, torch.from_numpy(tensors[f"exploration/{name}"].copy()).to(model.device))
-
-
-@contextlib.contextmanager
-def isolate_randomness(model: BaseAlgorithm, seed: int) -> Iterator[None]:
-    """Seed torch's generator with `seed` inside the block, and restore it after."""
-    explorer = _explorer(model)
-    before = {name: getattr(explorer, name) for name in _EXPLORATION if hasattr(explorer, name)}
-    state = torch.get_rng_state()
-    torch.manual_seed(seed)
-    try:
-        yield
-    finally:
-        torch.set_rng_state(state)
-        for name, value in before.items():
-            setattr(explorer, name, value)
 
 
 _NUMPY = ("keys", "position", "has_gauss", "cached")

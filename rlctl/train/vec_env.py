@@ -2,20 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from rlctl.dict_spaces import take_row
+from rlctl.dict_spaces import join
+from rlctl.errors import EpisodeFailed
+from rlctl.rollout.acting import Exploration
 from rlctl.rollout.history import ActionHistory
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.run.policy import PolicyInfo
 from rlctl.train.space_monitor import SpaceMonitor
 
-_NOTHING: dict[str, Any] = {}
+
+@dataclasses.dataclass(frozen=True)
+class PlayedSegment:
+    """What all environments did in some steps; arrays of shape (n_envs, steps, ...), in shared memory."""
+
+    observation: dict[str, NDArray[Any]]
+    """One row more than steps: what followed the last."""
+    final: dict[str, NDArray[Any]]
+    """What an episode ended with, in the row of its last step."""
+    stored: NDArray[Any]
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    infos: list[dict[str, Any]]
+    """As SB3 has them at the end of an episode."""
+
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """Where an episode ended."""
+        return self.terminated | self.truncated
+
+    @property
+    def last_observation(self) -> Any:
+        """A copy of what followed the last step, shape (n_envs, ...)."""
+        return join({key: rows[:, -1].copy() for key, rows in self.observation.items()})
 
 
 class WorkerVecEnv(VecEnv):
@@ -31,6 +59,9 @@ class WorkerVecEnv(VecEnv):
         self.monitor = SpaceMonitor(workers.info.spaces()[0])
         self.ended: list[EpisodeResult] = []
         """Episodes that ended since the last `take_ended`."""
+        self.policy_info: PolicyInfo | None = None
+        """Describes the policy that plays, once it does."""
+        self._steps, self._until_end = 0, False
         self.render_mode = None
         super().__init__(workers.n_envs, *workers.info.spaces())
 
@@ -40,14 +71,8 @@ class WorkerVecEnv(VecEnv):
     def reset(self) -> Any:
         self.workers.reset({env: self._seed(env, number) for env, number in enumerate(self.episodes_started)})
         self.episodes_started = [number + 1 for number in self.episodes_started]
-        self._begun(range(self.num_envs))
+        self.history.begin(range(self.num_envs))
         return self.workers.observations()
-
-    def _begun(self, envs: Iterable[int]) -> None:
-        envs = list(envs)
-        self.history.begin(envs)
-        for env in envs:
-            self.workers.arrays.next_seed[env] = self._seed(env, self.episodes_started[env])
 
     def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
         """Put each environment into its running episode by replaying the actions.
@@ -60,43 +85,64 @@ class WorkerVecEnv(VecEnv):
         ended = self.workers.replay_actions(dict(enumerate(zip(seeds, actions, strict=True))))
         self.monitor.forget(self.workers.arrays)  # counted the first time
         self.history = ActionHistory.of_episodes(actions, self.workers.arrays.action)
-        for env in range(self.num_envs):
-            self.workers.arrays.next_seed[env] = self._seed(env, self.episodes_started[env])
         return ended
 
+    def play(self, steps: int, exploration: Exploration, check: Callable[[], None] | None = None) -> PlayedSegment:
+        """Let the workers play `steps` steps in each environment with the policy they have."""
+        self.start(steps, exploration)
+        return self.finish(check)
+
+    def start(self, steps: int, exploration: Exploration, *, until_end: bool = False) -> None:
+        """Begin to play up to `steps` steps, with `until_end` only up to the end of the running episode."""
+        self._steps, self._until_end = steps, until_end
+        self.workers.start_playing(
+            dict.fromkeys(range(self.num_envs), -1),
+            steps,
+            exploration,
+            until_end=until_end,
+            run_seed=self.run_seed,
+            episodes_started=self.episodes_started,
+        )
+
+    def finish(self, check: Callable[[], None] | None = None) -> PlayedSegment:
+        """Wait for what `start` has begun; `check` is called several times a second."""
+        try:
+            ended = self.workers.finish_playing(check=check)
+        except EpisodeFailed as error:
+            error.actions = self._failed_actions(error)
+            raise
+        segment = self.workers.arrays.segment
+        steps = ended[0].row + 1 if self._until_end and ended else self._steps
+        for result in ended:
+            self.episodes_started[result.env] += 1
+        self.history.add_segment(segment.action[:, :steps], [(each.env, each.row) for each in ended])
+        self.ended += ended
+        seen = {key: rows[:, 1 : steps + 1].reshape(-1, *rows.shape[2:]) for key, rows in segment.observation.items()}
+        self.monitor.look(join(seen))
+        return PlayedSegment(
+            {key: rows[:, : steps + 1] for key, rows in segment.observation.items()},
+            {key: rows[:, :steps] for key, rows in segment.final.items()},
+            segment.stored[:, :steps],
+            segment.reward[:, :steps],
+            segment.terminated[:, :steps],
+            segment.truncated[:, :steps],
+            [_info_at_end(result) for result in ended],
+        )
+
+    def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any] | None:
+        """Return the actions of a failed episode, that of the failed step last; None if it goes too far back."""
+        arrays = self.workers.arrays
+        rows = int(arrays.inside[error.env, 2]) + 1
+        if error.step <= rows:
+            return arrays.segment.action[error.env, rows - error.step : rows].copy()
+        before = self.history.of(error.env)
+        return None if before is None else np.concatenate([before, arrays.segment.action[error.env, :rows]])
+
     def step_async(self, actions: NDArray[Any]) -> None:
-        self.workers.arrays.action[:] = actions
-        self.history.add(self.workers.arrays.action)
+        raise NotImplementedError("workers play segments; nothing steps them one by one")
 
-    def step_wait(self) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        ended = self.workers.step()
-        arrays = self.workers.arrays
-        infos = [_NOTHING] * self.num_envs
-        if ended:
-            envs = [result.env for result in ended]
-            final = self.workers.final_observations(envs)
-            for index, result in enumerate(ended):
-                env = result.env
-                self.episodes_started[env] += 1
-                infos[env] = self._end_info(result, take_row(final, index))
-            self._begun(envs)
-            self.ended += ended
-        # float32, as SB3's own environments hand rewards over.
-        rewards = arrays.reward.astype(np.float32)
-        observations = self.workers.observations()
-        self.monitor.look(observations)
-        return observations, rewards, arrays.terminated | arrays.truncated, infos
-
-    def _end_info(self, result: EpisodeResult, final_observation: Any) -> dict[str, Any]:
-        arrays = self.workers.arrays
-        info: dict[str, Any] = {
-            "terminal_observation": final_observation,
-            "TimeLimit.truncated": bool(arrays.truncated[result.env] and not arrays.terminated[result.env]),
-            "episode": {"r": result.total_reward, "l": result.length, "t": 0.0},
-        }
-        if result.success is not None:
-            info["is_success"] = result.success
-        return info
+    def step_wait(self) -> Any:
+        raise NotImplementedError("workers play segments; nothing steps them one by one")
 
     def take_ended(self) -> list[EpisodeResult]:
         """Return the episodes that ended since the last call."""
@@ -125,3 +171,10 @@ class WorkerVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         return [False for _ in self._get_indices(indices)]
+
+
+def _info_at_end(result: EpisodeResult) -> dict[str, Any]:
+    info: dict[str, Any] = {"episode": {"r": result.total_reward, "l": result.length, "t": 0.0}}
+    if result.success is not None:
+        info["is_success"] = result.success
+    return info

@@ -7,6 +7,7 @@ import psutil
 
 import rlctl.rollout.workers
 import rlctl.run.files
+import rlctl.train.evaluation
 import rlctl.train.loop
 import rlctl.train.status
 import rlctl.train.vec_env
@@ -16,13 +17,13 @@ PHASES = {
     "workers start": (process_start, "default_start", 1),
     "workers build": (rlctl.rollout.workers.Workers, "info", 1),
     "run folder": (rlctl.train.status, "write_start", 1),
-    "first rollout": (rlctl.train.vec_env.WorkerVecEnv, "step_wait", 2),
+    "first rollout": (rlctl.train.vec_env.WorkerVecEnv, "finish", 1),
     "boundary": (rlctl.train.loop.TrainingLoop, "boundary", 1),
-    "evaluation": (rlctl.rollout.workers.Workers, "step", 19),  # two rollouts of 8 steps are before it
+    "evaluation": (rlctl.train.evaluation.Evaluator, "run", 1),
     "first checkpoint": (rlctl.run.files, "os.rename", 1),
     "checkpoint": (rlctl.run.files, "os.rename", 2),
     "evaluated checkpoint": (rlctl.run.files, "os.rename", 3),
-    "final evaluation": (rlctl.rollout.workers.Workers, "step", 37),  # 8 more, and an evaluation of 10
+    "final evaluation": (rlctl.train.evaluation.Evaluator, "run", 2),
     "the end": (rlctl.train.loop.TrainingLoop, "finish", 1),
     "last checkpoint": (rlctl.run.files, "os.rename", 4),
     "done": (rlctl.train.status, "write_end", 1),

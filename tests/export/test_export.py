@@ -12,10 +12,11 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.export.agreement import Comparison
 from rlctl.export.export import export_onnx
 from rlctl.export.report import show
-from rlctl.export.verify import compare_episodes, verify
+from rlctl.export.verify import PolicyFiles, compare_episodes, verify
 from rlctl.rollout.collect import Episode
 from rlctl.rollout.workers import EpisodeResult, Workers
 from rlctl.run.onnx_policy import OnnxPolicy
+from rlctl.run.policy import read_policy
 from rlctl.run.torch_policy import TorchPolicy
 
 
@@ -106,7 +107,8 @@ def test_other_weights_are_noticed(small, train, write, tmp_path):
     model.policy.action_net.bias.data[0] += 0.001
     exported = export(write(model, "ppo", small(), name="other")).path
     with Workers(small(), 10) as workers:
-        seen = verify(TorchPolicy.load(original), OnnxPolicy.load(exported), workers)
+        files = PolicyFiles(read_policy(original)[1], exported)
+        seen = verify(TorchPolicy.load(original), OnnxPolicy.load(exported), files, workers)
     assert not seen.passed
     assert seen.agreement.max_difference == pytest.approx(0.001, rel=0.01)
     assert seen.agreement.beyond_limit > 1000

@@ -59,6 +59,22 @@ class Walk(gymnasium.Env):
             os.system("echo hello from its child >&2")
 
 
+class Long(Walk):
+    """An episode of `length` steps without a time limit; it observes how many are done."""
+
+    def __init__(self, length=1000):
+        super().__init__()
+        self.steps_of_an_episode = length
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.full(2, self.steps, np.float32), 0.0, self.steps == self.steps_of_an_episode, False, {}
+
+
 class FailsToStart(Walk):
     def __init__(self):
         raise RuntimeError("no licence for this robot")

@@ -6,10 +6,11 @@ import threading
 import pytest
 
 from rlctl.env_spec import EnvSpec
+from rlctl.rollout import messages
 from rlctl.rollout.failures import FailedInEpisode, encode_error
 from rlctl.rollout.shared_arrays import anonymous_file
 from rlctl.rollout.worker_output import MAX_LINE_BYTES, MAX_LINES_PER_S, forward, replace_control_characters
-from rlctl.rollout.worker_process import _Worker
+from rlctl.rollout.worker_process import Job, Worker
 from tests.train import faulty_envs
 
 ENVS = faulty_envs.__file__
@@ -17,8 +18,8 @@ ENVS = faulty_envs.__file__
 
 def failure(env, **parameters):
     """Return what a worker tells of the episode of seed 7."""
-    worker = _Worker(anonymous_file(), EnvSpec(f"{ENVS}:{env}", parameters), 0, 1, 1)
-    worker.attach()
+    worker = Worker(Job(anonymous_file(), -1, 0, 1, 1), EnvSpec(f"{ENVS}:{env}", parameters))
+    worker.attach(messages.Attach(1))
     worker.arrays.next_seed[:] = -1
     with pytest.raises(FailedInEpisode) as caught:
         live(worker)
@@ -26,7 +27,7 @@ def failure(env, **parameters):
 
 
 def live(worker):
-    worker.reset([(0, 7)])
+    worker.reset(messages.Reset([[0, 7]]))
     for _ in range(10):
         worker.step()
 

@@ -1,7 +1,5 @@
 """A run that was killed and resumed is the run that was never stopped, bit for bit."""
 
-import itertools
-
 import pytest
 
 from rlctl.run import recipe as recipes
@@ -70,16 +68,27 @@ def kill_after(monkeypatch):
     """End the training in the middle of a step, so many steps after it began."""
 
     def kill(steps):
-        counter = itertools.count(1)
-        original = WorkerVecEnv.step_wait
+        done = 0
+        started, finished = WorkerVecEnv.start, WorkerVecEnv.finish
 
-        def step_wait(env):
-            if next(counter) > steps:
-                raise Killed
-            return original(env)
+        def killed():
+            raise Killed
 
-        monkeypatch.setattr(WorkerVecEnv, "step_wait", step_wait)
-        return lambda: monkeypatch.setattr(WorkerVecEnv, "step_wait", original)
+        def start(env, count, exploration, **options):
+            nonlocal done
+            done += count
+            started(env, count, exploration, **options)
+
+        def finish(env, check=None):
+            return finished(env, killed if done > steps else check)  # while the workers play
+
+        def undo():
+            monkeypatch.setattr(WorkerVecEnv, "start", started)
+            monkeypatch.setattr(WorkerVecEnv, "finish", finished)
+
+        monkeypatch.setattr(WorkerVecEnv, "start", start)
+        monkeypatch.setattr(WorkerVecEnv, "finish", finish)
+        return undo
 
     return kill
 

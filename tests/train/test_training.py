@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from rlctl.errors import DivergedError, RecipeError, TaskError, UsageError
+from rlctl.rollout.acting import PolicyPlayer
 from rlctl.run import recipe as recipes
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
-from rlctl.run.policy import load_policy
+from rlctl.run.policy import load_policy, read_policy
 from rlctl.train import checkpoint
 from rlctl.train.request import TrainRequest, TrainResult, run_training
 from tests.train.conftest import ENVS, SMALL, SMALL_PPO
@@ -239,7 +240,10 @@ def test_live_policy_and_saved_policy_act_the_same(finished):
     if episode.info.policy != "training step 256":
         pytest.fail(f"the newest episode is of {episode.info.policy}")
     actions = np.stack([policy.predict(observation) for observation in episode.observations[:-1]])
-    np.testing.assert_array_equal(actions, episode.actions)
+    np.testing.assert_allclose(actions, episode.actions, atol=1e-6)
+    player = PolicyPlayer(*read_policy(finished.run.last_policy))
+    played = [player.act(observation, 0, 0)[1] for observation in episode.observations[:-1]]
+    np.testing.assert_array_equal(played, episode.actions)
 
 
 @pytest.mark.parametrize(

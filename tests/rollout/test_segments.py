@@ -1,0 +1,109 @@
+"""Segments that workers play by themselves: the same however environments are spread, every episode by its address."""
+
+import numpy as np
+import pytest
+
+from rlctl.errors import EpisodeFailed
+from rlctl.rollout.acting import Exploration, PolicyPlayer
+from rlctl.rollout.seeds import EpisodeAddress, Stream
+from tests.rollout.policies import linear
+
+pytestmark = pytest.mark.usefixtures("no_child_left")
+
+SAMPLES = Exploration(stochastic=True)
+WEIGHT = -0.1 * np.eye(2)
+
+
+def seed(env: int, episode: int) -> int:
+    return EpisodeAddress(3, Stream.TRAIN, env, episode).seed
+
+
+def play(workers, segments, steps):
+    """Return copies of the arrays of some segments, joined, and the episodes that ended."""
+    workers.set_policy(*linear(workers.info, WEIGHT, log_std=-1.0))
+    started, results, parts = [1] * workers.n_envs, [], []
+    for number in range(segments):
+        begin = {env: -1 if number else seed(env, 0) for env in range(workers.n_envs)}
+        workers.start_playing(begin, steps, SAMPLES, run_seed=3, episodes_started=list(started))
+        ended = workers.finish_playing()
+        for each in ended:
+            started[each.env] += 1
+        results += [(number * steps + each.row, each) for each in ended]
+        segment = workers.arrays.segment
+        names = ("stored", "action", "reward", "terminated")
+        parts.append({name: getattr(segment, name)[:, :steps].copy() for name in names})
+        parts[-1]["observation"] = segment.observation[""][:, :steps].copy()
+    joined = {name: np.concatenate([part[name] for part in parts], axis=1) for name in parts[0]}
+    return joined, sorted(results, key=lambda pair: (pair[1].env, pair[0]))
+
+
+@pytest.mark.parametrize("n_workers", [2, 3])
+def test_equal_however_environments_and_steps_are_spread(spec, start, n_workers):
+    """Five environments on two or three workers, four segments of 10 steps, against one worker and one segment."""
+    one, ended = play(start(spec("Walk"), 5, n_workers=1), 1, 40)
+    other, also = play(start(spec("Walk"), 5, n_workers=n_workers), 4, 10)
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, other[name], err_msg=name)
+    assert [(row, each) for row, each in ended] == [(row, each) for row, each in also]
+    assert len(ended) > 10
+
+
+def test_workers_play_as_this_process_does(spec, start):
+    workers = start(spec("Walk"), 2)
+    played, ended = play(workers, 1, 30)
+    env, player = spec("Walk").make(), PolicyPlayer(*linear(workers.info, WEIGHT, log_std=-1.0))
+    player.exploration = SAMPLES
+    episode, step = 0, 0
+    observation, _ = env.reset(seed=seed(1, 0))
+    for row in range(30):
+        np.testing.assert_array_equal(played["observation"][1, row], observation)
+        stored, action = player.act(observation, seed(1, episode), step)
+        np.testing.assert_array_equal(played["stored"][1, row], stored)
+        np.testing.assert_array_equal(played["action"][1, row], np.clip(stored, -1, 1))
+        observation, reward, done, *_ = env.step(action)
+        assert (played["reward"][1, row], played["terminated"][1, row]) == (reward, done)
+        step += 1
+        if done:
+            episode, step = episode + 1, 0
+            observation, _ = env.reset(seed=seed(1, episode))
+    assert [each.seed for _, each in ended if each.env == 1] == [seed(1, number) for number in range(episode)]
+
+
+def test_episodes_of_one_step(spec, start):
+    workers = start(spec("Long", length=1), 3, n_workers=2)
+    played, ended = play(workers, 2, 5)
+    assert played["terminated"].all()
+    assert [each.seed for _, each in ended] == [seed(env, number) for env in range(3) for number in range(10)]
+    assert {each.length for _, each in ended} == {1}
+    # Each ended at the observation 1, and what follows is the next one's first.
+    assert (workers.arrays.segment.final[""][:, :5] == 1.0).all()
+    assert (played["observation"] == 0.0).all()
+
+
+def test_a_segment_up_to_the_end_of_an_episode(spec, start):
+    """As off-policy algorithms play whose `train_freq` counts episodes: the next one has begun then."""
+    workers = start(spec("Walk"), 1)
+    workers.set_policy(*linear(workers.info, WEIGHT))
+    workers.start_playing({0: seed(0, 0)}, 50, Exploration(), until_end=True, run_seed=3, episodes_started=[1])
+    (result,) = workers.finish_playing()
+    assert result.row + 1 == result.length < 50
+    first, _ = spec("Walk").make().reset(seed=seed(0, 1))
+    np.testing.assert_array_equal(workers.observations()[0], first)
+
+
+def test_uniform_actions_of_a_warm_up(spec, start):
+    workers = start(spec("Spaces", kind="discrete"), 2)
+    workers.set_policy(*linear(workers.info, np.zeros((2, 7))))
+    workers.start_playing({0: 1, 1: 2}, 40, Exploration(warmup=True), run_seed=3, episodes_started=[1, 1])
+    workers.finish_playing()
+    assert set(workers.arrays.segment.action[:, :40].ravel().tolist()) == {0, 1}
+
+
+def test_the_step_of_a_segment_that_fails_is_named(spec, start):
+    workers = start(spec("Walk", fault="raise"), 3, n_workers=2)
+    workers.set_policy(*linear(workers.info, WEIGHT))
+    workers.start_playing({0: 5, 1: 6, 2: 7}, 20, Exploration(), run_seed=3, episodes_started=[1, 1, 1])
+    with pytest.raises(EpisodeFailed) as caught:
+        workers.finish_playing()
+    assert (caught.value.env, caught.value.seed, caught.value.step) == (2, 7, 3)
+    assert workers.arrays.inside[2].tolist() == [7, 3, 2]
