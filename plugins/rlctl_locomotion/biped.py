@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlctl.errors import TaskError
-from rlctl.task import Box, Event, Sim, Task, events, rewards
+from rlctl.task import Box, Event, Sim, Task, TaskError, events, rewards
 from rlctl_locomotion.ground import add_ground
 
 MODELS = Path(__file__).parent / "models"

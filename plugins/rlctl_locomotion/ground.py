@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from rlctl.errors import TaskError
-from rlctl.task import Body, Sim, rough_heights
+from rlctl.task import Body, Sim, TaskError, rough_heights
 
 LENGTH = 48.0  # [m], along x: further than any of them gets in an episode
 CELL = 0.12  # [m]

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.errors import TaskError
-from rlctl.task import Box, Event, Sim, Task, events, rewards
+from rlctl.task import Box, Event, Sim, Task, TaskError, events, rewards
 from rlctl_locomotion.ground import add_ground
 
 LEGS = ("FR", "FL", "RR", "RL")  # front right and so on, as in the model

@@ -14,8 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from rlctl.errors import TaskError
-from rlctl.task import Attachment, Box, Event, Sim, Task, events, rewards
+from rlctl.task import Attachment, Box, Event, Sim, Task, TaskError, events, rewards
 
 MODEL = Path(__file__).parent / "models" / "gear_arm.urdf"
 JOINTS = ["turn", "shoulder", "crank"]

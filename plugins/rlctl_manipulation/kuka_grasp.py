@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.errors import TaskError
-from rlctl.task import Box, Event, Sim, Task, events, rewards
+from rlctl.task import Box, Event, Sim, Task, TaskError, events, rewards
 
 # Seven joints of the arm, then the gripper's: turn, left finger, left tip, right finger, right tip. [rad]
 START = [0.0064, 0.4132, -0.0114, -1.5893, 0.0054, 1.1377, -0.0065, 0.0, -0.3, 0.0, 0.3, 0.0]

@@ -1,7 +1,8 @@
-"""What a plugin author needs: `Task`, `Sim`, `Body`, `Event`, reward terms and spaces."""
+"""What a plugin author needs: `Task`, `Sim`, `Body`, `Event`, `TaskError`, reward terms and spaces."""
 
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
+from rlctl.errors import TaskError
 from rlctl.task import events, rewards
 from rlctl.task.body import Body
 from rlctl.task.constraints import Attachment
@@ -20,6 +21,7 @@ __all__ = [
     "MultiDiscrete",
     "Sim",
     "Task",
+    "TaskError",
     "events",
     "rewards",
     "rough_heights",
