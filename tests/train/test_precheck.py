@@ -14,7 +14,7 @@ def test_an_error_refuses_before_a_run_begins(train, runs, small_ppo):
     with pytest.raises(AnswerIsNo) as refused:
         train("Unseeded", small_ppo, check=True)
     first, second = str(refused.value).splitlines()
-    assert first.startswith("the check before training found 1 error: RL302 trajectory not repeatable (lived twice by")
+    assert first.startswith("the check before training found 1 error: RL302 trajectory not repeatable (played twice by")
     assert second.startswith("rlctl check-env ")
     assert second.endswith("--no-check trains anyway.")
     assert runs() == []
@@ -26,9 +26,9 @@ def test_without_the_check_it_trains(train, runs, small_ppo):
 
 
 def test_warnings_are_printed_and_training_goes_on(train, small_ppo, capsys):
-    assert train("FixedStart", small_ppo, check=True).steps == 256
+    assert train("LargeRewards", small_ppo, check=True).steps == 256
     printed = capsys.readouterr().err
-    assert "check before training: warnings RL306" in printed
+    assert "check before training: warnings RL603" in printed
 
 
 def test_an_environment_that_cannot_be_built_is_the_workers_matter(train, small_ppo):
