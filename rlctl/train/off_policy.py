@@ -49,7 +49,8 @@ class ChunkRollouts(OffPolicyAlgorithm):
             self._finish_chunk(callback)
             if not self.overlap:
                 self._learn_from_chunk()
-        self._learn_from_chunk()
+        # With overlap the last chunk's updates stay due: a run made longer does them beside its next chunk, as one that
+        # was that long from the beginning.
         callback.on_training_end()
         return self
 

@@ -8,7 +8,7 @@ import pytest
 from rlctl.env_spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
-from rlctl.eval.report import as_json, show
+from rlctl.eval.report import as_json
 from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
 from rlctl.rollout.workers import EpisodeResult
 from rlctl.train.request import TrainRequest, run_training
@@ -89,7 +89,7 @@ def test_tolerance_is_a_parameter(reach_run):
     assert run_evaluation(wide, Gates()).success_rate == 1.0
 
 
-def test_it_says_whether_it_was_randomised(reach_run, evaluation, capfd):
+def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
     shaken = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, changes=EnvChanges(randomize=True)), Gates())
     offered = as_json(evaluation)["events"]
     assert offered
@@ -100,11 +100,10 @@ def test_it_says_whether_it_was_randomised(reach_run, evaluation, capfd):
     assert [each.result.total_reward for each in shaken.episodes] != [
         each.result.total_reward for each in evaluation.episodes
     ]
-    for result in (evaluation, shaken):
-        show(result, None)
-    printed = capfd.readouterr()
-    assert "6 episodes, seed 0, not randomised" in printed.out + printed.err
-    assert f"6 episodes, seed 0, randomised by {', '.join(offered)}" in printed.out + printed.err
+    plain = rlctl("eval", reach_run.path, "--episodes", 6)
+    assert "6 episodes, seed 0, not randomised" in plain.stdout
+    randomised = rlctl("eval", reach_run.path, "--episodes", 6, "--set", "randomize=true")
+    assert f"6 episodes, seed 0, randomised by {', '.join(offered)}" in randomised.stdout
 
 
 def test_stochastic_repeats_with_its_seed(reach_run):

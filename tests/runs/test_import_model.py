@@ -1,6 +1,7 @@
 """Models of Stable-Baselines3 become policies that act the same, and nothing in the files is run."""
 
 import base64
+import copy
 import io
 import json
 import pickle
@@ -11,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rlctl.env_spec import EnvChanges, EnvSpec
@@ -52,8 +52,9 @@ def save(tmp_path):
     def saved(algo="ppo", observation="vector", action="box", **kwargs):
         parameters = {"observation": observation, "action": action}
         raw = DummyVecEnv([EnvSpec(SMALL, parameters).make])
+        raw.observation_space = copy.deepcopy(raw.observation_space)  # VecNormalize writes into a Dict space
         parts = getattr(raw.observation_space, "spaces", {})
-        keys = [key for key, space in parts.items() if isinstance(space, spaces.Box)] or None
+        keys = [key for key, space in parts.items() if space.dtype == np.float32] or None
         env = VecNormalize(raw, norm_reward=False, norm_obs_keys=keys)
         settings = {**ON_POLICY.get(algo, OFF_POLICY), **kwargs}
         model = ALGORITHMS[algo](policy_name(algo, env.observation_space), env, device="cpu", seed=0, **settings)
