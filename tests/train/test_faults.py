@@ -107,9 +107,13 @@ def test_bad_behaviour_changes_nothing(train, whole, capfd):
     assert ["sleep", "300.0625"] not in [process.info["cmdline"] for process in psutil.process_iter(["cmdline"])]
     printed = capfd.readouterr().err
     assert "more lines of what environments print are left out" in printed
-    assert "warning: closing environment 0: RuntimeError: closed twice" in printed
     assert "\x1b" not in printed
     assert "Traceback" not in printed
+
+
+def test_an_environment_that_cannot_be_closed_is_warned_of(train, capfd):
+    train("Misbehaving", {**TINY, "total_timesteps": 32, "task": {"misbehaviour": "changes numpy's errors"}}, envs=ENVS)
+    assert "warning: closing environment 0: RuntimeError: closed twice" in capfd.readouterr().err
 
 
 @pytest.mark.slow
