@@ -149,7 +149,6 @@ def test_text_has_the_finding_its_numbers_and_its_fix(broken):
     assert "\x1b" not in text
 
 
-@pytest.mark.slow
 def test_a_clean_environment_fits_on_a_screen():
     report = report_of("reach", experiments=[each for each in families.EXPERIMENTS if each not in families.CHECKERS])
     lines = plain.text(report).splitlines()

@@ -79,7 +79,7 @@ def test_kept_episodes_are_the_first_and_the_worst(finished):
         ("a2c", "Line"),
         ("sac", "Line"),
         ("td3", "Line"),
-        pytest.param("ddpg", "Line", marks=pytest.mark.slow),  # a td3 of other settings
+        ("ddpg", "Line"),
         ("dqn", "Discrete"),
         ("tqc", "Line"),
         ("crossq", "Line"),
