@@ -37,8 +37,6 @@ FOR_COMMANDS = (
     *("rlctl.eval.evaluate", "rlctl.run.torch_policy", "typer.rich_utils", "yaml"),
 )
 """What is imported when it is needed; one that is missing here costs time only."""
-HASH_SEED = "0"
-"""Of all forks: that of check-env's processes but one."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PR_SET_CHILD_SUBREAPER = 36
 
@@ -104,7 +102,6 @@ class ForkServer:
                 [sys.executable, "-c", code],
                 cwd=ROOT,
                 pass_fds=(theirs.fileno(),),
-                env={**os.environ, "PYTHONHASHSEED": HASH_SEED},
                 process_group=0,  # an interrupt at the terminal is for the tests
             )
         return cls(ours, process)
@@ -138,9 +135,9 @@ class ForkServer:
     ):
         """Start `[python, "-c", code, ...]` or `[python, "-m", module, ...]` with options of `subprocess.Popen`.
 
-        One that is to have another hash seed than the server is a fresh interpreter.
+        One that is to have another hash seed is a fresh interpreter.
         """
-        if env is not None and env.get("PYTHONHASHSEED", HASH_SEED) != HASH_SEED:
+        if env is not None and env.get("PYTHONHASHSEED") != os.environ.get("PYTHONHASHSEED"):
             options = {"env": env, "cwd": cwd, "process_group": process_group, "start_new_session": start_new_session}
             return subprocess.Popen(command, pass_fds=pass_fds, stdin=stdin, stdout=stdout, stderr=stderr, **options)
         with contextlib.ExitStack() as opened:
@@ -202,9 +199,8 @@ def close():
 
 
 def start(command, **options):
-    """Start a child process as `subprocess.Popen` does; those of check-env by the server that has imported torch."""
-    server = for_commands() if "rlctl.check_env" in command[-1] else for_workers()
-    return server.start(command, **options)
+    """Start a worker as `subprocess.Popen` does, by the server of this process."""
+    return for_workers().start(command, **options)
 
 
 @contextlib.contextmanager
