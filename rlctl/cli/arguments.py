@@ -1,0 +1,62 @@
+"""Arguments and options that several commands share, and what they do first."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rlctl import completion
+
+if TYPE_CHECKING:
+    from rlctl.env_spec import EnvChanges
+
+TASK_FORMS = "Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id."
+OptionalTask = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="TASK",
+        help=TASK_FORMS,
+        show_default=False,
+        autocompletion=completion.complete_task,
+    ),
+]
+Run = Annotated[
+    str | None,
+    typer.Argument(
+        help="Run folder, policy file, task name, or latest.",
+        show_default="latest",
+        autocompletion=completion.complete_run,
+    ),
+]
+Set = Annotated[
+    list[str],
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Set a key, e.g. task.tolerance=0.02, randomize=true.",
+        show_default=False,
+    ),
+]
+Json = Annotated[
+    str | None,
+    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - for stdout.", show_default=False),
+]
+Seed = Annotated[int | None, typer.Option(help="Seed.", min=0)]
+EnvTimeout = Annotated[float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1)]
+NEnvs = Annotated[int | None, typer.Option(help="Environments stepped side by side.", min=1, show_default=False)]
+Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]
+
+
+def claim_stdout() -> None:
+    """Keep stdout for the result: what a plugin prints from now on goes to stderr."""
+    from rlctl import output
+
+    output.results()
+
+
+def parse_changes(settings: list[str]) -> EnvChanges:
+    """Read the `--set` options of a command that changes an environment."""
+    from rlctl.run.recipe import parse_changes
+
+    return parse_changes(settings)

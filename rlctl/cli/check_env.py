@@ -1,0 +1,57 @@
+"""`rlctl check-env`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rlctl.cli.arguments import EnvTimeout, Json, OptionalTask, Set, claim_stdout, parse_changes
+from rlctl.errors import UsageError
+
+
+def check_env(
+    task: OptionalTask = None,
+    settings: Set = [],
+    select: Annotated[
+        list[str],
+        typer.Option(metavar="RULES", help="Judge only these: RL3,RL501.", show_default=False),
+    ] = [],
+    ignore: Annotated[
+        list[str], typer.Option(metavar="RULES", help="Leave these out: RL106.", show_default=False)
+    ] = [],
+    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 for warnings too.")] = False,
+    form: Annotated[
+        str | None,
+        typer.Option("--format", metavar="text|json|sarif|github", help="Form of the report.", show_default="text"),
+    ] = None,
+    output: Annotated[
+        str | None,
+        typer.Option("--output", "-o", metavar="FILE", help="Where the report goes.", show_default="stdout"),
+    ] = None,
+    json: Json = None,
+    env_timeout: EnvTimeout = 10.0,
+    list_rules: Annotated[bool, typer.Option("--list", help="List all rules, and do nothing else.")] = False,
+    explain: Annotated[
+        str | None,
+        typer.Option(metavar="RULE", help="Say what a rule means, and do nothing else.", show_default=False),
+    ] = None,
+) -> None:
+    """Find what is wrong with an environment before hours of training do."""
+    claim_stdout()
+    from rlctl.check_env import formats
+    from rlctl.check_env.check import check
+    from rlctl.check_env.formats import rules
+    from rlctl.check_env.selection import choose_rules
+    from rlctl.env_spec import EnvSpec
+
+    if list_rules or explain is not None:
+        rules.show_list() if explain is None else rules.explain(explain)
+        return
+    if task is None:
+        raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
+    form, target = formats.choose(form, output, json)
+    spec = parse_changes(settings).apply(EnvSpec(task))
+    report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)
+    formats.show(report, form, target)
+    raise typer.Exit(report.exit_code)

@@ -1,0 +1,67 @@
+"""`rlctl eval`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rlctl.cli.arguments import Checkpoint, EnvTimeout, Json, NEnvs, Run, Set, claim_stdout, parse_changes
+
+
+def evaluate(
+    run: Run = None,
+    task: Annotated[
+        str | None,
+        typer.Option(help="Evaluate on this task instead of the one it was trained on.", show_default=False),
+    ] = None,
+    checkpoint: Checkpoint = "best",
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes, each with its own seed.", min=1)] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    stage: Annotated[
+        str | None,
+        typer.Option(metavar="N|all", help="Stage of the curriculum it was trained in.", show_default="the last"),
+    ] = None,
+    settings: Set = [],
+    stochastic: Annotated[
+        bool, typer.Option("--stochastic", help="Sample actions instead of taking the mean.")
+    ] = False,
+    n_envs: NEnvs = None,
+    min_success: Annotated[
+        float | None,
+        typer.Option(metavar="RATE", help="Gate: exit 1 below this success rate.", show_default=False),
+    ] = None,
+    min_success_lower: Annotated[
+        float | None,
+        typer.Option(metavar="RATE", help="Gate on the lower bound of the 95 % interval.", show_default=False),
+    ] = None,
+    min_return: Annotated[
+        float | None,
+        typer.Option(metavar="RETURN", help="Gate: exit 1 below this mean return.", show_default=False),
+    ] = None,
+    env_timeout: EnvTimeout = 60.0,
+    json: Json = None,
+) -> None:
+    """Say how good a policy is: success rate with its interval, returns, reward terms."""
+    claim_stdout()
+    from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluations
+    from rlctl.eval.report import show_all
+
+    gates = Gates(min_success, min_success_lower, min_return)
+    results = run_evaluations(
+        EvalRequest(
+            run=run,
+            task=task,
+            checkpoint=checkpoint,
+            episodes=episodes,
+            seed=seed,
+            changes=parse_changes(settings),
+            stage=stage,
+            deterministic=not stochastic,
+            n_envs=n_envs,
+            env_timeout_s=env_timeout,
+        ),
+        gates,
+    )
+    show_all(results, json)
+    gates.check(*results)

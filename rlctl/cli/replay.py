@@ -1,0 +1,68 @@
+"""`rlctl replay`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rlctl import completion
+from rlctl.cli.arguments import Checkpoint, Json, Set, claim_stdout, parse_changes
+
+
+def replay(
+    source: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[RUN or EPISODE]",
+            help="A run or policy to roll out, or a recorded episode (.npz).",
+            show_default="latest",
+            autocompletion=completion.complete_run,
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes to roll out.", min=1)] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    checkpoint: Checkpoint = "best",
+    task: Annotated[
+        str | None,
+        typer.Option(help="Roll out on this task instead of the one it was trained on.", show_default=False),
+    ] = None,
+    settings: Set = [],
+    verify: Annotated[
+        Path | None,
+        typer.Option(metavar="EPISODE", help="Replay a recorded episode; exit 1 unless identical.", show_default=False),
+    ] = None,
+    gui: Annotated[bool, typer.Option("--gui", help="Show it in PyBullet's window instead of recording.")] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="PATH",
+            help="An .rrd file or a folder. Default: episodes/ of the run.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = None,
+) -> None:
+    """Show what a policy does: rollouts as Rerun recordings, without a display."""
+    claim_stdout()
+    from rlctl.replay.replay import ReplayRequest, run_replay
+    from rlctl.replay.report import show
+
+    result = run_replay(
+        ReplayRequest(
+            source=source,
+            episodes=episodes,
+            seed=seed,
+            checkpoint=checkpoint,
+            task=task,
+            changes=parse_changes(settings),
+            verify=verify,
+            gui=gui,
+            output=output,
+        )
+    )
+    show(result, json)
+    result.check()

@@ -1,0 +1,135 @@
+"""`rlctl runs` and what comes after it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from rlctl.cli.arguments import TASK_FORMS, Json, Run, Set, claim_stdout, parse_changes
+from rlctl.errors import UsageError
+
+
+class _RunsGroup(TyperGroup):
+    """Reads `rlctl runs [TASK]` as `rlctl runs list [TASK]`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args or (args[0] not in self.commands and args[0] not in ctx.help_option_names):
+            args = ["list", *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(cls=_RunsGroup, help="List runs, show one, compare several, remove what is not needed.")
+
+
+@app.command("list")
+def list_runs(
+    task: Annotated[
+        str | None,
+        typer.Argument(metavar="[TASK]", help="Only the runs of this task.", show_default=False),
+    ] = None,
+    sort: Annotated[str, typer.Option(metavar="newest|score|steps|minutes", help="Order.")] = "newest",
+    json: Json = None,
+) -> None:
+    """List every run below ./runs. `rlctl runs` alone does the same."""
+    from rlctl.runs.listing import list_runs, show
+
+    show(list_runs(task, sort=sort), json)
+
+
+@app.command("show")
+def show_run(run: Run = None, json: Json = None) -> None:
+    """Show a run: its recipe, curve, evaluations, warnings and files."""
+    from rlctl.runs.show import describe, show
+
+    show(describe(run), json)
+
+
+@app.command("compare")
+def compare_runs(
+    runs: Annotated[
+        list[str],
+        typer.Argument(metavar="A B...", help="Runs, globs or folders of runs; the first is the baseline."),
+    ],
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes that each run plays.", min=2)] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    task: Annotated[
+        str | None,
+        typer.Option(help="Evaluate all on this task.", show_default=False),
+    ] = None,
+    threshold: Annotated[
+        float | None,
+        typer.Option(help="Success rate (or return) to be reached soon; 0.9 where success is known."),
+    ] = None,
+    gate: Annotated[
+        str | None,
+        typer.Option(metavar="not-worse", help="Exit 1 if one is worse than the first.", show_default=False),
+    ] = None,
+    json: Json = None,
+) -> None:
+    """Say whether a policy, or a recipe trained with several seeds, is better than another."""
+    claim_stdout()
+    if gate not in (None, "not-worse"):
+        raise UsageError(f"--gate {gate}: the one gate there is is not-worse")
+    from rlctl.runs.comparison import CompareRequest, compare
+    from rlctl.runs.comparison_report import show
+
+    result = compare(CompareRequest(runs, episodes, seed, task, threshold))
+    show(result, json)
+    if gate:
+        result.check()
+
+
+@app.command("import")
+def import_run(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.zip", help="Model of Stable-Baselines3 or rl-zoo3.")],
+    task: Annotated[str, typer.Option(metavar="TASK", help=f"What it was trained on. {TASK_FORMS}")],
+    vecnormalize: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.pkl", help="Its normalisation, if it has one.", show_default=False),
+    ] = None,
+    algo: Annotated[
+        str | None,
+        typer.Option(help="Its algorithm, where the file does not tell it.", show_default=False),
+    ] = None,
+    settings: Set = [],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="Policy file to write. Default: MODEL.safetensors."),
+    ] = None,
+    json: Json = None,
+) -> None:
+    """Turn a model of Stable-Baselines3 into a policy file. Nothing in the model is unpickled."""
+    claim_stdout()
+    from rlctl.runs.import_model import ImportRequest, import_model, show
+
+    request = ImportRequest(model, task, vecnormalize, algo, output, parse_changes(settings))
+    show(import_model(request), json)
+
+
+@app.command("rm")
+def remove_runs(
+    runs: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="RUN...", help="Folders of runs.", show_default=False),
+    ] = None,
+    keep_best: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Remove all finished or failed runs but the N best of each task.", min=0),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Remove runs, never one that is being trained."""
+    from rlctl.runs.removal import plan_removal, remove_with_report
+
+    remove_with_report(plan_removal(runs or [], keep_best=keep_best), yes=yes)
+
+
+@app.command("prune")
+def prune_runs(yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False) -> None:
+    """Remove the checkpoints of finished runs, which are needed only to train on."""
+    from rlctl.runs.removal import plan_prune, remove_with_report
+
+    remove_with_report(plan_prune(), yes=yes)

@@ -1,0 +1,56 @@
+"""`rlctl tasks` and what comes after it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rlctl import completion
+from rlctl.cli.arguments import TASK_FORMS, Json, claim_stdout
+from rlctl.errors import UsageError
+
+app = typer.Typer()
+
+
+@app.callback(invoke_without_command=True)
+def tasks(
+    context: typer.Context,
+    check: Annotated[bool, typer.Option("--check", help="Import each task, in a process of its own.")] = False,
+    json: Json = None,
+) -> None:
+    """List the installed tasks; show one of them, or begin one of your own."""
+    if context.invoked_subcommand is not None:
+        if check or json is not None:
+            raise UsageError(f"options of `rlctl tasks {context.invoked_subcommand}` come after its name")
+        return
+    from rlctl.tasks.listing import list_tasks, show
+
+    show(list_tasks(check=check), json)
+
+
+@app.command("show")
+def show_task(
+    task: Annotated[
+        str,
+        typer.Argument(metavar="TASK", help=TASK_FORMS, show_default=False, autocompletion=completion.complete_task),
+    ],
+    json: Json = None,
+) -> None:
+    """Show what a task observes, does and rewards, what can be set, and how it is trained."""
+    claim_stdout()
+    from rlctl.tasks.description import describe
+    from rlctl.tasks.show import show
+
+    show(describe(task), json)
+
+
+@app.command("new")
+def new_task(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the task: letters, digits, - and _.")],
+    json: Json = None,
+) -> None:
+    """Write a plugin to begin with, in a folder of its name: a task that learns at once, its recipe and tests."""
+    from rlctl.tasks.new import create, show
+
+    show(create(name), json)

@@ -1,0 +1,82 @@
+"""`rlctl train`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rlctl import completion
+from rlctl.cli.arguments import EnvTimeout, Json, NEnvs, OptionalTask, Set, claim_stdout
+
+
+def train(
+    task: OptionalTask = None,
+    resume: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RUN",
+            help="Go on with a run instead: a folder, a task's name, or latest.",
+            show_default=False,
+            autocompletion=completion.complete_run,
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Go on with a run even if its task has changed.")] = False,
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Recipe that goes over the task's own, or presets/NAME.", show_default=False),
+    ] = None,
+    settings: Set = [],
+    algo: Annotated[
+        str | None,
+        typer.Option(
+            help="ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.",
+            show_default=False,
+            autocompletion=completion.complete_algorithm,
+        ),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of everything random.", show_default=False)] = None,
+    total_timesteps: Annotated[
+        str | None,
+        typer.Option(
+            "--total-timesteps", "-n", metavar="STEPS", help="Environment steps; 1e6 is fine.", show_default=False
+        ),
+    ] = None,
+    n_envs: NEnvs = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, or auto.")] = "cpu",
+    stop_success: Annotated[
+        float | None,
+        typer.Option(
+            metavar="RATE", help="Stop after two evaluations in a row at this success rate.", show_default=False
+        ),
+    ] = None,
+    record: Annotated[int, typer.Option(metavar="N", help="Write the last N evaluation episodes as .rrd.", min=0)] = 0,
+    no_check: Annotated[bool, typer.Option("--no-check", help="Train without checking the environment first.")] = False,
+    env_timeout: EnvTimeout = 60.0,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where run folders go.")] = Path(
+        "runs"
+    ),
+    json: Json = None,
+) -> None:
+    """Train a policy, evaluate as it goes, and keep the best and the last."""
+    claim_stdout()
+    from rlctl.run.recipe import merge_flags
+    from rlctl.train.request import TrainRequest, run_training
+    from rlctl.train.summary import show
+
+    request = TrainRequest(
+        task=task,
+        resume=resume,
+        config=config,
+        settings=merge_flags(
+            settings, algo=algo, seed=seed, total_timesteps=total_timesteps, n_envs=n_envs, stop_success=stop_success
+        ),
+        device=device,
+        record=record,
+        env_timeout_s=env_timeout,
+        root=output,
+        check=not no_check,
+        force=force,
+    )
+    show(run_training(request), json)
