@@ -50,6 +50,11 @@ class RunDirectory:
         return self.path / "evals.csv"
 
     @property
+    def robustness_file(self) -> Path:
+        """What `rlctl eval --vary` or `--push` measured last; see `rlctl.run.robustness`."""
+        return self.path / "robustness.json"
+
+    @property
     def best_policy(self) -> Path:
         """The policy of the best evaluation."""
         return self.path / "policies" / "best.safetensors"

@@ -1,0 +1,143 @@
+"""How robust a policy is: what `rlctl eval --vary` and `--push` measured, kept in its run as `robustness.json`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import pydantic
+
+from rlctl.errors import ArtifactError
+from rlctl.run import files, untrusted
+
+FORMAT = 1
+
+Interval = tuple[float, float]
+
+
+class _Content(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class Outcome(_Content):
+    """What the episodes of one setting came to."""
+
+    success_rate: float | None
+    """In [0, 1]; None where the task reports no success."""
+    success_interval: Interval | None
+    """95 % Wilson score interval of the success rate."""
+    mean_return: float
+    return_interval: Interval | None
+    """95 % interval of the mean, by Student's t; None for a single episode."""
+
+
+class Cell(Outcome):
+    """The episodes of one place in a map."""
+
+    values: list[float]
+    """One per axis."""
+    nominal: bool
+    """Whether every value is that of the world as it was built."""
+
+    @property
+    def score(self) -> tuple[float, float]:
+        """What cells are ordered by: the success rate where there is one, then the mean return."""
+        return (0.0 if self.success_rate is None else self.success_rate), self.mean_return
+
+
+class Axis(_Content):
+    """What is varied."""
+
+    name: str
+    """As the user names it: an event (`mass`), an event's parameter (`push.force`) or the task's (`tolerance`)."""
+    setting: str
+    """As `--set` names it: `events.mass.factor`, `task.tolerance`."""
+    values: list[float]
+    nominal: float | None
+    """The value of the world as it was built; None where it is not one number."""
+
+
+class RobustnessMap(_Content):
+    """One or two things varied together; all else is nominal."""
+
+    axes: list[Axis]
+    cells: list[Cell]
+    """For every combination of the axes' values, that of the last axis changing fastest."""
+
+    def find_worst(self) -> Cell:
+        """Return the cell with the lowest success rate, or mean return where there is none."""
+        return min(self.cells, key=lambda cell: cell.score)
+
+
+class PushLevel(Outcome):
+    """The episodes with pushes of one size."""
+
+    impulse: float
+    """Force times duration [N s]."""
+    held: float
+    """Part of the episodes that went well, in [0, 1], by `PushTest.measure`."""
+
+
+class PushTest(_Content):
+    """From which horizontal push at mid-episode on the policy fails."""
+
+    body: str
+    link: str | None
+    """None: the base of the body."""
+    duration_s: float
+    """How long a push lasts [s]."""
+    mass: float
+    """Of the whole body [kg]."""
+    measure: Literal["success", "upright"]
+    """What counts as going well: `success`, or `upright`, an episode that lasts until its time limit."""
+    levels: list[PushLevel]
+    """By impulse; the first is without a push."""
+    threshold: float | None
+    """Impulse [N s] at which half of the episodes fail; None: cannot tell."""
+    threshold_interval: Interval | None
+    """95 % interval, by resampling episodes."""
+    verdict: str
+    """The result as a sentence."""
+
+
+class Robustness(_Content):
+    """What was measured of one policy."""
+
+    format: int = FORMAT
+    task: str
+    parameters: dict[str, Any]
+    policy_file: str
+    algo: str
+    training_steps: int
+    episodes: int
+    """In every cell, with the same seeds."""
+    seed: int
+    deterministic: bool
+    nominal: Outcome
+    """Without anything varied."""
+    maps: list[RobustnessMap] = []
+    push: PushTest | None = None
+    command: str = ""
+    """How to measure it again."""
+    versions: dict[str, str] = {}
+
+    def find_worst(self) -> tuple[RobustnessMap, Cell] | None:
+        """Return the worst cell of all maps with its map; None where nothing was varied."""
+        worst = [(each, each.find_worst()) for each in self.maps]
+        return min(worst, key=lambda found: found[1].score) if worst else None
+
+
+def write(path: Path, result: Robustness) -> None:
+    """Write a result, whole or not at all."""
+    files.write_json(path, result.model_dump(mode="json"))
+
+
+def read(path: Path) -> Robustness:
+    """Read a result; raises `ArtifactError` if it is missing, damaged, not ours or of another format."""
+    content = files.read_json(path)
+    if isinstance(content, dict) and content.get("format") != FORMAT:
+        raise ArtifactError(f"{path}: robustness format {content.get('format')!r}, this rlctl reads {FORMAT}")
+    try:
+        return Robustness.model_validate(content)
+    except pydantic.ValidationError as error:
+        raise ArtifactError(f"{path}: damaged: {untrusted.explain_error(error)}") from None
