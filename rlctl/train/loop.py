@@ -21,7 +21,7 @@ from rlctl.rollout.collect import Episode
 from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
-from rlctl.train import faults, snapshot, table_rows
+from rlctl.train import faults, measurements, snapshot, table_rows
 from rlctl.train.checkpoint import Checkpoint
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
@@ -209,19 +209,26 @@ class TrainingLoop(BaseCallback):
         self._last_row = (now, steps)
         recent, self.progress.recent = self.progress.recent, []
         terms = list(self.env.workers.info.reward_weights)
+        elapsed = max(now - before, 1e-9)
         row = {
             "steps": steps,
             "seconds": round(now - self._started, 3),
-            "fps": round((steps - steps_before) / max(now - before, 1e-9), 1),
+            "fps": round((steps - steps_before) / elapsed, 1),
+            "playing": round(self.env.waited_s / elapsed, 3),
             **self.curriculum.columns(),
             **table_rows.training_row(recent, terms, self.logger.name_to_value),
+            **measurements.measure(self.model, self.env, self.progress.last_row, self.recipe.total_timesteps),
         }
+        self.env.waited_s = 0.0
         self.saver.row(self.saver.metrics, row)
         for name, number in self.curriculum.columns().items():
             self.logger.record(f"curriculum/{name}", number)
-        for name in terms:
-            if (value := row[f"term/{name}"]) is not None:
-                self.logger.record(f"reward_terms/{name}", value)
+        for column, name in (
+            ("distance", "rollout/final_distance"),
+            *((f"term/{t}", f"reward_terms/{t}") for t in terms),
+        ):
+            if (value := row[column]) is not None:
+                self.logger.record(name, value)
         self.display.metrics(row)
 
     def evaluate(self, *, at_end: bool = False) -> None:

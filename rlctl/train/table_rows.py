@@ -27,6 +27,7 @@ def training_row(recent: Sequence[EpisodeResult], terms: Iterable[str], log: Map
         "return": mean_return(recent) if recent else None,
         "length": _mean_length(recent) if recent else None,
         "success": success_rate(recent) if recent else None,
+        "distance": _mean_distance(recent),
         **{f"term/{name}": means.get(name) for name in terms},
         **{name: log.get(f"train/{name}") for name in _LOSSES},
     }
@@ -39,9 +40,16 @@ def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
         "success": success_rate(results),
         "return": mean_return(results),
         "length": _mean_length(results),
+        "distance": _mean_distance(results),
         **{f"term/{name}": value for name, value in mean_terms(results).items()},
     }
 
 
 def _mean_length(results: Sequence[EpisodeResult]) -> float:
     return float(np.mean([result.length for result in results]))
+
+
+def _mean_distance(results: Sequence[EpisodeResult]) -> float | None:
+    """Return the mean distance to the goal at the end; None where the environment reports none."""
+    distances = [result.final_distance for result in results if result.final_distance is not None]
+    return float(np.mean(distances)) if distances else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -29,6 +30,9 @@ class PlayedSegment:
     final: dict[str, NDArray[Any]]
     """What an episode ended with, in the row of its last step."""
     stored: NDArray[Any]
+    """Actions as the policy chose them."""
+    action: NDArray[Any]
+    """Actions as the environments took them."""
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
@@ -59,6 +63,10 @@ class WorkerVecEnv(VecEnv):
         self.monitor = SpaceMonitor(workers.info.spaces()[0])
         self.ended: list[EpisodeResult] = []
         """Episodes that ended since the last `take_ended`."""
+        self.last_segment: PlayedSegment | None = None
+        """What `finish` returned last; its arrays are overwritten by the next."""
+        self.waited_s = 0.0
+        """Time spent waiting for the environments to play [s], since it was set to 0."""
         self.policy_info: PolicyInfo | None = None
         """Describes the policy that plays, once it does."""
         self._steps, self._until_end = 0, False
@@ -106,11 +114,13 @@ class WorkerVecEnv(VecEnv):
 
     def finish(self, check: Callable[[], None] | None = None) -> PlayedSegment:
         """Wait for what `start` has begun; `check` is called several times a second."""
+        began = time.monotonic()
         try:
             ended = self.workers.finish_playing(check=check)
         except EpisodeFailed as error:
             error.actions = self._failed_actions(error)
             raise
+        self.waited_s += time.monotonic() - began
         segment = self.workers.arrays.segment
         steps = ended[0].row + 1 if self._until_end and ended else self._steps
         for result in ended:
@@ -119,15 +129,17 @@ class WorkerVecEnv(VecEnv):
         self.ended += ended
         seen = {key: rows[:, 1 : steps + 1].reshape(-1, *rows.shape[2:]) for key, rows in segment.observation.items()}
         self.monitor.look(join(seen))
-        return PlayedSegment(
+        self.last_segment = PlayedSegment(
             {key: rows[:, : steps + 1] for key, rows in segment.observation.items()},
             {key: rows[:, :steps] for key, rows in segment.final.items()},
             segment.stored[:, :steps],
+            segment.action[:, :steps],
             segment.reward[:, :steps],
             segment.terminated[:, :steps],
             segment.truncated[:, :steps],
             [_info_at_end(result) for result in ended],
         )
+        return self.last_segment
 
     def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any] | None:
         """Return the actions of a failed episode, that of the failed step last; None if it goes too far back."""

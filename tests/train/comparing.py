@@ -9,7 +9,7 @@ from safetensors.numpy import load_file
 from rlctl.run.directory import RunDirectory
 from rlctl.train import checkpoint
 
-OF_TIME = ("seconds", "fps")
+OF_TIME = ("seconds", "fps", "playing")
 
 
 class Killed(BaseException):

@@ -48,6 +48,12 @@ def test_run_folder_holds_everything(finished):
     metrics = rows(run.metrics_file)
     assert [int(row["steps"]) for row in metrics] == [64, 128, 192, 256]
     assert all(float(row["approx_kl"]) >= 0 for row in metrics)
+    # A new network's actions are of a normal distribution with a standard deviation of about 1, in [-1, 1]: 32 % of
+    # them are beyond the limits.
+    assert float(metrics[0]["exploration"]) == pytest.approx(1.0, rel=0.05)
+    assert float(metrics[0]["action_saturation"]) == pytest.approx(0.32, abs=0.15)
+    assert {row["terminated"] for row in metrics} == {"0.0"}
+    assert all(float(row["gradient_norm"]) <= 0.5 + 1e-6 for row in metrics)
     evals = rows(run.evals_file)
     assert [int(row["steps"]) for row in evals] == [128, 256]
     # |x| stays below 0.4 + 10 * 0.01 = 0.5, so every episode succeeds.

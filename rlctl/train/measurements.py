@@ -1,0 +1,171 @@
+"""What a row of metrics has beside returns and losses: actions, exploration, values, gradients.
+
+All of it is read from what SB3 holds after an update anyway, and depends on steps alone, so a resumed run measures the
+same. Where something does not exist, as limits of discrete actions, it is None.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from rlctl.dict_spaces import split
+from rlctl.run.env_info import EnvInfo
+from rlctl.train.vec_env import WorkerVecEnv
+
+HISTOGRAMS = 20
+"""How many times in a training TensorBoard gets histograms, which cost more than numbers."""
+
+_ROWS = 500
+"""Steps of each environment that are looked at, the last ones."""
+_SAMPLES = 2000
+"""Values in a histogram."""
+_AT_LIMIT = 0.99
+"""From this part of its range on an action counts as saturated."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Play:
+    """The last steps of all environments; arrays of shape (n_envs, steps, ...) but for `values`."""
+
+    observation: Mapping[str, NDArray[Any]]
+    """As the environments gave them."""
+    action: NDArray[Any]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    values: NDArray[Any] | None
+    """What the critic expected of each step, in any order; None where it was not computed."""
+
+
+def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timesteps: int) -> dict[str, float | None]:
+    """Return columns for the environment steps since the last row; log them, and now and then distributions."""
+    steps = model.num_timesteps
+    play = _read_last_steps(model, env, steps - last_row)
+    row = _columns(play, model)
+    for name, value in row.items():
+        if value is not None:
+            model.logger.record(f"rollout/{name}", value)
+    part = max(1, total_timesteps // HISTOGRAMS)
+    if play is not None and steps // part > last_row // part:
+        for name, values in _collect_histograms(play, env.workers.info).items():
+            model.logger.record(name, values)
+    return row
+
+
+def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> Play | None:
+    """Return the environments' last steps, at most `steps` of all together; None before there are any.
+
+    On-policy they are the last segment, else the newest of the replay buffer.
+    """
+    replay: Any = getattr(model, "replay_buffer", None)
+    if replay is not None:
+        return _read_replay_buffer(model, replay, max(1, steps // env.num_envs))
+    segment = env.last_segment
+    if segment is None:
+        return None
+    rollout: Any = model.rollout_buffer  # type: ignore[attr-defined]
+    observation = {key: rows[:, :-1] for key, rows in segment.observation.items()}
+    action = _scale(env.action_space, segment.action)
+    return Play(observation, action, segment.terminated, segment.truncated, rollout.values.ravel())
+
+
+def _read_replay_buffer(model: BaseAlgorithm, buffer: Any, steps: int) -> Play | None:
+    stored = buffer.buffer_size if buffer.full else buffer.pos
+    rows = np.arange(buffer.pos - min(stored, steps, _ROWS), buffer.pos)
+    if not len(rows):
+        return None
+    done, timeout = (np.asarray(values[rows], np.bool_).T for values in (buffer.dones, buffer.timeouts))
+    observation = {key: values[rows].swapaxes(0, 1) for key, values in split(buffer.observations).items()}
+    # SB3 stores continuous actions scaled to [-1, 1].
+    return Play(observation, buffer.actions[rows].swapaxes(0, 1), done & ~timeout, done & timeout, None)
+
+
+def _scale(space: spaces.Space[Any], action: NDArray[Any]) -> NDArray[Any]:
+    """Return actions scaled to [-1, 1] where they have limits, else as they are."""
+    if isinstance(space, spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all():
+        middle, half = (space.high + space.low) / 2, np.maximum((space.high - space.low) / 2, 1e-12)
+        scaled: NDArray[Any] = (action - middle) / half
+        return scaled
+    return action
+
+
+def _columns(play: Play | None, model: BaseAlgorithm) -> dict[str, float | None]:
+    space, log = model.action_space, model.logger.name_to_value
+    limited = isinstance(space, spaces.Box) and bool(np.isfinite(space.low).all() and np.isfinite(space.high).all())
+    actions = None if play is None or not isinstance(space, spaces.Box) else play.action.astype(np.float32)
+    return {
+        "terminated": None if play is None else _terminated_share(play),
+        "action_saturation": None if actions is None or not limited else float((np.abs(actions) > _AT_LIMIT).mean()),
+        "action_change": None if actions is None or play is None else _mean_change(actions, play),
+        "exploration": _exploration(space, log.get("train/entropy_loss")),
+        "value": None if play is None or play.values is None else float(play.values.mean()),
+        "gradient_norm": _gradient_norm(model),
+    }
+
+
+def _terminated_share(play: Play) -> float | None:
+    ended = int((play.terminated | play.truncated).sum())
+    return float(play.terminated.sum()) / ended if ended else None
+
+
+def _mean_change(actions: NDArray[np.float32], play: Play) -> float | None:
+    """Return the mean size of the change from one action to the next of the same episode, in half ranges."""
+    same = ~(play.terminated | play.truncated)[:, :-1]
+    return float(np.abs(np.diff(actions, axis=1))[same].mean()) if same.any() else None
+
+
+def _exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
+    """Return how widely an on-policy algorithm explores: 1 is the half range of an action, or any choice of all.
+
+    For a normal distribution it is the standard deviation that has the logged entropy; gSDE's own log has the one of a
+    matrix instead.
+    """
+    if entropy_loss is None or not math.isfinite(entropy_loss):
+        return None
+    if isinstance(space, spaces.Discrete):
+        return math.exp(-entropy_loss) / int(space.n)
+    if not isinstance(space, spaces.Box) or not np.isfinite(space.low).all() or not np.isfinite(space.high).all():
+        return None
+    half_range = float(np.exp(np.log(np.maximum((space.high - space.low) / 2, 1e-12)).mean()))
+    per_element = -entropy_loss / math.prod(space.shape)
+    return math.exp(min(per_element - 0.5 * math.log(2 * math.pi * math.e), 50.0)) / half_range
+
+
+def _gradient_norm(model: BaseAlgorithm) -> float | None:
+    """Return the norm of the last minibatch's gradient as it was applied: not above `max_grad_norm`, if clipped."""
+    if not hasattr(model, "max_grad_norm"):
+        return None
+    gradients = [each.grad for each in model.policy.parameters() if each.grad is not None]
+    return float(torch.nn.utils.get_total_norm(gradients)) if gradients else None
+
+
+def _collect_histograms(play: Play, info: EnvInfo) -> dict[str, torch.Tensor]:
+    """Return what TensorBoard draws distributions of: actions, values, and observed angles."""
+    found = {"actions": play.action, **_angles(play.observation, info)}
+    if play.values is not None:
+        found["values"] = play.values
+    return {f"histograms/{name}": _sample(values) for name, values in found.items()}
+
+
+def _angles(observation: Mapping[str, NDArray[Any]], info: EnvInfo) -> dict[str, NDArray[Any]]:
+    named = dict(observation)
+    if list(observation) == [""] and info.observation_sizes:  # flat: its parts in their order
+        bounds = np.cumsum([0, *info.observation_sizes.values()])
+        named = {
+            name: observation[""][..., low:high]
+            for name, low, high in zip(info.observation_sizes, bounds, bounds[1:], strict=False)
+        }
+    return {name: named[name] for name, unit in info.observation_units.items() if unit == "rad" and name in named}
+
+
+def _sample(values: NDArray[Any]) -> torch.Tensor:
+    flat = np.asarray(values, np.float32).ravel()
+    return torch.from_numpy(flat[:: max(1, len(flat) // _SAMPLES)].copy())
