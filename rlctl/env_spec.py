@@ -13,7 +13,8 @@ from annotated_types import Ge, Le
 
 from rlctl import named_task
 from rlctl.errors import RecipeError, TaskError, did_you_mean, short_repr
-from rlctl.registry import call_plugin, is_task, load
+from rlctl.plugin_code import call_plugin
+from rlctl.registry import is_task, load
 
 if TYPE_CHECKING:
     import gymnasium

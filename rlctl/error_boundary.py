@@ -9,6 +9,8 @@ import sys
 from rlctl import __version__
 from rlctl.errors import RlctlError, short_repr
 
+EXIT_S = 10.0
+"""How long exit handlers may take [s]."""
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "can't allocate memory", "not enough memory")
 
 
@@ -43,6 +45,20 @@ def close_stdout() -> None:
     os.dup2(nowhere, 1)
     if output.results.cache_info().currsize:
         os.dup2(nowhere, output.results().fileno())
+
+
+def limit_exit_handlers(code: int) -> None:
+    """End the process with `code` after `EXIT_S`, whatever an exit handler of a plugin or a library still does."""
+    import threading
+
+    def leave() -> None:
+        print(f"warning: an exit handler did not end within {EXIT_S:g} s; leaving without it", file=sys.stderr)
+        sys.stderr.flush()
+        os._exit(code)
+
+    timer = threading.Timer(EXIT_S, leave)
+    timer.daemon = True  # Python waits for other threads before it calls the handlers
+    timer.start()
 
 
 def report(error: RlctlError) -> int:

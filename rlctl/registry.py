@@ -8,20 +8,17 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import importlib
 import importlib.metadata
-import importlib.util
 import inspect
 import os
 import re
 import sys
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rlctl import errors
 from rlctl.errors import NoSuchClassError, OldGymError, TaskError, UsageError, did_you_mean
+from rlctl.plugin_code import find_module_file, import_file, import_module
 
 GROUP = "rlctl.tasks"
 OURS = "rlctl"
@@ -44,7 +41,7 @@ class TaskEntry:
     @property
     def module_file(self) -> Path | None:
         """The module's file, found without importing it or its packages."""
-        return _find_module_file(self.target.partition(":")[0])
+        return find_module_file(self.target.partition(":")[0])
 
     @property
     def recipe_file(self) -> Path | None:
@@ -125,8 +122,8 @@ def load(task: str) -> Callable[..., Any]:
         return _load_target(task, entry.target)
     if _GYMNASIUM_ID.match(task):
         package = task.rpartition(":")[0]
-        if package and _find_module_file(package) is not None:
-            _import_module(task, package)  # here, so that what it raises is known as an import's
+        if package and find_module_file(package) is not None:
+            import_module(task, package)  # here, so that what it raises is known as an import's
         return _load_gymnasium(task)
     if ":" in task:
         return _load_target(task, task)
@@ -174,7 +171,7 @@ def find_source_file(task: str) -> Path | None:
     if _GYMNASIUM_ID.match(task) or ":" not in task:
         return None
     place = task.rpartition(":")[0]
-    return Path(place) if place.endswith(".py") else _find_module_file(place)
+    return Path(place) if place.endswith(".py") else find_module_file(place)
 
 
 def _keep_existing(file: Path) -> Path | None:
@@ -198,26 +195,9 @@ def _put_current_folder_on_path() -> None:
         sys.path.insert(0, os.getcwd())
 
 
-def _find_module_file(module: str) -> Path | None:
-    """Find a module's file; unlike `find_spec` on a dotted name this imports no parent package."""
-    head, *rest = module.split(".")
-    try:
-        spec = importlib.util.find_spec(head)
-        for depth, _ in enumerate(rest, start=2):
-            if spec is None:
-                return None
-            name = ".".join(module.split(".")[:depth])
-            path = spec.submodule_search_locations
-            found = (finder.find_spec(name, path) for finder in sys.meta_path if hasattr(finder, "find_spec"))
-            spec = next((each for each in found if each is not None), None)
-    except (ImportError, ValueError):
-        return None
-    return Path(spec.origin) if spec and spec.origin and spec.has_location else None
-
-
 def _load_target(task: str, target: str) -> Callable[..., Any]:
     place, _, attribute = target.rpartition(":")
-    module = _import_file(task, Path(place)) if place.endswith(".py") else _import_module(task, place)
+    module = import_file(task, Path(place)) if place.endswith(".py") else import_module(task, place)
     constructor = module
     for part in attribute.split("."):
         if not hasattr(constructor, part):
@@ -235,54 +215,14 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
     return constructor  # type: ignore[no-any-return]
 
 
-def _import_module(task: str, name: str) -> Any:
-    if _find_module_file(name) is None and name not in sys.modules:
-        raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
-    return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
-
-
-def _import_file(task: str, file: Path) -> Any:
-    file = _find_loaded(file.expanduser())
-    if not file.is_file():
-        raise UsageError(f"task {task!r}: no file {file}")
-    for loaded, known in list(sys.modules.items()):
-        if getattr(known, "__file__", None) == str(file) and loaded != "__main__":
-            return known
-    folder = str(file.parent)
-    if folder not in sys.path:
-        sys.path.append(folder)  # last: a neighbour called torch.py must not be taken for torch
-    name = file.stem
-    while name in sys.modules or name in sys.stdlib_module_names:
-        name = f"rlctl_task_{name}"
-    spec = importlib.util.spec_from_file_location(name, file)
-    if spec is None or spec.loader is None:
-        raise UsageError(f"task {task!r}: {file} is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    loader = spec.loader
-    try:
-        call_plugin(task, lambda: loader.exec_module(module), doing="import failed: ")
-    except BaseException:
-        sys.modules.pop(name, None)
-        raise
-    return module
-
-
-def _find_loaded(file: Path) -> Path:
-    """Return a file's whole path, even if the working directory is not the one any more in which it was loaded."""
-    loaded = (getattr(module, "__file__", None) or "" for module in list(sys.modules.values()))
-    before = None if file.exists() else next((path for path in loaded if Path(path).match(str(file))), None)
-    return Path(before or file).resolve()
-
-
 def _load_gymnasium(task: str) -> Callable[..., Any]:
     import gymnasium
 
     spec = gymnasium.registry.get(task.rpartition(":")[2])
     if spec is not None and isinstance(spec.entry_point, str):
         module = spec.entry_point.partition(":")[0]
-        if _find_module_file(module) is not None:
-            _import_module(task, module)  # as in `load`: an import that fails is no constructor that fails
+        if find_module_file(module) is not None:
+            import_module(task, module)  # as in `load`: an import that fails is no constructor that fails
 
     def constructor(**parameters: Any) -> Any:
         try:
@@ -310,21 +250,3 @@ def _is_in_old_gym(name: str) -> bool:
     old = getattr(sys.modules.get("gym"), "envs", None)
     known = getattr(old, "registry", {})
     return name in getattr(known, "env_specs", known)
-
-
-def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
-    """Run a plugin's code; whatever it raises, `SystemExit` included, becomes a `TaskError`."""
-    try:
-        return call()
-    except (errors.RlctlError, KeyboardInterrupt):
-        raise
-    except BaseException as error:
-        where = ""
-        frames = traceback.extract_tb(error.__traceback__)
-        own = frames and "rlctl" in Path(frames[-1].filename).parts[-2:-1]
-        if frames and not own and not frames[-1].filename.startswith("<frozen"):  # a syntax error names its place
-            where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})"
-        raise TaskError(
-            f"task {task!r}: {doing}{errors.describe_exception(error)}{where}",
-            details=errors.format_plugin_traceback(error) or None,
-        ) from error

@@ -247,3 +247,13 @@ def test_a_bug_shows_its_traceback(rlctl, tmp_path):
     assert result.returncode == 70
     assert "ZeroDivisionError: division by zero" in result.stderr
     assert result.stderr.splitlines()[-1].startswith(f"error: a bug in rlctl {package.__version__} or a library; ")
+
+
+def test_an_exit_handler_that_hangs_does_not_keep_the_process(tmp_path):
+    code = (
+        "import atexit, sys, time; from rlctl import cli, error_boundary; error_boundary.EXIT_S = 0.2\n"
+        "atexit.register(time.sleep, 100); sys.argv[1:] = ['reech']; cli.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.endswith("warning: an exit handler did not end within 0.2 s; leaving without it\n")

@@ -24,6 +24,7 @@ LAYERS = [
     {"dict_spaces"},
     {"named_task"},
     {"registry"},
+    {"plugin_code"},
     {"task"},
     {"output"},
     {"errors", "__init__"},

@@ -206,6 +206,7 @@ def test_make_randomises_when_it_is_asked_to(my_env):
             "import nothing_like_it",
             "import failed: ModuleNotFoundError: No module named 'nothing_like_it' (broken.py:1)",
         ),
+        ("import os; os._exit(7)", "import failed: SystemExit: os._exit(7)"),
         ("x = = 1", "import failed: SyntaxError: invalid syntax (broken.py, line 1)"),
         ("class E:\n    def __init__(self): 1 / 0", "ZeroDivisionError: division by zero (broken.py:2)"),
     ],
@@ -218,6 +219,16 @@ def test_a_plugin_that_raises(write_module, source, message):
         assert str(caught.value) == f"task 'broken.py:E': {message}"
         assert "Traceback" in caught.value.details
         assert caught.value.exit_code == 3
+
+
+def test_an_alarm_in_a_module(rlctl, write_module):  # a process of its own: here, an alarm ends tests that hang
+    write_module("early.py", "import signal, time; signal.setitimer(signal.ITIMER_REAL, 0.01); time.sleep(60)")
+    done = rlctl("tasks", "show", "early.py:E")
+    assert done.returncode == 3
+    assert "import failed: TimeoutError: an alarm that the module sets goes off while it is imported" in done.stderr
+    write_module("late.py", "import signal; signal.alarm(1)\nclass E: pass")
+    done = rlctl("tasks", "show", "late.py:E")
+    assert done.stderr.startswith("warning: task 'late.py:E': its module sets an alarm; cancelled\n")
 
 
 def test_hints_that_cannot_be_read(write_module):

@@ -27,6 +27,7 @@ def describe_built(instance: Instance) -> Built:
         observation_space=_short(getattr(env, "observation_space", None)),
         action_space=_short(env.action_space),
         names=dict(inner.observation_sizes) if is_task(env) else {},
+        events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
         max_steps=inner.max_steps if is_task(env) else getattr(spec, "max_episode_steps", None),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         accepts_seed=instance.accepts_seed,

@@ -35,6 +35,8 @@ class Built:
     action_space: str
     names: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Size per observation name in the order of a flat observation; empty where names are not known."""
+    events: Mapping[str, bool] = dataclasses.field(default_factory=dict)
+    """Per event of a task, whether it acts."""
     max_steps: int | None = None
     """The time limit it declares [steps]."""
     nondeterministic: bool = False

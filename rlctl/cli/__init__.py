@@ -54,7 +54,9 @@ app.add_typer(runs.app, name="runs")
 def main() -> None:
     """Run the command line and end the process with its exit code."""
     error_boundary.prepare_streams()
-    sys.exit(run(sys.argv[1:]))
+    code = run(sys.argv[1:])
+    error_boundary.limit_exit_handlers(code)
+    sys.exit(code)
 
 
 def run(arguments: list[str]) -> int:

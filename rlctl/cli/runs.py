@@ -36,7 +36,8 @@ def list_runs(
     """List every run below ./runs. `rlctl runs` alone does the same."""
     from rlctl.runs.listing import list_runs, show
 
-    show(list_runs(task, sort=sort), json)
+    commands = [command.name for command in app.registered_commands if command.name]
+    show(list_runs(task, sort=sort, commands=commands), json)
 
 
 @app.command("show")

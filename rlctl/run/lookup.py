@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import os
 import re
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -94,13 +95,20 @@ def find_owner(file: Path) -> RunDirectory | None:
 def locate_task(task: str, run: RunDirectory | None) -> str:
     """Return a task with the whole path of its file, if it was named by a path from the folder of the training.
 
-    A run that has been moved to another folder finds the file there, by the path that was typed.
+    A run that has been moved to another folder finds the file there, by the path that was typed. A module that is found
+    nowhere else is imported from the folder of the training.
     """
     place, _, name = task.rpartition(":")
-    if run is None or not place.endswith(".py") or Path(place).expanduser().is_absolute():
+    if run is None or not place or Path(place).expanduser().is_absolute():
         return task
     folder = run.status().get("folder")
-    if not isinstance(folder, str) or not (original := Path(folder) / place).is_file():
+    if not isinstance(folder, str):
+        return task
+    if not place.endswith(".py"):
+        if registry.find_source_file(f"{place}:{name}") is None and Path(folder).is_dir() and folder not in sys.path:
+            sys.path.append(folder)  # handed on to the workers
+        return task
+    if not (original := Path(folder) / place).is_file():
         return task
     here = Path(place)
     moved = not run.path.resolve().is_relative_to(folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,12 @@ SORT_KEYS = {
 _CHANGES_SHOWN = 4
 
 
-def list_runs(task: str | None = None, *, sort: str = "newest", root: Path = ROOT) -> list[RunSummary]:
+def list_runs(
+    task: str | None = None, *, sort: str = "newest", root: Path = ROOT, commands: Iterable[str] = ()
+) -> list[RunSummary]:
     """Return the runs of a task, or all, best or newest first.
 
-    Raises `UsageError` for an unknown order or a task without runs.
+    Raises `UsageError` for an unknown order or a task without runs, which may be one of `commands` misspelt.
     """
     if sort not in SORT_KEYS:
         raise UsageError(f"--sort {sort}: give one of {', '.join(SORT_KEYS)}.{did_you_mean(sort, list(SORT_KEYS))}")
@@ -33,7 +36,8 @@ def list_runs(task: str | None = None, *, sort: str = "newest", root: Path = ROO
         found = [run for run in every if run.task == task or run.path.parent.name == registry.make_slug(task)]
         if not found:
             names = sorted({run.task for run in every})
-            raise UsageError(f"no run of {task!r} under {root.resolve()}.{did_you_mean(task, names)}")
+            close = did_you_mean(task, [*names, *commands])
+            raise UsageError(f"no run of {task!r} under {root.resolve()}, and no such command of rlctl runs.{close}")
     return sorted(found, key=SORT_KEYS[sort], reverse=True)
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rlctl import registry
 from rlctl.check_env.leaves import Leaf, leaves_of
 from rlctl.errors import TaskError
+from rlctl.plugin_code import call_plugin
 from rlctl.run import recipe as recipes
 from rlctl.tasks import parameters
 from rlctl.tasks.definition import Definition, describe_definition
@@ -78,12 +79,12 @@ def describe(task: str) -> Description:
     env = spec.make()
     # Guarded: attributes of an environment are a plugin's code too.
     try:
-        description: Description = registry.call_plugin(task, lambda: _describe(task, constructor, recipe, env))
+        description: Description = call_plugin(task, lambda: _describe(task, constructor, recipe, env))
     except TaskError:
         with contextlib.suppress(TaskError):
-            registry.call_plugin(task, lambda: env.close())
+            call_plugin(task, lambda: env.close())
         raise
-    registry.call_plugin(task, lambda: env.close())
+    call_plugin(task, lambda: env.close())
     return description
 
 

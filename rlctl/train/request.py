@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import re
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,6 +61,9 @@ class TrainResult:
     task: str
     steps: int
     seconds: float
+    """Of training, with what came before a resume."""
+    wall_seconds: float
+    """From the call to the end: with the start of the workers, the check, imports and saving."""
     best_step: int | None
     best_success: float | None
     best_return: float | None
@@ -319,6 +323,7 @@ def _result(
         start.task,
         steps,
         progress.seconds,
+        time.monotonic() - start.began,
         progress.best_step,
         progress.best_success,
         progress.best_return,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,7 @@ class Start:
     """Messages for the user, before the first step."""
     inexact: tuple[str, ...] = ()
     """Why the run cannot go on as if it had never stopped, as far as is known before it goes on."""
+    began: float = dataclasses.field(default_factory=time.monotonic)
 
     @property
     def stage(self) -> int:

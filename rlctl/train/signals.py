@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -14,18 +15,20 @@ if TYPE_CHECKING:
     from rlctl.train.loop import TrainingLoop
 
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SAME_S = 1.0  # equal signals within it are one: `timeout` sends SIGTERM to the process and to its group
 
 
 class StopSignals:
     """Handles SIGINT, SIGTERM and SIGHUP, which a closed terminal sends, as long as it is entered.
 
     Before the training they end the process at once; while it goes on the first ends it at the next boundary and the
-    second at once; when it is done they change nothing any more.
+    second at once, if it is another signal or comes more than a second later; when it is done they change nothing.
     """
 
     def __init__(self) -> None:
         self._loop: TrainingLoop | None = None
         self._done = False
+        self._received_s = 0.0
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
@@ -62,5 +65,8 @@ class StopSignals:
         if self._loop is None:
             raise Interrupted("interrupted before the training began", number)
         if self._loop.stop_signal is not None:
+            if number == self._loop.stop_signal and time.monotonic() - self._received_s < _SAME_S:
+                return
             raise Interrupted("interrupted again: stopped at once, the last checkpoint stands", number)
         self._loop.stop_signal = number
+        self._received_s = time.monotonic()

@@ -17,6 +17,7 @@ def show(result: TrainResult, json: str | None) -> None:
                 "task": result.task,
                 "steps": result.steps,
                 "seconds": round(result.seconds, 3),
+                "wall_seconds": round(result.wall_seconds, 3),
                 "best": {
                     "step": result.best_step,
                     "success_rate": result.best_success,
@@ -34,7 +35,7 @@ def show(result: TrainResult, json: str | None) -> None:
     run = result.run.path
     if result.note:
         out.print(result.note)
-    out.print(f"trained {result.task}: {result.steps:,} steps in {duration(result.seconds)}")
+    out.print(f"trained {result.task}: {result.steps:,} steps in {duration(result.seconds)}{_format_wall(result)}")
     if result.best_return is not None and result.best_step is not None:
         success = "" if result.best_success is None else f"success {percent(result.best_success)}, "
         out.print(
@@ -57,3 +58,10 @@ def show(result: TrainResult, json: str | None) -> None:
         f"tensorboard --logdir {result.run.tensorboard}",
     ):
         out.print(f"  {command}", markup=False)
+
+
+def _format_wall(result: TrainResult) -> str:
+    """Return how long the whole command took, where that is clearly more than the training."""
+    if result.wall_seconds < result.seconds + 3:
+        return ""
+    return f" ({duration(result.wall_seconds)} with start, check and end)"

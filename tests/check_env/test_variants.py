@@ -51,6 +51,13 @@ def test_an_error_of_the_task_layer_is_named_as_one():
     assert finding.message == "step 1 raised TaskError: NotFinite: reward term 'distance' is nan at step 1"
 
 
+def test_stages_of_a_packaged_recipe_are_judged(tmp_path, write_module):
+    task = write_module("swing.py", "from rlctl_manipulation.reach import Reach\nclass Swing(Reach): pass\n")
+    task.with_suffix(".yaml").write_text("stages: [{task: {episode: 1}, promote: {success: 0.5}}, {}]\n")
+    (finding,) = findings(f"{task}:Swing", "RL012")
+    assert finding.message.startswith("stage 1 of 2: task.episode: Swing has no parameter 'episode'.")
+
+
 def test_a_plain_environment_has_neither():
     records = records_of("broken_envs.py:Clean", "variants")
     assert not records.findings

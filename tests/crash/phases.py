@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import signal
 
 import psutil
 
@@ -32,7 +33,7 @@ PHASES = {
 
 
 def send(number, phase, everybody=False, again=False):
-    """Send a signal at the start of a phase, to this process or to all below it too, and once more with `again`.
+    """Send a signal at the start of a phase, to this process or to all below it too; with `again` after another one.
 
     To all is what a service manager does, as the machine or the job of a cluster ends.
     """
@@ -44,10 +45,11 @@ def send(number, phase, everybody=False, again=False):
 
     def called(*arguments, **options):
         if next(counter) == call:
-            for _ in range(2 if again else 1):
+            first = signal.SIGTERM if number == signal.SIGINT else signal.SIGINT  # equal ones within a second are one
+            for sent in [first, number] if again else [number]:
                 for each in psutil.Process().children(recursive=True) if everybody else ():
-                    each.send_signal(number)
-                os.kill(os.getpid(), number)
+                    each.send_signal(sent)
+                os.kill(os.getpid(), sent)
         return original.fget(*arguments) if isinstance(original, property) else original(*arguments, **options)
 
     setattr(owner, name, property(called) if isinstance(original, property) else called)

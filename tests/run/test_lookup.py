@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
+from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import directory, lookup
@@ -184,6 +185,9 @@ def test_a_task_by_path_is_found_from_other_folders(root, make_run, tmp_path, mo
     assert located(tmp_path / "other") == f"{original}:Swing"
     (tmp_path / "other" / "swing.py").write_text("")  # by chance of the same name
     assert located(tmp_path / "other") == f"{original}:Swing"
+    (tmp_path / "project" / "swinging_arms.py").write_text("")
+    assert lookup.locate_task("swinging_arms:Swing", run) == "swinging_arms:Swing"
+    assert registry.find_source_file("swinging_arms:Swing") == tmp_path / "project" / "swinging_arms.py"
     moved = RunDirectory(tmp_path / "other" / "runs" / "Swing" / run.path.name)
     moved.path.parent.mkdir(parents=True)
     run.path.rename(moved.path)

@@ -62,6 +62,8 @@ def test_order_and_selection(write_run):
     assert [run.task for run in list_runs("reach")] == ["reach"]
     with pytest.raises(UsageError, match=r"no run of 'reech'.*Did you mean 'reach'"):
         list_runs("reech")
+    with pytest.raises(UsageError, match=r"no such command of rlctl runs\. Did you mean 'show'"):
+        list_runs("shwo", commands=["list", "show", "compare"])
     with pytest.raises(UsageError, match="--sort stepz: give one of newest, score, steps, minutes"):
         list_runs(sort="stepz")
 

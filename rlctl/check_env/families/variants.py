@@ -20,7 +20,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.env_info import describe as describe_env
-from rlctl.run.recipe import validate
+from rlctl.run.recipe import read, validate
 
 STEPS = 60
 """Of each variant: an event at an interval of a second acts in them."""
@@ -40,10 +40,17 @@ def play_variants(context: Context) -> Iterator[Message]:
         yield from _play_events(context, repeats)
     else:
         yield Skipped("RL011", "the task has no events", applies=False)
-    if task.stages:
-        yield from _play_stages(context, task.stages)
+    if stages := _find_stages(context.spec.task, task):
+        yield from _play_stages(context, stages)
     else:
         yield Skipped("RL012", "the task has no stages", applies=False)
+
+
+def _find_stages(name: str, task: Any) -> Sequence[Any]:
+    """Return the stages that training would use: those of the recipe that comes with the task, or of its class."""
+    file = registry.find_recipe_file(name)
+    stages = read(file).get("stages", task.stages) if file else task.stages
+    return stages if isinstance(stages, list | tuple) else ()  # another type is refused with the recipe
 
 
 def _play_events(context: Context, repeats: bool) -> Iterator[Finding]:

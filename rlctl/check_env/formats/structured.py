@@ -83,6 +83,7 @@ def _environment(report: Report) -> dict[str, Any] | None:
         "observations": [_row(row) for row in observation_rows(report.records)],
         "actions": [_row(row) for row in action_rows(report.records)],
         "max_steps": built.max_steps,
+        "randomized": any(built.events.values()),
         "uses_pybullet": built.uses_pybullet,
         "file": built.file,
         "line": built.line,
