@@ -5,32 +5,25 @@ from pathlib import Path
 
 import numpy as np
 
-from rlctl.task import Box, Event, Sim, Task, TaskError, events, rewards
-from rlctl_locomotion.ground import add_ground
+from rlctl.task import Box, Event, Sim, TaskError, events, rewards
+from rlctl_locomotion.legged import Legged
 
 MODELS = Path(__file__).parent / "models"
 JOINTS = ["left_hip", "left_knee", "right_hip", "right_knee"]
-FEET = ("left_foot", "right_foot")
 RAIL = ["rail_x", "rail_z", "pitch"]
 ANGLE = 0.5  # [rad], of a joint at action 1
 FORCE = [50.0] * 4  # [N m], of a motor
 GAIN = 0.2  # part of the position error that the motors take away in a physics step
 HEIGHT = 0.58  # [m], of the trunk's middle, standing with straight legs
 STANCE = np.array([0.25, 0.0, -0.25, 0.0])  # [rad], one leg before the other: with straight legs nothing could stand
-START_NOISE = 0.05  # [rad]
-FALLEN = 0.2  # [m], of the trunk's middle
-FORWARDS = np.array([1.0, 0.0, 0.0])
-HIGHEST_STEP = 0.1  # [m], a quarter of a leg
 
 
 @dataclass
-class Biped(Task):
+class Biped(Legged):
     """Walk forwards on a rail, in a vertical plane: at least `least_distance` in an episode, without a fall."""
 
     least_distance: float = 5.0  # [m]; 0 asks only to stand
     top_speed: float = 1.0  # [m/s], what is faster earns no more
-    roughness: float = 0.0  # [m], height of the steps in the ground
-    terrain_seed: int = 0
     episode_s: float = 20.0  # [s], 1,000 steps
 
     robot = "biped, four joints"
@@ -75,7 +68,9 @@ class Biped(Task):
     }
 
     rlctl_ignore = {"RL611": "walking metres is what training is for; random actions fall in a second"}
-    ground_width = 2.4  # [m]
+    feet, fallen_height = ("left_foot", "right_foot"), 0.2
+    highest_step = 0.1  # a quarter of a leg
+    ground_width = 2.4
 
     def load_robot(self, sim: Sim) -> None:
         """Load the robot as body `robot`, where the ground is at height 0."""
@@ -93,34 +88,23 @@ class Biped(Task):
                 f"least_distance: {self.least_distance:g} m is out of reach: at top_speed {self.top_speed:g} m/s an "
                 f"episode of {self.episode_s:g} s is {self.top_speed * self.episode_s:g} m long."
             )
-        self.ground = add_ground(
-            sim, roughness=self.roughness, seed=self.terrain_seed, highest_step=HIGHEST_STEP, width=self.ground_width
-        )
+        self.build_ground(sim)
         self.load_robot(sim)
         self.body.set_friction(1.0)  # times the ground's
         self.joints = self.body.find_joints(JOINTS)
 
     def reset(self, rng: np.random.Generator) -> None:
         """Stand still, one leg before the other."""
-        joints = STANCE + rng.uniform(-START_NOISE, START_NOISE, 4)
+        joints = self.draw_pose(rng, STANCE)
         # Both feet above the ground by up to 1 cm: a leg of 0.4 m at angle a, its knee bent by b, is so high.
         reach = [0.2 * np.cos(hip) + 0.2 * np.cos(hip + knee) for hip, knee in joints.reshape(2, 2)]
         self.place(HEIGHT - 0.4 + max(reach) + 0.002, joints)
-        self.last_action = self.action_change = np.zeros(4, np.float32)
-        self.update()
-        self.foot_contacts = np.zeros(2)  # what is known of contacts before a step is of the last episode
-
-    def update(self) -> None:
-        """Read what rewards and observations share, once per step."""
-        self.trunk = self.body.mass_state("trunk")
-        self.velocity = np.array(self.trunk.velocity)
-        touching = self.body.links_touching(self.ground)
-        self.foot_contacts = np.array([float(foot in touching) for foot in FEET])
+        self.begin(4)
 
     def act(self, action: np.ndarray) -> None:
         """Set the joints' target angles."""
         self.body.drive_to(ANGLE * action.astype(np.float64), max_force=FORCE, gain=GAIN, joints=JOINTS)
-        self.action_change, self.last_action = action - self.last_action, action
+        self.note_action(action)
 
     def observe(self) -> dict[str, np.ndarray]:
         """Return the state of joints and trunk, in the plane, and which feet touch the ground."""
@@ -145,7 +129,7 @@ class Biped(Task):
     def rewards(self, action: np.ndarray) -> dict[str, float]:
         """Return how fast and how well it walks; `fall` is 1 in the step that ends an episode."""
         fallen = self.is_fallen()
-        speed = min(rewards.forward_velocity(self.velocity, FORWARDS), self.top_speed)
+        speed = min(self.trunk.velocity[0], self.top_speed)
         return {
             "progress": speed,
             "forward_while_alive": 0.0 if fallen else speed,
@@ -155,15 +139,6 @@ class Biped(Task):
             "energy": rewards.power(self.body.joint_torques[self.joints], self.body.joint_velocities[self.joints]),
             "smoothness": rewards.squared(self.action_change),
         }
-
-    def is_terminated(self) -> bool:
-        """The trunk is below 0.2 m."""
-        self.update()
-        return self.is_fallen()
-
-    def is_fallen(self) -> bool:
-        """Say whether the trunk is down."""
-        return rewards.fallen(self.trunk.position[2], FALLEN) > 0
 
     def is_success(self) -> bool:
         """It has walked far enough, or was only asked to stand, and is up."""
@@ -176,7 +151,7 @@ class Biped3D(Biped):
 
     robot = "biped, four joints, free"
     reward_weights = {**Biped.reward_weights, "alive": 0.2, "heading": -0.2}
-    ground_width = 12.0  # [m]
+    ground_width = 12.0
 
     def load_robot(self, sim: Sim) -> None:
         """Load the free robot."""
@@ -193,7 +168,7 @@ class Biped3D(Biped):
         return {
             **self.observe_legs(),
             "attitude": np.array(self.trunk.roll_pitch_yaw),  # [rad], roll, pitch and yaw
-            "velocity": self.velocity,
+            "velocity": np.array(self.trunk.velocity),
             "angular_velocity": np.array(self.trunk.angular_velocity),
         }
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.task import Box, Event, Sim, Task, TaskError, events, rewards
-from rlctl_locomotion.ground import add_ground
+from rlctl.task import Box, Event, Sim, TaskError, events, rewards
+from rlctl_locomotion.legged import Legged
 
 LEGS = ("FR", "FL", "RR", "RL")  # front right and so on, as in the model
 JOINTS = [f"{leg}_{joint}_joint" for leg in LEGS for joint in ("hip", "upper", "lower")]
@@ -14,21 +14,16 @@ STANCE = np.array([0.0, 0.9, -1.8] * 4)  # [rad]; the model's zero pose is outsi
 ANGLES = np.array([0.2, 0.4, 0.4] * 4)  # [rad], from the stance, at action 1
 GAIN = 0.2  # part of the position error that the motors take away in a physics step
 HEIGHT = 0.27  # [m], of the trunk in the stance
-START_NOISE = 0.05  # [rad]
 UPRIGHT = 0.2  # [m]; the trunk is above it while the robot counts as alive
-FALLEN = 0.15  # [m]
 SPEED_SCALE = 0.25  # [m/s]; so far from the command, tracking is worth 1/e
-HIGHEST_STEP = 0.08  # [m], a third of the trunk's height
 
 
 @dataclass
-class Quadruped(Task):
+class Quadruped(Legged):
     """Walk forwards at a commanded speed, drawn in every episode, and stay up."""
 
     slowest: float = 0.3  # [m/s], of the commanded speeds
     fastest: float = 0.7  # [m/s]
-    roughness: float = 0.0  # [m], height of the steps in the ground
-    terrain_seed: int = 0
     episode_s: float = 10.0  # [s], 500 steps
 
     robot = "Unitree A1"
@@ -71,15 +66,15 @@ class Quadruped(Task):
         "action_delay": Event("action", events.delay, steps=(0, 1)),
         "push": Event("interval", events.push, every_s=3.0, body="robot", force=(0.0, 40.0), duration_s=(0.1, 0.2)),
     }
+    feet, fallen_height = FEET, 0.15
+    highest_step = 0.08  # a third of the trunk's height
     rlctl_ignore = {"RL611": "walking at a speed is what training is for; random actions stay where they are"}
 
     def build(self, sim: Sim) -> None:
         """Load the ground and the robot."""
         if not 0 <= self.slowest <= self.fastest:
             raise TaskError(f"slowest {self.slowest:g}, fastest {self.fastest:g} m/s: give 0 <= slowest <= fastest")
-        self.ground = add_ground(
-            sim, roughness=self.roughness, seed=self.terrain_seed, highest_step=HIGHEST_STEP, width=12.0
-        )
+        self.build_ground(sim)
         self.body = sim.load("robot", "a1/a1.urdf", position=(0.0, 0.0, HEIGHT))
         self.body.set_friction(1.0)  # times the ground's
         self.joints = self.body.find_joints(JOINTS)  # of all, in the model's order
@@ -88,24 +83,16 @@ class Quadruped(Task):
     def reset(self, rng: np.random.Generator) -> None:
         """Stand still, and be told a speed."""
         self.body.set_base((0.0, 0.0, HEIGHT + 0.01))  # 1 cm above the ground, so that no foot starts in it
-        self.body.set_joints(STANCE + rng.uniform(-START_NOISE, START_NOISE, 12))
+        self.body.set_joints(self.draw_pose(rng, STANCE))
         self.command = rng.uniform(self.slowest, self.fastest)
-        self.last_action = self.action_change = np.zeros(12, np.float32)
         self.steps = 0
-        self.update()
-        self.foot_contacts = np.zeros(4)  # what is known of contacts before a step is of the last episode
-
-    def update(self) -> None:
-        """Read what rewards and observations share, once per step."""
-        self.trunk = self.body.mass_state("trunk")
-        touching = self.body.links_touching(self.ground)
-        self.foot_contacts = np.array([float(foot in touching) for foot in FEET])
+        self.begin(12)
 
     def act(self, action: np.ndarray) -> None:
         """Set the joints' target angles."""
         target = np.minimum(np.maximum(STANCE + ANGLES * action, self.low), self.high)
         self.body.drive_to(target, gain=GAIN)
-        self.action_change, self.last_action = action - self.last_action, action
+        self.note_action(action)
         self.steps += 1
 
     def observe(self) -> dict[str, np.ndarray]:
@@ -136,15 +123,6 @@ class Quadruped(Task):
             "heading": yaw**2,
             "smoothness": rewards.squared(self.action_change),
         }
-
-    def is_terminated(self) -> bool:
-        """The trunk is below 0.15 m."""
-        self.update()
-        return self.is_fallen()
-
-    def is_fallen(self) -> bool:
-        """Say whether the trunk is down."""
-        return rewards.fallen(self.trunk.position[2], FALLEN) > 0
 
     def is_success(self) -> bool:
         """It has walked at 70 % to 130 % of the commanded speed, on average, and is up."""

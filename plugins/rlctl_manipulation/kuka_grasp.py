@@ -36,6 +36,7 @@ NEAR_TRAY = 0.08  # [m], height of the gripper
 GRASP_GAP = 0.005  # [m], between gripper and tray, at which the descent ends
 TOP = 0.5  # [m], where the lift of the hand ends
 BLOCK_REST = -0.175  # [m], height of the block's middle in the tray
+ALIGNED = 0.02  # [m]; so far from the block's middle, alignment is worth 1/e
 LIFTED = 0.1  # [m], above its rest
 HOLD_S = 0.5  # [s]
 
@@ -58,10 +59,11 @@ class KukaGrasp(Task):
     observation_units = {"gripper": "m", "gripper_attitude": "rad", "block_in_gripper": "m", "block_yaw": "rad"}
     # The original's, at the end of an episode: reward_weights {original: 1} and 0 for the others.
     reward_weights = {
-        "distance": -1.0,
-        "misaligned": -0.2,
+        "distance": -5.0,
+        "misaligned": -0.5,
+        "aligned": 0.5,
         "grasp": 0.5,
-        "lift": 2.0,
+        "lift": 1.0,
         "held": 1.0,
         "action": -0.01,
         "smoothness": -0.05,  # without it the hand trembled, ten times a second
@@ -139,7 +141,7 @@ class KukaGrasp(Task):
     def update(self) -> None:
         """Read what rewards and observations share, once per step."""
         self.gripper = self.arm.link_position(GRIPPER)
-        self.gripper_attitude = np.array(self.arm.mass_state(GRIPPER).roll_pitch_yaw)
+        self.gripper_attitude = angles_from_down(self.arm.link_orientation(GRIPPER))
         block = self.block.mass_state(self.block.base_name)
         # The gripper points down: its x axis is turned by yaw, its y axis is mirrored.
         yaw = self.gripper_yaw()
@@ -171,11 +173,13 @@ class KukaGrasp(Task):
         """Return how well the gripper is placed, and what became of the block."""
         self.update()
         grasped = self.is_grasped()
+        distance, misaligned = float(np.hypot(*self.block_in_gripper)), math.cos(self.block_yaw) ** 2
         height = self.block_height - BLOCK_REST
         self.held_steps = self.held_steps + 1 if grasped and height > LIFTED else 0
         return {
-            "distance": float(np.hypot(*self.block_in_gripper)),
-            "misaligned": math.cos(self.block_yaw) ** 2,  # 0 where the fingers close on the block's narrow side
+            "distance": distance,
+            "misaligned": misaligned,  # 0 where the fingers close on the block's narrow side
+            "aligned": rewards.closeness(distance, ALIGNED) * (1 - misaligned),
             "grasp": float(grasped),
             "lift": min(max(height, 0.0), LIFTED) / LIFTED if grasped else 0.0,
             "held": float(self.is_success()),
@@ -197,6 +201,23 @@ class KukaGrasp(Task):
     def is_success(self) -> bool:
         """The block has been held above the tray for half a second."""
         return self.held_steps * self.control_dt >= HOLD_S
+
+
+def angles_from_down(orientation: np.ndarray) -> np.ndarray:
+    """Return by what roll, pitch and yaw [rad], shape (3,), a quaternion is turned from DOWN, in world axes.
+
+    The Euler angles of the orientation itself, which KukaBulletEnv observes, are of no use: of a hand that points down
+    the roll is pi or -pi at random, and so is the yaw that it starts with.
+    """
+    x, y, z, w = orientation.tolist()
+    x, y, z, w = z, -w, -x, y  # times the inverse of DOWN
+    return np.array(
+        [
+            math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0)),
+            math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        ]
+    )
 
 
 def wrap(angle: float) -> float:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.task import Box, Event, Sim, Task, events, rewards
+from rlctl.task import Box, Event, Sim, Task, TaskError, events, rewards
 
 HOME = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])  # [rad], elbow bent
 SPEED_LIMIT = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
@@ -14,6 +14,7 @@ JOINT_STEP = 1.5 * MAX_SPEED * 4 / 240  # [rad], further than a control step get
 GAIN = 0.25  # part of the position error that the motors take away in a physics step
 HOME_NOISE = 0.1  # [rad]
 HAND = "lbr_iiwa_link_7"
+SHOULDER, ARM_LENGTH = np.array([0.0, 0.0, 0.36]), 0.88  # [m]; stretched, it is 0.9 m from the shoulder to the hand
 
 
 @dataclass
@@ -21,6 +22,9 @@ class Reach(Task):
     """Bring the hand within `tolerance` of the goal and keep it there until the episode ends."""
 
     tolerance: float = 0.05  # [m]
+    goal_low: tuple[float, float, float] = GOAL_LOW  # [m], of the box that goals are drawn from
+    goal_high: tuple[float, float, float] = GOAL_HIGH  # [m]
+    start_noise: float = HOME_NOISE  # [rad], to each side of the home position
 
     robot = "KUKA LBR iiwa"
     control_dt, substeps, episode_s = 4 / 240, 4, 2.0  # [s], -, [s]
@@ -46,6 +50,7 @@ class Reach(Task):
 
     def build(self, sim: Sim) -> None:
         """Load the floor and the arm."""
+        check_goals(np.array(self.goal_low), np.array(self.goal_high))
         sim.load("plane", "plane.urdf", fixed=True)
         self.arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
         self.arm.cap_joint_speed(SPEED_LIMIT.max())  # a blow on the floor would turn joints faster than any motor
@@ -53,8 +58,8 @@ class Reach(Task):
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start near the home position, with a goal in a box."""
-        self.arm.set_joints(HOME + rng.uniform(-HOME_NOISE, HOME_NOISE, 7))
-        self.goal = rng.uniform(GOAL_LOW, GOAL_HIGH)
+        self.arm.set_joints(HOME + rng.uniform(-self.start_noise, self.start_noise, 7))
+        self.goal = rng.uniform(self.goal_low, self.goal_high)
         self.last_action = self.action_change = np.zeros(7, np.float32)
 
     def act(self, action: np.ndarray) -> None:
@@ -94,3 +99,15 @@ class Reach(Task):
     def markers(self) -> dict[str, np.ndarray]:
         """The goal."""
         return {"goal": self.goal}
+
+
+def check_goals(low: np.ndarray, high: np.ndarray) -> None:
+    """Raise `TaskError` for a box of goals from `low` to `high` [m] that is empty, under the floor or out of reach."""
+    if not (low <= high).all() or low[2] < 0:
+        raise TaskError(f"goal_low {low.tolist()}, goal_high {high.tolist()}: give low <= high, above the floor")
+    furthest = float(np.linalg.norm(np.maximum(abs(low - SHOULDER), abs(high - SHOULDER))))
+    if furthest > ARM_LENGTH:
+        raise TaskError(
+            f"goal_low, goal_high: a corner of the box is {furthest:.2f} m from the shoulder, and the arm gets to "
+            f"{ARM_LENGTH:g} m. Use a smaller box."
+        )

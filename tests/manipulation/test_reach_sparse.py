@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from rlctl.errors import TaskError
 from rlctl.run import recipe
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
+from rlctl_manipulation.reach import HOME
 from rlctl_manipulation.reach_sparse import ReachSparse
 
 
@@ -83,3 +85,33 @@ def test_train_eval_export_replay(rlctl, tmp_path):
     assert len(json.loads(done.stdout)["episodes"]) == 2
     assert rlctl("export", str(run), "--onnx").returncode == 0
     assert rlctl("replay", str(run), "--episodes", "1").returncode == 0
+
+
+def test_goals_are_drawn_from_the_box():
+    env = TaskEnv(ReachSparse(goal_low=(0.5, -0.1, 0.3), goal_high=(0.5, 0.1, 0.4), start_noise=0.0))
+    goals = np.array([env.reset(seed=seed)[0]["desired_goal"] for seed in range(40)])
+    assert (goals[:, 0] == 0.5).all()
+    assert -0.1 <= goals[:, 1].min() < -0.08
+    assert 0.39 < goals[:, 2].max() <= 0.4
+    assert (env.task.arm.joint_positions == HOME).all()
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (
+            {"goal_high": (0.9, 0.3, 0.6)},
+            "goal_low, goal_high: a corner of the box is 0.98 m from the shoulder, and the arm gets to 0.88 m. "
+            "Use a smaller box.",
+        ),
+        (
+            {"goal_low": (0.45, 0.4, 0.2)},
+            "goal_low [0.45, 0.4, 0.2], goal_high [0.7, 0.3, 0.6]: give low <= high, above the floor",
+        ),
+    ],
+)
+def test_goals_that_cannot_be(parameters, message):
+    with pytest.raises(TaskError) as caught:
+        TaskEnv(ReachSparse(**parameters))
+    assert str(caught.value) == message
