@@ -213,7 +213,7 @@ def test_colours_are_for_terminals_and_can_be_refused(install, tmp_path, variabl
 def read(descriptor: int) -> bytes:
     try:
         return os.read(descriptor, 4096)
-    except OSError:  # how Linux tells that the other end of a terminal has closed
+    except OSError:  # how Linux reports that the other end of a terminal has closed
         return b""
 
 

@@ -1,4 +1,4 @@
-"""Nothing is unpickled: not of good files, not of hostile ones. Python itself tells, by its audit events."""
+"""Nothing is unpickled: not of good files, not of hostile ones. Python's audit events show it."""
 
 import json
 import pickle

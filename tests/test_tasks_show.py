@@ -228,5 +228,5 @@ def test_a_link_with_an_impossible_inertia_is_named(write_module, rlctl):
     write_module("heavy.py", source)
     done = rlctl("tasks", "show", "heavy:Everything")
     assert done.returncode == 0, done.stderr
-    told = done.stdout.partition("model files")[2].split("\n\n")[0]
-    assert "block.urdf, link 'block_2_base_link': a moment of 1 kg m^2 is more than 0.02 kg within 0.1 m" in told
+    notes = done.stdout.partition("model files")[2].split("\n\n")[0]
+    assert "block.urdf, link 'block_2_base_link': a moment of 1 kg m^2 is more than 0.02 kg within 0.1 m" in notes

@@ -1,4 +1,4 @@
-"""Quadruped: Unitree's A1 trots at a speed that it is told."""
+"""Quadruped: Unitree's A1 trots at a commanded speed."""
 
 from dataclasses import dataclass
 
@@ -81,7 +81,7 @@ class Quadruped(Legged):
         self.low, self.high = self.body.joint_low[self.joints], self.body.joint_high[self.joints]
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Stand still, and be told a speed."""
+        """Stand still, and get a commanded speed."""
         self.body.set_base((0.0, 0.0, HEIGHT + 0.01))  # 1 cm above the ground, so that no foot starts in it
         self.body.set_joints(self.draw_pose(rng, STANCE))
         self.command = rng.uniform(self.slowest, self.fastest)

@@ -1,4 +1,4 @@
-"""Reach, told only whether the goal is reached: for hindsight experience replay."""
+"""Reach with a reward that says only whether the goal is reached: for hindsight experience replay."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -93,7 +93,7 @@ def import_run(
     ] = None,
     algo: Annotated[
         str | None,
-        typer.Option(help="Its algorithm, where the file does not tell it.", show_default=False),
+        typer.Option(help="Its algorithm, where the file does not say it.", show_default=False),
     ] = None,
     settings: Set = [],
     output: Annotated[

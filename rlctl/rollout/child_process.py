@@ -57,7 +57,7 @@ class ChildProcess:
     ) -> None:
         """`main` is "package.module:function"; `arguments` are what JSON can hold."""
         ours, theirs = socket.socketpair()
-        # A pipe that nobody writes to: its end tells the child that this process is gone.
+        # A pipe that nobody writes to: its end shows the child that this process is gone.
         lifeline, self._lifeline = os.pipe()
         job = {
             "main": main,

@@ -30,7 +30,7 @@ def preserve_process_state() -> Iterator[None]:
 
 
 def _restore_torch() -> None:
-    """Undo what torch was told, where a module has imported it: number type, device, gradients, determinism."""
+    """Reset torch's defaults, where a module has imported it: number type, device, gradients, determinism."""
     torch = sys.modules.get("torch")
     if torch is None:
         return

@@ -80,8 +80,8 @@ def short_run() -> Path:
 def evaluate(seed: int, tolerance: float) -> float:
     """Return the success rate of the best policy of a training, over 100 episodes it has not seen."""
     run = str(train(seed).folder)
-    told = rlctl_command("eval", run, "--set", f"task.tolerance={tolerance}", "--seed", str(1000 + seed), "--json", "-")
-    result: dict[str, Any] = json.loads(told)
+    text = rlctl_command("eval", run, "--set", f"task.tolerance={tolerance}", "--seed", str(1000 + seed), "--json", "-")
+    result: dict[str, Any] = json.loads(text)
     return float(result["success_rate"])
 
 

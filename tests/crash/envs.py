@@ -28,5 +28,5 @@ class Stuck(Line):
             if how == "busy":
                 while True:
                     pass
-            re.match("(a+)+$", "a" * 100 + "b")  # holds Python's lock for longer than anybody lives
+            re.match("(a+)+$", "a" * 100 + "b")  # holds Python's lock for ever, in practice
         return super().step(action)

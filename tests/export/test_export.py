@@ -68,7 +68,7 @@ def test_export_of_known_tasks(algo, task, train, write):
 
 def test_more_rollouts_where_episodes_are_short(small, train, write):
     report = export(write(train("ppo", small(), steps=0), "ppo", small()))
-    # 20 episodes of 20 steps are not enough; so many more are lived that 1,000 observations are reached.
+    # 20 episodes of 20 steps are not enough; so many more are played that 1,000 observations are reached.
     assert 1000 <= report.agreement.observations <= 1200
 
 

@@ -48,7 +48,7 @@ def test_episodes_of_other_environments_are_the_same_again(name, tmp_path):
 
 
 def test_training_episodes_are_the_same_again(run):
-    # Lived by a worker among other episodes, verified alone and in a fresh world.
+    # Played by a worker among other episodes, verified alone and in a fresh world.
     files = sorted(run.run.episodes.glob("*.npz"))
     assert files
     for path in files:

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("no_child_left")
 
 
 def run_into_the_fault(workers):
-    """Environment 2 lives the faulty seed."""
+    """Environment 2 plays the faulty seed."""
     workers.reset({env: env + 5 for env in range(4)})
     workers.arrays.action[:] = 0.0
     for _ in range(4):

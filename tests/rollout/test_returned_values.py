@@ -17,7 +17,7 @@ ENVS = faulty_envs.__file__
 
 
 def failure(env, **parameters):
-    """Return what a worker tells of the episode of seed 7."""
+    """Return what a worker reports of the episode of seed 7."""
     worker = Worker(Job(anonymous_file(), -1, 0, 1, 1), EnvSpec(f"{ENVS}:{env}", parameters))
     worker.attach(messages.Attach(1))
     worker.arrays.next_seed[:] = -1
@@ -33,7 +33,7 @@ def live(worker):
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "message"),
     [
         ("nan reward", "reward is nan"),
         ("inf reward", "reward is inf"),
@@ -59,9 +59,9 @@ def live(worker):
         ("text success", "info['is_success'] is 'yes', not a number"),
     ],
 )
-def test_what_is_returned(fault, told):
+def test_what_is_returned(fault, message):
     assert failure("Faulty", fault=fault) == {
-        "message": f"ValueError: {told}",
+        "message": f"ValueError: {message}",
         "kind": None,
         "traceback": None,
         "env": 0,
@@ -71,7 +71,7 @@ def test_what_is_returned(fault, told):
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "message"),
     [
         ("raise", "RuntimeError: the gripper fell off"),
         ("unprintable", "Unprintable: (message unavailable: ZeroDivisionError)"),
@@ -85,9 +85,9 @@ def test_what_is_returned(fault, told):
     ],
 )
 @pytest.mark.parametrize("at_reset", [False, True])
-def test_what_is_raised(fault, told, at_reset):
+def test_what_is_raised(fault, message, at_reset):
     found = failure("Faulty", fault=fault, at_reset=at_reset)
-    assert found["message"] == told
+    assert found["message"] == message
     assert found["step"] == (0 if at_reset else 7)
     assert found["traceback"].splitlines()[1].startswith(f'  File "{ENVS}"')
     assert "worker_process.py" not in found["traceback"]
@@ -113,26 +113,26 @@ def test_functions_that_call_each_other_for_ever():
     assert lines[40].endswith(" lines left out ...")
 
 
-def told_of(content: bytes, receive=None):
-    told = []
+def forward_lines(content: bytes, receive=None):
+    lines = []
     read_end, write_end = os.pipe()
-    thread = threading.Thread(target=forward, args=(read_end, receive or told.append))
+    thread = threading.Thread(target=forward, args=(read_end, receive or lines.append))
     thread.start()
     with os.fdopen(write_end, "wb") as pipe:
         pipe.write(content)
     thread.join(timeout=20)
     assert not thread.is_alive()
-    return told
+    return lines
 
 
 def test_what_is_printed_comes_line_by_line():
-    assert told_of(b"one\ntwo\n\ntwo\ntwo\nthree") == ["one", "two", "", "two", "three"]
+    assert forward_lines(b"one\ntwo\n\ntwo\ntwo\nthree") == ["one", "two", "", "two", "three"]
 
 
 def test_a_warning_of_pybullet_comes_once_and_whole():
     warning = b"b3Warning[examples/Importers/URDF.cpp,126]:\nNo inertial data for link 'hand'\n"
     other = b"b3Warning[examples/Importers/URDF.cpp,126]:\nNo inertial data for link 'wrist'\n"
-    assert told_of((warning + other) * 64 + b"done\n") == [
+    assert forward_lines((warning + other) * 64 + b"done\n") == [
         "b3Warning[examples/Importers/URDF.cpp,126]: No inertial data for link 'hand'",
         "b3Warning[examples/Importers/URDF.cpp,126]: No inertial data for link 'wrist'",
         "done",
@@ -140,23 +140,25 @@ def test_a_warning_of_pybullet_comes_once_and_whole():
 
 
 def test_what_would_upset_a_terminal():
-    assert told_of(b"\x1b[2J\x07\x00 caf\xc3\xa9 \xff\tend\r\n") == ["\ufffd[2J\ufffd\ufffd caf\u00e9 \ufffd\tend"]
+    assert forward_lines(b"\x1b[2J\x07\x00 caf\xc3\xa9 \xff\tend\r\n") == [
+        "\ufffd[2J\ufffd\ufffd caf\u00e9 \ufffd\tend"
+    ]
     assert replace_control_characters("\u202eabc") == "\ufffdabc"
 
 
 def test_a_flood_is_counted():
-    told = told_of(b"".join(b"%d\n" % number for number in range(200_000)) + b"z" * 10 * MAX_LINE_BYTES)
-    assert told[:2] == ["0", "1"]
-    assert max(map(len, told)) <= MAX_LINE_BYTES
-    left_out = [int(line.split()[0].strip("(").replace(",", "")) for line in told if "left out" in line]
+    lines = forward_lines(b"".join(b"%d\n" % number for number in range(200_000)) + b"z" * 10 * MAX_LINE_BYTES)
+    assert lines[:2] == ["0", "1"]
+    assert max(map(len, lines)) <= MAX_LINE_BYTES
+    left_out = [int(line.split()[0].strip("(").replace(",", "")) for line in lines if "left out" in line]
     # The last line comes in ten parts, all alike: one of them counts.
-    assert sum(left_out) + len(told) - len(left_out) == 200_001
-    assert len(told) < 200_000 / 100
-    assert len(told) > MAX_LINES_PER_S
+    assert sum(left_out) + len(lines) - len(left_out) == 200_001
+    assert len(lines) < 200_000 / 100
+    assert len(lines) > MAX_LINES_PER_S
 
 
 def test_nobody_to_tell():
     def closed(_):
         raise BrokenPipeError
 
-    told_of(b"one line\nand another\n" * 50_000, closed)
+    forward_lines(b"one line\nand another\n" * 50_000, closed)

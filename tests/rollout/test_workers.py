@@ -46,7 +46,7 @@ def test_results_do_not_depend_on_the_number_of_workers(spec, start):
 
 
 def test_reach_does_not_depend_on_the_number_of_environments(start):
-    """Environment 0 lives the same beside one and beside four others."""
+    """Environment 0 plays the same beside one and beside four others."""
     rows = []
     for n_envs in (2, 5):
         workers = start(EnvSpec("reach"), n_envs, n_workers=2)

@@ -49,7 +49,7 @@ class Arm(Task):
 
 
 class Read:
-    """Values of a world as PyBullet tells them."""
+    """Values of a world as PyBullet reports them."""
 
     def __init__(self, env):
         self.client, self.task = env.sim.client, env.task
@@ -71,7 +71,7 @@ class Read:
 
     @property
     def damping(self):
-        pybullet.syncBodyInfo(physicsClientId=self.client)  # else it tells what was loaded
+        pybullet.syncBodyInfo(physicsClientId=self.client)  # else it reports what was loaded
         return [pybullet.getJointInfo(self.task.arm.id, i, physicsClientId=self.client)[6] for i in range(7)]
 
     @property
@@ -161,7 +161,7 @@ def test_weak_motors_give_a_part_of_their_torque(make):
         states = pybullet.getJointStates(env.task.arm.id, range(7), physicsClientId=env.sim.client)
         return np.abs([state[3] for state in states])
 
-    # 4 N m are too little to move the first three joints so far, so these give all they have. PyBullet tells the
+    # 4 N m are too little to move the first three joints so far, so these give all they have. PyBullet reports the
     # motor's impulse of a substep over the time of the step, with 4 substeps: 1 and 0.5 N m.
     np.testing.assert_allclose(torque()[:3], 1.0)
     np.testing.assert_allclose(torque(motors={"factor": 0.5})[:3], 0.5)

@@ -120,7 +120,7 @@ def test_resume_goes_on_with_weights_optimiser_normalisation_and_counters(train,
     counters = after.state.model["counters"]
     assert counters["num_timesteps"] == after.state.step == 320
     assert counters["_n_updates"] == 2 * 5  # epochs x rollouts
-    # 64 more: the episodes that were running are lived on, without a reset that would count.
+    # 64 more: the episodes that were running go on, without a reset that would count.
     assert float(after.tensors["normalize//count"]) == pytest.approx(count + 64, abs=0.01)
     adam_steps = {float(value) for key, value in after.tensors.items() if key.endswith("/step")}
     assert adam_steps == {2.0 * 2 * 5}  # minibatches x epochs x rollouts
