@@ -1,7 +1,11 @@
 """A run that was killed and resumed is the run that was never stopped, bit for bit."""
 
+import contextlib
+import os
+
 import pytest
 
+from rlctl.rollout.workers import available_cores
 from rlctl.run import recipe as recipes
 from rlctl.train import saving
 from rlctl.train.vec_env import WorkerVecEnv
@@ -111,6 +115,37 @@ def test_killed_and_resumed(train, resume, kill_after, case):
         with pytest.raises(Killed):
             resume(run)
         undo()
+    resume(run)
+    assert_same_run(whole, run)
+
+
+@pytest.fixture
+def one_core():
+    """Let this process and those that it starts use one core only, as long as the result is entered."""
+
+    @contextlib.contextmanager
+    def limit():
+        before = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {min(before)})
+        try:
+            assert available_cores() == 1
+            yield
+        finally:
+            os.sched_setaffinity(0, before)
+
+    return limit
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores can be chosen on Linux only")
+@pytest.mark.usefixtures("every_boundary")
+def test_on_one_core_and_resumed_on_all(train, resume, kill_after, one_core):
+    env, given = CASES["ppo"]
+    whole = train(env, given).run
+    undo = kill_after(37)
+    with one_core(), pytest.raises(Killed):
+        train(env, given)
+    undo()
+    run = newest_other_than(whole)
     resume(run)
     assert_same_run(whole, run)
 
