@@ -10,6 +10,8 @@ from rlctl import output
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import find_run
 from rlctl.run.memory import format_bytes
+from rlctl.runs.diagnosis import Finding, diagnose
+from rlctl.runs.diagnosis import show as diagnosis
 from rlctl.runs.listing import as_json
 from rlctl.runs.summary import RunSummary, evaluations, read_table, summarize
 
@@ -28,6 +30,8 @@ class RunDescription:
     metrics: Rows
     evaluations: Rows
     warnings: list[str]
+    findings: list[Finding]
+    """What its records show."""
     sizes: dict[str, int]
     """Bytes per file or folder of the run."""
 
@@ -40,6 +44,7 @@ def describe(text: str | None) -> RunDescription:
         metrics=read_table(run.metrics_file),
         evaluations=evaluations(run),
         warnings=_warnings(run),
+        findings=diagnose(run),
         sizes={entry.name: _bytes(entry) for entry in sorted(run.path.iterdir()) if not entry.name.startswith(".")},
     )
 
@@ -67,7 +72,8 @@ def show(run: RunDescription, json: str | None) -> None:
     """Print the description, or write it as JSON."""
     if json is not None:
         content = {**as_json(run.summary), "evaluations": run.evaluations, "metrics": run.metrics}
-        output.write_result_json(json, {**content, "warnings": run.warnings, "bytes": run.sizes})
+        found = {"warnings": run.warnings, "findings": diagnosis.as_json(run.findings)}
+        output.write_result_json(json, {**content, **found, "bytes": run.sizes})
         return
     out, summary = output.out(), run.summary
     out.print(f"[bold]{summary.name}[/bold]: {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}")
@@ -83,6 +89,8 @@ def show(run: RunDescription, json: str | None) -> None:
         if curve := plot(run, name):
             out.print(curve, markup=False)
     _show_evaluations(run.evaluations)
+    for finding in run.findings:
+        out.print("\n".join(diagnosis.format_finding(finding)), markup=False)
     files = "  ".join(f"{name} {format_bytes(size)}" for name, size in run.sizes.items())
     out.print(f"files: {files}  in {summary.path}", markup=False)
 

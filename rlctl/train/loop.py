@@ -27,6 +27,7 @@ from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
 from rlctl.train.episodes import EpisodeKeeper
 from rlctl.train.evaluation import Evaluator
+from rlctl.train.findings import FindingReporter
 from rlctl.train.pack import pack
 from rlctl.train.progress import Progress
 from rlctl.train.saving import Packed, Saver
@@ -80,6 +81,7 @@ class TrainingLoop(BaseCallback):
         self.stop_signal: int | None = None
         self.episodes = EpisodeKeeper(run, learner.curriculum.goal_spec, learner.curriculum.goal)
         self._evaluator = evaluator
+        self._findings = FindingReporter(run, display.message)
         self._resumed = resumed
         self._stop_announced = False
         self._started = time.monotonic() - self.progress.seconds
@@ -247,6 +249,8 @@ class TrainingLoop(BaseCallback):
         except (TaskError, UsageError, ArtifactError) as error:  # the last two where files were removed meanwhile
             self._evaluation_failed(error)
         self.progress.last_eval = steps
+        if not at_end:
+            self._findings.report_new()
         while self.progress.next_eval <= steps:
             self.progress.next_eval += self.recipe.eval.every_steps or self.recipe.total_timesteps
         # The rate of training is without the time of evaluations.

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from rlctl import output
+from rlctl.runs.diagnosis import diagnose
+from rlctl.runs.diagnosis.show import as_json, format_end
 from rlctl.train.display import duration, percent
 from rlctl.train.request import TrainResult
 
 
 def show(result: TrainResult, json: str | None) -> None:
-    """Print the result and what to type next, or write it as JSON."""
+    """Print the result, what the training's records show, and what to type next; or write it as JSON."""
+    findings = diagnose(result.run)
     if json is not None:
         output.write_result_json(
             json,
@@ -26,6 +29,7 @@ def show(result: TrainResult, json: str | None) -> None:
                     "policy": str(result.run.best_policy),
                 },
                 **({"stage": result.stage, "stages": result.stages} if result.stages else {}),
+                "findings": as_json(findings),
                 "recordings": [str(path) for path in result.recordings],
                 "note": result.note,
             },
@@ -45,6 +49,8 @@ def show(result: TrainResult, json: str | None) -> None:
     if result.stages:
         short = "" if result.stage == result.stages else "; evaluated in the last, which it did not reach"
         out.print(f"ended in stage {result.stage} of {result.stages}{short}")
+    for line in format_end(findings, str(run)):
+        out.print(line, markup=False)
     for path in result.recordings:
         out.print(f"recording: rerun {path}")
     if result.recordings:

@@ -1,0 +1,127 @@
+"""Signs in the recorded episodes of the last evaluations, in which the policy acts as it does in use."""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.dict_spaces import split
+from rlctl.run.episode import RecordedEpisode
+from rlctl.runs.diagnosis.history import History
+
+Array = NDArray[np.float64]
+
+_LEAST_STEPS = 20
+_MOST_SPEED = {"m/s": 50.0, "rad/s": 300.0}
+"""No joint or body of a robot is faster: 300 rad/s are 2,900 turns a minute."""
+_MOST_POSITION_SPEED = 50.0  # [m/s]
+
+
+def _actions(run: History) -> list[Array]:
+    """Return the actions of each episode, shape (T, elements), in half ranges; none where they have no limits."""
+    if run.env is None:
+        return []
+    space = run.env.spaces()[1]
+    if not isinstance(space, spaces.Box) or not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        return []
+    middle, half = (space.high + space.low) / 2, np.maximum((space.high - space.low) / 2, 1e-12)
+    long = [each.actions for each in run.episodes if len(each.rewards) >= _LEAST_STEPS]
+    return [((actions - middle) / half).reshape(len(actions), -1).astype(np.float64) for actions in long]
+
+
+def shakes(run: History) -> str | None:
+    """Actions jump to and fro from step to step by a large part of their range."""
+    found = []
+    for actions in _actions(run):
+        change = np.diff(actions, axis=0)
+        found.append((float((change[1:] * change[:-1] < 0).mean()), float(np.abs(change).mean())))
+    if not found or run.progress < 0.5:
+        return None
+    reversals, size = np.median(found, axis=0)
+    if reversals < 0.6 or size < 0.4:
+        return None
+    return f"actions reverse in {reversals:.0%} of the steps, by {size:.2g} half ranges on average"
+
+
+def stands_still(run: History) -> str | None:
+    """The policy does next to nothing."""
+    sizes = [float(np.abs(actions).mean()) for actions in _actions(run)]
+    if not sizes or run.progress < 0.5 or (largest := max(sizes)) > 0.05:
+        return None
+    return f"actions are {largest:.1%} of their half range on average"
+
+
+def paid_for_being(run: History) -> str | None:
+    """Most of the positive reward is paid alike in every step, whatever is done."""
+    weights = run.env.reward_weights if run.env is not None else {}
+    shares = [share for each in run.episodes if (share := _constant_share(each, weights)) is not None]
+    if not shares or (share := float(np.median(shares))) < 0.7:
+        return None
+    return f"{share:.0%} of the positive reward is the same in every step"
+
+
+def _constant_share(episode: RecordedEpisode, weights: dict[str, float]) -> float | None:
+    if len(episode.rewards) < _LEAST_STEPS or not episode.info.term_names:
+        return None
+    weighted = episode.terms * np.array([weights.get(name, 1.0) for name in episode.info.term_names])
+    inner = weighted[:-1]  # what the last step pays is for the end
+    positive = np.maximum(inner, 0).sum(axis=0)
+    constant = inner.std(axis=0) <= 0.05 * np.abs(inner.mean(axis=0))
+    total = float(positive.sum())
+    return float(positive[constant].sum()) / total if total > 0 else None
+
+
+def impossible_motion(run: History) -> str | None:
+    """Speeds, or jumps of positions, that no robot has."""
+    if run.env is None:
+        return None
+    found = []
+    for episode in run.episodes:
+        for name, rows in _named_observations(episode, run).items():
+            found += _fast(name, run.env.observation_units.get(name, ""), rows, run.env.control_dt)
+    return max(found)[1] if found else None
+
+
+def _fast(name: str, unit: str, rows: Array, control_dt: float | None) -> list[tuple[float, str]]:
+    """Return how many times too fast an observation is, in words too; nothing where it is so in less than two steps."""
+    speeds, limit = np.abs(rows).max(axis=1), _MOST_SPEED.get(unit)
+    if unit == "m" and control_dt and len(rows) > 1:
+        speeds, limit = np.abs(np.diff(rows, axis=0)).max(axis=1) / control_dt, _MOST_POSITION_SPEED
+    if limit is None or (speeds > limit).sum() < 2:
+        return []
+    kind = "m/s" if unit == "m" else unit
+    return [(float(speeds.max() / limit), f"{name} moves at up to {speeds.max():,.0f} {kind} in a recorded episode")]
+
+
+def badly_scaled_observations(run: History) -> str | None:
+    """Observations that are not normalised differ a thousand times in size."""
+    settings = run.recipe.get("normalize")
+    if (isinstance(settings, dict) and settings.get("observation", True)) or not run.episodes:
+        return None
+    deviations: dict[str, float] = {}
+    for episode in run.episodes[:1]:
+        for name, rows in _named_observations(episode, run).items():
+            for index, value in enumerate(rows.std(axis=0)):
+                if value > 1e-9:
+                    deviations[f"{name}[{index}]"] = float(value)
+    if len(deviations) < 2:
+        return None
+    small, large = (choose(deviations, key=lambda name: deviations[name]) for choose in (min, max))
+    if deviations[large] < 1000 * deviations[small]:
+        return None
+    return (
+        f"not normalised: {large} varies by {deviations[large]:.2g} and {small} by {deviations[small]:.2g} "
+        "(standard deviations)"
+    )
+
+
+def _named_observations(episode: RecordedEpisode, run: History) -> dict[str, Array]:
+    """Return observations by name, each of shape (T + 1, elements)."""
+    parts = {key: np.asarray(rows, np.float64) for key, rows in split(episode.observations).items() if rows.ndim <= 2}
+    rows = {key: each.reshape(len(each), -1) for key, each in parts.items()}
+    sizes = run.env.observation_sizes if run.env is not None else {}
+    if list(rows) != [""] or sum(sizes.values()) != rows[""].shape[1]:
+        return {key or "observation": each for key, each in rows.items()}
+    bounds = np.cumsum([0, *sizes.values()])
+    return {name: rows[""][:, low:high] for name, low, high in zip(sizes, bounds, bounds[1:], strict=False)}

@@ -1,0 +1,127 @@
+"""What signs mean together: which signs make a finding, and its texts, are data in `findings.yaml`."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import inspect
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rlctl.run.directory import RunDirectory
+from rlctl.runs.diagnosis import episode_signs, signs
+from rlctl.runs.diagnosis.history import History
+
+_NOT = "not "
+
+
+class Grade(enum.StrEnum):
+    """How bad a finding is."""
+
+    WARNING = "warning"
+    """The training is very likely wrong."""
+    INFO = "info"
+    """Worth knowing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """A parameter to try another value of."""
+
+    name: str
+    value: Any
+    """What the recipe has, or SB3's default."""
+    advice: str
+    """Its usual range and value, and what raising and lowering it does."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """Something that a training's records show."""
+
+    id: str
+    """Q1 to Q13."""
+    name: str
+    grade: Grade
+    evidence: list[str]
+    """What was seen, in numbers."""
+    meaning: str
+    advice: list[str]
+    settings: list[Setting]
+
+    @property
+    def line(self) -> str:
+        """The finding in a line."""
+        return f"{self.grade}: {self.id} {self.name}: {'; '.join(self.evidence)}"
+
+
+@functools.cache
+def _texts() -> dict[str, Any]:
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where PyYAML has it
+    text = Path(__file__).with_name("findings.yaml").read_text(encoding="utf-8")
+    content: dict[str, Any] = yaml.load(text, loader)  # noqa: S506
+    return content
+
+
+def list_signs() -> dict[str, signs.Sign]:
+    """Return the function of every sign that `findings.yaml` may name."""
+    return {
+        name: function
+        for module in (signs, episode_signs)
+        for name, function in inspect.getmembers(module, inspect.isfunction)
+        if function.__module__ == module.__name__ and not name.startswith("_")
+    }
+
+
+def find_signs(run: RunDirectory) -> dict[str, str]:
+    """Return the evidence of every sign that a run has, whether it makes a finding or not."""
+    history = History(run)
+    found = {name: function(history) for name, function in list_signs().items()}
+    return {name: evidence for name, evidence in found.items() if evidence is not None}
+
+
+def diagnose(run: RunDirectory) -> list[Finding]:
+    """Return what a run's records show, warnings first; never raises for what is in the folder."""
+    history = History(run)
+    functions = list_signs()
+
+    @functools.cache
+    def look(name: str) -> str | None:
+        return functions[name](history)
+
+    found = [finding for text in _texts()["findings"] if (finding := _check(text, look, history)) is not None]
+    return sorted(found, key=lambda each: list(Grade).index(each.grade))
+
+
+def _check(text: dict[str, Any], look: Callable[[str], str | None], history: History) -> Finding | None:
+    holding = [signs for signs in text["when"] if all(_holds(name, look) for name in signs)]
+    if not holding:
+        return None
+    names = dict.fromkeys(name for signs in holding for name in signs if not name.startswith(_NOT))
+    return Finding(
+        id=text["id"],
+        name=text["name"],
+        grade=Grade(text["grade"]),
+        evidence=[evidence for name in names if (evidence := look(name)) is not None],
+        meaning=text["meaning"],
+        advice=list(text["try"]),
+        settings=list(_settings(text["settings"], history)),
+    )
+
+
+def _holds(name: str, look: Callable[[str], str | None]) -> bool:
+    return look(name.removeprefix(_NOT)) is None if name.startswith(_NOT) else look(name) is not None
+
+
+def _settings(names: Iterable[str], history: History) -> Iterable[Setting]:
+    for name in names:
+        row = _texts()["settings"][name]
+        value = history.setting(name)
+        if value is None and row["common"] != "none":
+            continue  # this algorithm has no such parameter
+        advice = f"usually {row['range']}, often {row['common']}; raise: {row['raise']}; lower: {row['lower']}"
+        yield Setting(name, value, advice)

@@ -1,0 +1,151 @@
+"""What a run folder holds of a training, as curves."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import RlctlError
+from rlctl.run import recipe as recipes
+from rlctl.run.directory import RunDirectory
+from rlctl.run.env_info import EnvInfo
+from rlctl.run.episode import RecordedEpisode, load_episode
+from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS
+from rlctl.run.policy import read_policy
+from rlctl.runs.summary import read_table
+
+Array = NDArray[np.float64]
+Rows = list[dict[str, float | None]]
+
+EPISODES = 4
+"""Recorded episodes that are looked at: of the last two evaluations, as each keeps its first and its worst."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """A quantity over training steps; both of shape (points,), without gaps."""
+
+    steps: Array
+    values: Array
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def thirds(self) -> tuple[float, float]:
+        """Return the means of the first and of the last third of the points."""
+        size = max(1, len(self) // 3)
+        return float(self.values[:size].mean()), float(self.values[-size:].mean())
+
+    def noise(self) -> float:
+        """Return the standard deviation from point to point, a slow change left out; for a normal distribution."""
+        if len(self) < 3:
+            return 0.0
+        return float(np.median(np.abs(np.diff(self.values))) / 0.954)
+
+    def rise(self) -> float:
+        """Return by how many standard errors the last third is above the first."""
+        first, last = self.thirds()
+        error = self.noise() * float(np.sqrt(2 / max(1, len(self) // 3)))
+        if error == 0.0:
+            return 0.0 if first == last else float(np.copysign(np.inf, last - first))
+        return float((last - first) / error)
+
+
+class History:
+    """Reads a run when it is asked; what is missing or damaged is empty."""
+
+    def __init__(self, run: RunDirectory) -> None:
+        self._run = run
+
+    @functools.cached_property
+    def status(self) -> Mapping[str, Any]:
+        try:
+            return self._run.status()
+        except (RlctlError, OSError):
+            return {}
+
+    @functools.cached_property
+    def recipe(self) -> Mapping[str, Any]:
+        try:
+            return recipes.read(self._run.recipe_file)
+        except (RlctlError, OSError):
+            return {}
+
+    @functools.cached_property
+    def metrics(self) -> Rows:
+        return read_table(self._run.metrics_file)
+
+    @functools.cached_property
+    def evaluations(self) -> Rows:
+        return read_table(self._run.evals_file)
+
+    def curve(self, name: str) -> Curve:
+        """Return a column of `metrics.csv`."""
+        return _curve(self.metrics, name)
+
+    def evaluation_curve(self, name: str) -> Curve:
+        """Return a column of `evals.csv`."""
+        return _curve(self.evaluations, name)
+
+    @functools.cached_property
+    def progress(self) -> float:
+        """How much of the planned training is done, in [0, 1]; 1 for one that ended as planned."""
+        if self.status.get("status") == "finished":
+            return 1.0
+        total, steps = self.recipe.get("total_timesteps"), self.curve("steps").values
+        return min(1.0, float(steps[-1]) / total) if isinstance(total, int | float) and total and len(steps) else 0.0
+
+    def terms(self) -> dict[str, Curve]:
+        """Return the weighted reward terms, mean sums per episode."""
+        names = [name for name in (self.metrics[0] if self.metrics else {}) if name.startswith("term/")]
+        return {name.removeprefix("term/"): self.curve(name) for name in names}
+
+    def setting(self, name: str) -> Any:
+        """Return a parameter of the algorithm as the recipe has it, or SB3's default; None if it has no such one."""
+        given = self.recipe.get("algo_kwargs") or {}
+        if name in given:
+            return given[name]
+        fields = getattr(ALGORITHM_PARAMETERS.get(self.recipe.get("algo", "")), "model_fields", {})
+        return fields[name].default if name in fields else None
+
+    @functools.cached_property
+    def env(self) -> EnvInfo | None:
+        """What the policy was trained in."""
+        for file in (self._run.last_policy, self._run.best_policy):
+            try:
+                return read_policy(file)[0].env
+            except (RlctlError, OSError):
+                continue
+        return None
+
+    @functools.cached_property
+    def episodes(self) -> list[RecordedEpisode]:
+        """The newest recorded episodes of evaluations, at most `EPISODES`."""
+        found: list[RecordedEpisode] = []
+        files = [file for file in self._run.episodes.glob("*.npz") if file.stem.isdecimal()]
+        for file in sorted(files, reverse=True)[:EPISODES]:
+            if (episode := _load(file)) is not None and len(episode.rewards):
+                found.append(episode)
+        return found
+
+
+def _load(file: Path) -> RecordedEpisode | None:
+    try:
+        return load_episode(file)
+    except (RlctlError, OSError):
+        return None
+
+
+def _curve(rows: Rows, name: str) -> Curve:
+    points = [
+        (steps, value)
+        for row in rows
+        if (steps := row.get("steps")) is not None and (value := row.get(name)) is not None and np.isfinite(value)
+    ]
+    return Curve(*np.array(points, np.float64).reshape(-1, 2).T)

@@ -1,0 +1,232 @@
+"""Each finding in a training made sick for it, as tables and episodes of a run folder; and none in healthy ones."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import yaml
+from gymnasium import spaces
+
+from rlctl.env_spec import EnvSpec
+from rlctl.run.directory import RunDirectory
+from rlctl.run.env_info import EnvInfo, space_to_json
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
+from rlctl.run.policy import PolicyInfo, save_policy
+from rlctl.runs.diagnosis import Grade, diagnose
+from rlctl.runs.diagnosis.findings import list_signs
+from rlctl.runs.diagnosis.show import format_end
+
+UPDATES = 30
+STEPS = 1000 * np.arange(1, UPDATES + 1)
+RISING = np.linspace(-50, 50, UPDATES)
+ENV = EnvInfo(
+    observation_space=space_to_json(spaces.Box(-np.inf, np.inf, (3,), np.float32)),
+    action_space=space_to_json(spaces.Box(-1.0, 1.0, (2,), np.float32)),
+    observation_sizes={"position": 2, "turning": 1},
+    observation_units={"position": "m", "turning": "rad/s"},
+    control_dt=0.05,
+    reward_weights={"alive": 1.0, "progress": 1.0},
+    max_steps=200,
+)
+# Of a perfect run of reach, a little simplified: large steps of the policy alone mean nothing.
+HEALTHY = {
+    "return": RISING,
+    "length": 200,
+    "success": np.linspace(0, 1, UPDATES),
+    "approx_kl": 0.05,
+    "clip_fraction": 0.35,
+    "explained_variance": 0.4,
+    "exploration": np.linspace(0.6, 0.4, UPDATES),
+    "action_saturation": 0.13,
+    "terminated": 0.0,
+    "gradient_norm": 0.5,
+    "playing": 0.75,
+    "fps": 3000,
+}
+FLAT = {"return": -50 + np.tile([0.5, -0.5, 1.0], 10), "success": 0.0}
+
+
+@pytest.fixture
+def write_training(tmp_path):
+    """Write a run folder with the given columns of metrics and evaluations, of a healthy run where not given."""
+
+    def write(metrics=(), evaluations=(), recipe=(), episodes=(), env=ENV, **status):
+        columns = {"steps": STEPS, **HEALTHY, **dict(metrics)}
+        every = slice(5, None, 6)
+        evaluated = {name: columns[name] for name in ("return", "length", "success") if columns[name] is not None}
+        evaluated = {name: np.broadcast_to(values, UPDATES)[every] for name, values in evaluated.items()}
+        run = RunDirectory(tmp_path / "run")
+        run.path.mkdir()
+        _write_table(run.metrics_file, columns)
+        _write_table(run.evals_file, {"steps": STEPS[every], **evaluated, **dict(evaluations)})
+        run.recipe_file.write_text(
+            yaml.safe_dump(
+                {"algo": "ppo", "algo_kwargs": {"learning_rate": 0.009}, "total_timesteps": 30_000, **dict(recipe)}
+            )
+        )
+        run.status_file.write_text(json.dumps({"status": "finished", "task": "reach", **status}))
+        save_policy(run.last_policy, PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec("reach")), {})
+        for number, episode in enumerate(episodes):
+            save_episode(run.episode_file(number), episode)
+        return run
+
+    return write
+
+
+def _write_table(path, columns):
+    columns = {name: values for name, values in columns.items() if values is not None}
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(zip(*np.broadcast_arrays(*columns.values()), strict=True))
+
+
+def make_episode(actions, observations=None, terms=None):
+    steps = len(actions)
+    terms = np.column_stack([np.ones(steps), np.sin(np.arange(steps))]) if terms is None else terms
+    observations = np.zeros((steps + 1, 3), np.float32) if observations is None else observations
+    names = ["alive", "progress"]
+    info = EpisodeInfo(spec=EnvSpec("reach"), seed=1, total_reward=float(terms.sum()), term_names=names)
+    return RecordedEpisode(info, actions.astype(np.float32), observations, terms.sum(axis=1), terms)
+
+
+SMOOTH = np.column_stack([np.sin(np.arange(100) / 20), np.cos(np.arange(100) / 20)])
+SHAKING = np.tile([[0.8, -0.8], [-0.8, 0.8]], (50, 1))
+
+
+def ids(run, grade=None):
+    return [each.id for each in diagnose(run) if grade in (None, each.grade)]
+
+
+def test_healthy_training_has_no_finding(write_training):
+    assert diagnose(write_training(episodes=[make_episode(SMOOTH)])) == []
+
+
+def test_training_that_is_still_flat_at_a_third_has_no_finding(write_training):
+    run = write_training({**FLAT, "explained_variance": 0.0}, recipe={"total_timesteps": 90_000}, status="running")
+    assert diagnose(run) == []
+
+
+def test_noisy_return_with_rising_evaluations_has_no_finding(write_training):
+    # As of the quadruped: exploration makes it fall, the policy itself walks ever farther.
+    noisy = np.tile([30.0, -60.0, 0.0], 10)
+    assert diagnose(write_training({"return": noisy}, {"return": [130, 132, 140, 150, 176]})) == []
+
+
+@pytest.mark.parametrize(
+    ("id", "metrics", "more"),
+    [
+        ("Q1", {**FLAT, "length": np.tile([12, 11, 13], 10), "terminated": 1.0}, {}),
+        ("Q1", FLAT, {"episodes": [make_episode(0.001 * SMOOTH)]}),
+        ("Q1", {**FLAT, "approx_kl": 1e-6, "clip_fraction": 0.0}, {}),
+        ("Q2", {"success": 0.0, "distance": np.linspace(0.2, 0.9, UPDATES)}, {}),
+        ("Q2", {"success": 0.0}, {"episodes": [make_episode(SHAKING, terms=np.eye(100, 2))]}),
+        ("Q3", {"return": np.tile([0.0, 90.0, 10.0], 10), "approx_kl": 0.6, "clip_fraction": 0.7}, {}),
+        ("Q3", {}, {"status": "diverged", "error": "training diverged: loss is not finite at step 900."}),
+        ("Q5", {}, {"status": "failed", "error": "task 'arm': Cannot load URDF file arm.urdf"}),
+        ("Q7", {}, {"episodes": [make_episode(SHAKING, terms=np.tile([1.0, 0.0], (100, 1)))]}),
+        ("Q9", {**FLAT, "explained_variance": 0.01}, {}),
+        ("Q9", {"terminated": 1.0, "explained_variance": 0.01}, {}),
+        (
+            "Q10",
+            {
+                "success": 0.0,
+                "terminated": 1.0,
+                "length": np.linspace(150, 30, UPDATES),
+                "term/alive": 5.0,
+                "term/energy": RISING - 90,
+            },
+            {},
+        ),
+        ("Q11", {"return": np.concatenate([RISING[:15], np.full(15, -45.0)]), "success": None}, {}),
+        ("Q12", {**FLAT, "exploration": np.geomspace(0.6, 1e-4, UPDATES)}, {}),
+        ("Q12", {**FLAT, "action_saturation": np.linspace(0.3, 0.97, UPDATES)}, {}),
+        ("Q12", {**FLAT, "exploration": np.linspace(0.6, 30.0, UPDATES)}, {}),
+    ],
+)
+def test_sick_training_is_found(write_training, id, metrics, more):
+    run = write_training(metrics, **more)
+    assert ids(run, Grade.WARNING) == [id]
+    (finding,) = (each for each in diagnose(run) if each.id == id)
+    assert finding.evidence
+    assert finding.advice
+
+
+@pytest.mark.parametrize(
+    ("id", "metrics", "more"),
+    [
+        ("Q4", {"playing": 0.97, "fps": 40}, {}),
+        ("Q6", {}, {"observations_outside": 7}),
+        ("Q13", {"playing": 0.1}, {}),
+        ("Q11", {}, {"evaluations": {"return": [0, 90, 50, 40, 55]}}),
+    ],
+)
+def test_what_is_worth_knowing_is_information(write_training, id, metrics, more):
+    run = write_training(metrics, **more)
+    assert ids(run) == [id]
+    assert ids(run, Grade.WARNING) == []
+
+
+def test_motion_that_no_robot_makes_is_found(write_training):
+    flight = np.zeros((101, 3), np.float32)
+    flight[:, 0] = 10.0 * np.arange(101)  # 10 m in 0.05 s are 200 m/s
+    (finding,) = diagnose(write_training(episodes=[make_episode(SMOOTH, flight)]))
+    assert finding.id == "Q8"
+    assert finding.evidence == ["position moves at up to 200 m/s in a recorded episode"]
+
+
+def test_badly_scaled_observations_are_found_in_a_flat_training(write_training):
+    observations = np.column_stack([1e6 * np.sin(np.arange(101)), np.cos(np.arange(101)), np.zeros(101)])
+    env = ENV.model_copy(update={"observation_units": {}})
+    recipe = {"normalize": None}
+    run = write_training(FLAT, recipe=recipe, env=env, episodes=[make_episode(SMOOTH, observations.astype(np.float32))])
+    assert ids(run) == ["Q9"]
+
+
+def test_show_has_findings_with_advice(write_training, rlctl):
+    run = write_training({**FLAT, "explained_variance": 0.01})
+    shown = rlctl("runs", "show", run.path)
+    assert "warning: Q9 observations do not suffice: training return" in shown.stdout
+    assert "try: Observe what the reward is made of" in shown.stdout
+    assert "gamma is 0.99: usually 0.9 to 0.9999" in shown.stdout
+    (finding,) = json.loads(rlctl("runs", "show", run.path, "--json", "-").stdout)["findings"]
+    assert finding["id"] == "Q9"
+    assert finding["grade"] == "warning"
+
+
+def test_training_ends_with_warnings_in_full_and_the_rest_in_a_line(write_training):
+    findings = diagnose(write_training({**FLAT, "explained_variance": 0.01, "playing": 0.1}))
+    lines = format_end(findings, "runs/x")
+    assert lines[0].startswith("warning: Q9 ")
+    assert lines[-1] == "noted: Q13 slow updates; more: rlctl runs show runs/x"
+    assert format_end([], "runs/x") == []
+
+
+def test_advice_has_the_recipes_value_beside_the_usual_ones(write_training):
+    run = write_training({**FLAT, "approx_kl": 0.6, "clip_fraction": 0.7})
+    (finding,) = (each for each in diagnose(run) if each.id == "Q3")
+    settings = {each.name: each for each in finding.settings}
+    assert settings["learning_rate"].value == 0.009
+    assert "1e-5 to 1e-3" in settings["learning_rate"].advice
+    assert settings["clip_range"].value == 0.2  # SB3's default
+
+
+def test_every_sign_of_a_finding_exists():
+    from rlctl.runs.diagnosis.findings import _texts
+
+    named = {name.removeprefix("not ") for each in _texts()["findings"] for when in each["when"] for name in when}
+    assert named <= set(list_signs())
+    assert {each["id"] for each in _texts()["findings"]} == {f"Q{number}" for number in range(1, 14)}
+
+
+def test_damaged_run_is_not_an_error(write_training):
+    run = write_training()
+    run.metrics_file.write_text("steps,return\n1,\n2,nan\nx,1\n3")
+    run.recipe_file.write_text("{")
+    run.last_policy.write_bytes(b"nothing")
+    (run.path / "episodes").mkdir()
+    run.episode_file(0).write_bytes(b"nothing")
+    assert diagnose(run) == []
+    run.status_file.unlink()
+    assert diagnose(run) == []
