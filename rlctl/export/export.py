@@ -1,65 +1,81 @@
-"""`rlctl export`: a policy file becomes an ONNX file, which is kept only if it acts the same."""
+"""`rlctl export`: a policy file becomes an ONNX file or C source, which is kept only if it acts the same."""
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
-from rlctl.export.report import ExportReport, Port, format_agreement, format_closed_loop
+from rlctl.export.report import CReport, ExportReport, OnnxReport, Port, format_agreement, format_closed_loop
 from rlctl.output import print_notes
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import files, lookup, onnx_file
 from rlctl.run.lookup import FoundPolicy
-from rlctl.run.policy import PolicyInfo, read_policy
+from rlctl.run.policy import Policy, PolicyInfo, read_policy
 
 if TYPE_CHECKING:
     import onnx
 
-    from rlctl.export.verify import PolicyFiles, Verification
+    from rlctl.export.c_source import CSource
+    from rlctl.export.verify import Verification
+
+Format = Literal["onnx", "c"]
+C_OBSERVATIONS = 2000
+"""On which a C function is compared."""
 
 
-def export_onnx(run: str | None, *, checkpoint: str, output: Path | None) -> ExportReport:
-    """Export a policy to ONNX and verify it in its own environment.
+class _Export(NamedTuple):
+    # What the exports of one policy share.
+    file: Path
+    info: PolicyInfo
+    tensors: dict[str, Any]
+    policy: Any
+    """A `TorchPolicy`."""
+    model: onnx.ModelProto
+    workers: Workers
 
-    `run` is what the user typed: a run, a policy file, or None for the latest run. The file is written to `output`,
-    by default into the run's folder, or beside a policy file that belongs to none. Raises `UsageError` for a policy
-    that cannot be written as ONNX, and `AnswerIsNo` with the numbers if the file does not act as the policy does;
-    then no file is left.
+
+def export_policy(
+    run: str | None, formats: Sequence[Format], *, checkpoint: str, output: Path | None
+) -> list[ExportReport]:
+    """Export a policy in one or more formats and verify each file in the policy's own environment.
+
+    `run` is what the user typed: a run, a policy file, or None for the latest run. Files are written to `output`, by
+    default into the run's folder, or beside a policy file that belongs to none; of several formats each has its own
+    suffix. Raises `UsageError` for a policy that has no such form, and `AnswerIsNo` with the numbers if a file does
+    not act as the policy does; then that file is not left.
     """
     found = lookup.find_policy(run, checkpoint)
     print_notes(found.notes)
-    policy_file, owner = found.file, found.run
-    if policy_file.suffix == ".onnx":
-        raise UsageError(f"{policy_file}: an ONNX file already; export the run or its .safetensors file")
+    if found.file.suffix == ".onnx":
+        raise UsageError(f"{found.file}: an ONNX file already; export the run or its .safetensors file")
     if output is None:
-        output = owner.onnx_file if owner else policy_file.with_suffix(".onnx")
-    if output.suffix != ".onnx":
-        raise UsageError(f"--output {output}: the name of an ONNX file ends in .onnx")
-    return _export(found, output)
+        output = found.run.onnx_file if found.run else found.file.with_suffix(".onnx")
+        output = output.with_suffix(f".{formats[0]}")
+    if output.suffix not in [f".{each}" for each in formats]:
+        kind = "an ONNX file" if formats[0] == "onnx" else "a C file"
+        raise UsageError(f"--output {output}: the name of {kind} ends in .{formats[0]}")
+    return _export(found, [output.with_suffix(f".{each}") for each in formats])
 
 
-def _export(found: FoundPolicy, target: Path) -> ExportReport:
-    policy_file = found.file
-    info, tensors = read_policy(policy_file)
+def _export(found: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
+    info, tensors = read_policy(found.file)
     # The environments are built while torch is imported.
     with Workers(found.locate(info.spec), available_cores()) as workers:
         from rlctl.export.actor import build
-        from rlctl.export.verify import PolicyFiles
         from rlctl.run.torch_policy import TorchPolicy, pin_threads
 
         pin_threads()
-        policy = TorchPolicy.load(policy_file)
-        model = build(info, policy.network, tensors)
-        _check_environment(policy_file, info, workers)
-        reports: list[ExportReport] = []
-
-        def write(part: Path) -> None:
-            part.write_bytes(onnx_file.encode(model))
-            reports.append(_verify(policy_file, target, PolicyFiles(tensors, part), policy, model, workers))
-
-        files.write_with(target, write)
-    return reports[0]
+        policy = TorchPolicy.load(found.file)
+        job = _Export(found.file, info, tensors, policy, build(info, policy.network, tensors), workers)
+        sources = {target: _write_source(job, target) for target in targets if target.suffix == ".c"}
+        _check_environment(found.file, info, workers)
+        return [
+            _export_c(job, target, sources[target]) if target in sources else _export_onnx(job, target)
+            for target in targets
+        ]
 
 
 def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) -> None:
@@ -75,40 +91,88 @@ def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) ->
         )
 
 
-def _verify(
-    policy_file: Path, target: Path, played: PolicyFiles, policy: Any, model: onnx.ModelProto, workers: Workers
-) -> ExportReport:
-    from rlctl.export.latency import measure
-    from rlctl.export.verify import verify
+def _export_onnx(job: _Export, target: Path) -> ExportReport:
     from rlctl.run.onnx_policy import OnnxPolicy
 
-    exported = OnnxPolicy.load(played.onnx)
-    seen = verify(policy, exported, played, workers)
+    reports: list[ExportReport] = []
+
+    def write(part: Path) -> None:
+        part.write_bytes(onnx_file.encode(job.model))
+        exported = OnnxPolicy.load(part)
+        reports.append(
+            OnnxReport(
+                **_verify(job, target, exported, part, "the ONNX file", 1000),
+                size=part.stat().st_size,
+                opset=job.model.opset_import[0].version,
+                inputs=_list_ports(exported.session.get_inputs()),
+                outputs=_list_ports(exported.session.get_outputs()),
+            )
+        )
+
+    files.write_with(target, write)
+    return reports[0]
+
+
+def _write_source(job: _Export, target: Path) -> CSource:
+    from rlctl.export.c_source import write_c
+
+    return write_c(job.info, job.model, target.stem)
+
+
+def _export_c(job: _Export, target: Path, code: CSource) -> ExportReport:
+    from rlctl.export.c_library import build_library, find_compiler
+    from rlctl.run.c_policy import CPolicy
+
+    compiler = find_compiler()
+    # The name of a header is in the source, and a file's may not be an identifier: policy-1.c includes policy_1.h.
+    header = target.with_name(f"{code.name}.h")
+    if compiler is None:
+        seen = {**_describe(job, target), "not_verified": "no C compiler (cc, or $CC) on this machine"}
+    else:
+        with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
+            library = build_library(code, job.info, Path(folder), compiler)
+            seen = _verify(job, target, CPolicy.load(library), library, "the C function", C_OBSERVATIONS)
+    files.write_text(header, code.header)
+    files.write_text(target, code.source)
+    size = len(code.source.encode()) + len(code.header.encode())
+    return CReport(**seen, size=size, header=header, prototype=code.prototype, compiler=(compiler or [""])[0])
+
+
+def _describe(job: _Export, target: Path) -> dict[str, Any]:
+    info = job.info
+    return {
+        "path": target,
+        "policy": job.file,
+        "task": info.spec.task,
+        "algo": info.algo,
+        "training_steps": info.training_steps,
+    }
+
+
+def _verify(
+    job: _Export, target: Path, exported: Policy, file: Path, what: str, min_observations: int
+) -> dict[str, Any]:
+    """Return what a report says of a verified file."""
+    from rlctl.export.latency import measure
+    from rlctl.export.verify import PolicyFiles, verify
+
+    seen = verify(job.policy, exported, PolicyFiles(job.tensors, file), job.workers, min_observations)
     if not seen.passed:
-        raise AnswerIsNo(_explain_failure(policy_file, target, policy.info.spec.task, seen))
-    info = policy.info
-    return ExportReport(
-        path=target,
-        policy=policy_file,
-        task=info.spec.task,
-        algo=info.algo,
-        training_steps=info.training_steps,
-        size=played.onnx.stat().st_size,
-        opset=model.opset_import[0].version,
-        inputs=_list_ports(exported.session.get_inputs()),
-        outputs=_list_ports(exported.session.get_outputs()),
-        agreement=seen.agreement,
-        closed_loop=seen.closed_loop,
-        latency=measure(policy, exported),
-    )
+        raise AnswerIsNo(_explain_failure(job, target, what, seen))
+    return {
+        **_describe(job, target),
+        "agreement": seen.agreement,
+        "closed_loop": seen.closed_loop,
+        "latency": measure(job.policy, exported),
+    }
 
 
-def _explain_failure(policy_file: Path, target: Path, task: str, seen: Verification) -> str:
-    why = f"the ONNX file does not act as {policy_file} does"
+def _explain_failure(job: _Export, target: Path, what: str, seen: Verification) -> str:
+    why = f"{what} does not act as {job.file} does"
     if seen.agreement.agrees:
         why = (
             "every action agrees, but the episodes do not: the environment is not reproducible, or magnifies "
-            f"differences of {seen.agreement.max_difference:.0e}; see rlctl check-env {task}"
+            f"differences of {seen.agreement.max_difference:.0e}; see rlctl check-env {job.info.spec.task}"
         )
     numbers = f"{format_agreement(seen.agreement)}\n{format_closed_loop(seen.closed_loop)}"
     return f"{target}: not verified, not kept: {why}\n{numbers}"

@@ -24,9 +24,9 @@ class Port:
         return f"{self.name} {self.dtype}[{', '.join(str(size) for size in self.shape)}]"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportReport:
-    """A verified ONNX file."""
+    """A file that was exported, and how it was verified."""
 
     path: Path
     policy: Path
@@ -35,30 +35,90 @@ class ExportReport:
     training_steps: int
     size: int
     """[bytes]"""
-    opset: int
-    inputs: list[Port]
-    outputs: list[Port]
-    agreement: Agreement
-    closed_loop: ClosedLoop
-    latency: Latency
+    agreement: Agreement | None = None
+    closed_loop: ClosedLoop | None = None
+    latency: Latency | None = None
+    not_verified: str = ""
+    """Why it was not verified; empty if it was."""
 
     def as_json(self) -> dict[str, Any]:
         """Return plain data."""
-        return {
-            **dataclasses.asdict(self),
-            "path": str(self.path),
-            "policy": str(self.policy),
-            "verified": True,
-            "max_difference": self.agreement.max_difference,
-            "observations": self.agreement.observations,
-            "latency": {**dataclasses.asdict(self.latency), "speedup": self.latency.speedup},
+        result = {
+            key: str(value) if isinstance(value, Path) else value for key, value in dataclasses.asdict(self).items()
         }
+        result["verified"] = not self.not_verified
+        if self.agreement:
+            result["max_difference"] = self.agreement.max_difference
+            result["observations"] = self.agreement.observations
+        if self.latency:
+            result["latency"] = {**dataclasses.asdict(self.latency), "speedup": self.latency.speedup}
+        return result
+
+    def list_rows(self) -> list[tuple[str, str]]:
+        """Return the lines of the report: a word and a text each."""
+        rows = [
+            ("policy", f"{self.algo} for {self.task}, {self.training_steps:,} steps, from {self.policy}"),
+            *self._list_interface(),
+        ]
+        if self.not_verified or not (self.agreement and self.closed_loop and self.latency):
+            return [*rows, ("not verified", self.not_verified)]
+        latency = self.latency
+        times = f"{latency.exported_us:.1f} us for one observation; SB3 {latency.sb3_us:.1f} us, {latency.speedup:.1f}x"
+        return [
+            *rows,
+            ("verified", format_agreement(self.agreement)),
+            ("closed loop", format_closed_loop(self.closed_loop)),
+            ("latency", times),
+        ]
+
+    def _list_interface(self) -> list[tuple[str, str]]:
+        raise NotImplementedError
 
 
-def show(report: ExportReport, json: str | None) -> None:
-    """Print a report, or write it as JSON to a file or, for `-`, to stdout."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OnnxReport(ExportReport):
+    """An ONNX file."""
+
+    opset: int
+    inputs: list[Port]
+    outputs: list[Port]
+
+    def list_rows(self) -> list[tuple[str, str]]:
+        """Return the lines of the report."""
+        written = ("exported", f"{self.path} ({self.size / 1000:,.1f} kB, opset {self.opset})")
+        return [written, *super().list_rows(), ("next", f"rlctl eval {self.path} --task {self.task}")]
+
+    def _list_interface(self) -> list[tuple[str, str]]:
+        return [("inputs", ", ".join(map(str, self.inputs))), ("outputs", ", ".join(map(str, self.outputs)))]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CReport(ExportReport):
+    """A C source file and its header."""
+
+    header: Path
+    prototype: str
+    """Declaration of the function that acts."""
+    compiler: str
+    """What it was compiled with to verify it; empty if it was not."""
+
+    def list_rows(self) -> list[tuple[str, str]]:
+        """Return the lines of the report."""
+        written = ("exported", f"{self.path} and {self.header.name} ({self.size / 1000:,.1f} kB, C99)")
+        return [written, *super().list_rows(), ("next", f"cc -std=c99 -O3 -c {self.path}")]
+
+    def _list_interface(self) -> list[tuple[str, str]]:
+        return [("function", self.prototype)]
+
+
+def show(reports: list[ExportReport], json: str | None) -> None:
+    """Print the reports of one policy, or write them as JSON to a file or, for `-`, to stdout.
+
+    The JSON of one format is an object; of several it is one object per format, by the suffix of its file.
+    """
     if json is not None:
-        output.write_result_json(json, report.as_json())
+        by_format = {each.path.suffix[1:]: each.as_json() for each in reports}
+        output.write_result_json(json, by_format if len(reports) > 1 else reports[0].as_json())
     if json == "-":
         return
     from rich.table import Table
@@ -67,26 +127,12 @@ def show(report: ExportReport, json: str | None) -> None:
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
-    for name, text in _list_rows(report):
-        table.add_row(name, Text(text))
+    for number, report in enumerate(reports):
+        if number:
+            table.add_row("", "")
+        for name, text in report.list_rows():
+            table.add_row(name, Text(text))
     output.out().print(table)
-
-
-def _list_rows(report: ExportReport) -> list[tuple[str, str]]:
-    latency = report.latency
-    return [
-        ("exported", f"{report.path} ({report.size / 1000:,.1f} kB, opset {report.opset})"),
-        ("policy", f"{report.algo} for {report.task}, {report.training_steps:,} steps, from {report.policy}"),
-        ("inputs", ", ".join(map(str, report.inputs))),
-        ("outputs", ", ".join(map(str, report.outputs))),
-        ("verified", format_agreement(report.agreement)),
-        ("closed loop", format_closed_loop(report.closed_loop)),
-        (
-            "latency",
-            f"{latency.onnx_us:.1f} us for one observation; SB3 {latency.sb3_us:.1f} us, {latency.speedup:.1f}x",
-        ),
-        ("next", f"rlctl eval {report.path} --task {report.task}"),
-    ]
 
 
 def format_agreement(agreement: Agreement) -> str:
@@ -108,5 +154,5 @@ def format_closed_loop(loop: ClosedLoop) -> str:
     return (
         f"{loop.episodes} episodes: success same in {loop.same_success}, length in {loop.same_length}, "
         f"return within {loop.max_return_difference:.1e} "
-        f"(mean {loop.mean_return:.5g} and {loop.mean_return_onnx:.5g})"
+        f"(mean {loop.mean_return:.5g} and {loop.mean_return_exported:.5g})"
     )

@@ -15,8 +15,7 @@ from rlctl.export.agreement import Agreement, Comparison
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
-from rlctl.run.onnx_policy import OnnxPolicy
-from rlctl.run.policy import BatchActor
+from rlctl.run.policy import BatchActor, Policy
 from rlctl.run.torch_policy import TorchPolicy
 
 MAX_RETURN_DIFFERENCE = 1e-3
@@ -36,7 +35,7 @@ class ClosedLoop:
     max_return_difference: float
     """Relative to the larger of the episode's own return and the mean size of a return."""
     mean_return: float
-    mean_return_onnx: float
+    mean_return_exported: float
 
     @property
     def agrees(self) -> bool:
@@ -57,27 +56,33 @@ class Verification:
         return self.agreement.agrees and self.closed_loop.agrees
 
 
-def verify(torch_policy: TorchPolicy, onnx_policy: OnnxPolicy, files: PolicyFiles, workers: Workers) -> Verification:
-    """Play the same episodes with both files; on every observation of either, ask torch and ONNX.
+def verify(
+    torch_policy: TorchPolicy,
+    exported: Policy,
+    files: PolicyFiles,
+    workers: Workers,
+    min_observations: int = MIN_OBSERVATIONS,
+) -> Verification:
+    """Play the same episodes with both files; on every observation of either, ask torch and the exported policy.
 
-    Rollouts go on until `MIN_OBSERVATIONS` were compared. Raises `TaskError` if the environment fails.
+    Rollouts go on until `min_observations` were compared. Raises `TaskError` if the environment fails.
     """
     comparison = Comparison(torch_policy)
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
     workers.set_policy(torch_policy.info, files.tensors)
     expected = play_episodes(workers, seeds, record=True)
-    _compare_actions(torch_policy, onnx_policy, expected, comparison)
+    _compare_actions(torch_policy, exported, expected, comparison)
     played = EPISODES
-    while comparison.observations < MIN_OBSERVATIONS:
-        missing = MIN_OBSERVATIONS / comparison.observations - 1.0
+    while comparison.observations < min_observations:
+        missing = min_observations / comparison.observations - 1.0
         total = played + max(1, round(1.1 * missing * played))
         more = play_episodes(workers, episode_seeds(0, Stream.VERIFY, total)[played:], record=True)
-        _compare_actions(torch_policy, onnx_policy, more, comparison)
+        _compare_actions(torch_policy, exported, more, comparison)
         played = total
-    workers.set_other_policy(str(files.onnx.resolve()))
+    workers.set_other_policy(str(files.exported.resolve()))
     done = play_episodes(workers, seeds, record=True)
     compared = comparison.observations
-    _compare_actions(torch_policy, onnx_policy, done, comparison)
+    _compare_actions(torch_policy, exported, done, comparison)
     comparison.observations = compared  # those of one policy's rollouts are counted
     return Verification(comparison.result(), compare_episodes(expected, done))
 
@@ -87,27 +92,28 @@ class PolicyFiles:
     """What the workers play: a policy file's tensors, and the exported file."""
 
     tensors: dict[str, NDArray[Any]]
-    onnx: Path
+    exported: Path
+    """An ONNX file, or a compiled library."""
 
 
 def _compare_actions(
-    torch_policy: TorchPolicy, onnx_policy: OnnxPolicy, episodes: Sequence[Episode], comparison: Comparison
+    torch_policy: TorchPolicy, exported: Policy, episodes: Sequence[Episode], comparison: Comparison
 ) -> None:
     """Ask both policies on all observations of some episodes, step by step, each with its own recurrent state.
 
-    The ONNX policy runs in full batches, and for the first episode alone as well.
+    The exported policy runs in full batches, and for the first episode alone as well.
     """
     trajectories = [episode.trajectory for episode in episodes if episode.trajectory is not None]
-    of_torch, of_onnx = (BatchActor(policy, len(episodes)) for policy in (torch_policy, onnx_policy))
-    onnx_policy.reset()
+    of_torch, of_file = (BatchActor(policy, len(episodes)) for policy in (torch_policy, exported))
+    exported.reset()
     for step in range(max(len(each.actions) for each in trajectories)):
         rows = np.array([row for row, each in enumerate(trajectories) if step < len(each.actions)])
         observations = stack([take_row(trajectories[row].observations, step) for row in rows])
         starts = np.full(len(rows), step == 0)
         expected = of_torch.act(observations, rows, starts)
-        comparison.add(expected, of_onnx.act(observations, rows, starts))
+        comparison.add(expected, of_file.act(observations, rows, starts))
         if rows[0] == 0:
-            comparison.add(expected[:1], onnx_policy.predict(take_row(observations, 0))[None])
+            comparison.add(expected[:1], exported.predict(take_row(observations, 0))[None])
         comparison.observations += len(rows)
 
 
@@ -125,5 +131,5 @@ def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> Cl
         same_length=sum(ours.length == theirs.length for ours, theirs in pairs),
         max_return_difference=float(relative.max()),
         mean_return=float(returns[:, 0].mean()),
-        mean_return_onnx=float(returns[:, 1].mean()),
+        mean_return_exported=float(returns[:, 1].mean()),
     )

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from rlctl.dict_spaces import join, split_space
 from rlctl.errors import ArtifactError, DivergedError, UsageError, short_repr
+from rlctl.run.c_policy import LIBRARY_SUFFIX, CPolicy
 from rlctl.run.numpy_policy import NumpyNetwork, Tensors
-from rlctl.run.policy import PolicyInfo
+from rlctl.run.policy import Policy, PolicyInfo
 
 Array = NDArray[Any]
 
@@ -230,10 +231,14 @@ def check_playable(info: PolicyInfo, tensors: Tensors, file: Path) -> None:
         raise ArtifactError(f"{file}: its tensors do not fit its description: {text}") from None
 
 
-class OnnxPlayer(Player):
-    """Plays an exported policy: its deterministic action."""
+class ExportedPlayer(Player):
+    """Plays an exported policy, an ONNX file or compiled C: its deterministic action."""
 
     def __init__(self, path: str) -> None:
+        self._policy: Policy
+        if path.endswith(LIBRARY_SUFFIX):
+            self._policy = CPolicy.load(Path(path))
+            return
         from rlctl.run.onnx_policy import OnnxPolicy  # only here: it imports onnxruntime
 
         self._policy = OnnxPolicy.load(Path(path))

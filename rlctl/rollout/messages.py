@@ -53,7 +53,8 @@ class LoadPolicy:
     """A `PolicyInfo`."""
     layout: list[Any] = dataclasses.field(default_factory=list)
     """Name, shape and dtype of each array of numbers."""
-    onnx_file: str | None = None
+    exported_file: str | None = None
+    """An ONNX file, or a compiled library."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -231,11 +231,11 @@ class Workers:
         if layout:
             self._ask_all(messages.LoadPolicy(info.model_dump(mode="json"), layout), "loading the policy")
 
-    def set_other_policy(self, onnx_file: str | None = None) -> None:
-        """Act with an exported policy, or with random actions if no file is given."""
+    def set_other_policy(self, exported_file: str | None = None) -> None:
+        """Act with an exported policy (an ONNX file, a compiled library), or with random actions without a file."""
         self._wait_until_built()
         self._policy_layout = ()
-        self._ask_all(messages.LoadPolicy(onnx_file=onnx_file), "loading the policy")
+        self._ask_all(messages.LoadPolicy(exported_file=exported_file), "loading the policy")
 
     @property
     def recurrent_state(self) -> NDArray[np.float32] | None:

@@ -25,6 +25,7 @@ ROWS = {
     "playing-half-cheetah": "acting:half_cheetah",
     "playing-256": "acting:per_step",
     "onnx": "inference:onnx_runtime",
+    "c": "inference:c_function",
     "help": "startup:help_page",
     "check": "checking:bundled_task",
     "check-cartpole": "checking:cart_pole",

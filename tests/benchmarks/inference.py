@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -42,6 +43,43 @@ def onnx_runtime(repeat: int) -> Row:
         ">= 8x",
         faster >= 8,
         f"rlctl.load_policy(onnx).predict; onnxruntime's own session.run alone: {1 / bare.ratio:.1f}x",
+    )
+
+
+def c_function(repeat: int) -> Row:
+    """Time C for one observation, called through ctypes, beside onnxruntime's own `session.run`; both from Python."""
+    from rlctl.export.actor import build
+    from rlctl.export.c_library import build_library, find_compiler
+    from rlctl.export.c_source import write_c
+    from rlctl.run.c_policy import CPolicy
+    from rlctl.run.policy import read_policy
+
+    run = short_run()
+    rlctl_command("export", str(run), "--onnx")
+    exported: Any = rlctl.load_policy(run / "exports" / "policy.onnx")
+    info, tensors = read_policy(run / "policies" / "best.safetensors")
+    compiler = find_compiler()
+    assert compiler is not None, "no C compiler"
+    code = write_c(info, build(info, _torch_policy(run).network, tensors), "policy")
+    with tempfile.TemporaryDirectory() as folder:
+        policy = CPolicy.load(build_library(code, info, Path(folder), compiler))
+    observation = np.zeros(exported.observation_space.shape, np.float32)
+    batch = {"obs": observation[None]}
+
+    def theirs() -> float:
+        return _seconds(lambda: exported.session.run(["action"], batch))
+
+    pair = side_by_side(lambda: _seconds(lambda: policy.predict(observation)), theirs, 3 * repeat)
+    alone = side_by_side(lambda: _seconds(lambda: policy.repeat(observation, 10)) / 10, theirs, 3 * repeat)
+    faster = 1 / alone.ratio
+    return Row(
+        "C, one observation",
+        f"{alone.ours * 1e6:.1f} us",
+        f"{pair.theirs * 1e6:.1f} us",
+        f"{faster:.1f}x",
+        ">= 2x",
+        faster >= 2,
+        f"the C function alone beside onnxruntime's session.run; called from Python as a policy: {1 / pair.ratio:.1f}x",
     )
 
 

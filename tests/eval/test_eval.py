@@ -173,10 +173,10 @@ def test_a_run_without_a_best_policy(rlctl, reach_run, tmp_path):
 
 
 def test_an_exported_policy_is_evaluated_alike_and_without_torch(reach_run, evaluation, tmp_path):
-    from rlctl.export.export import export_onnx
+    from rlctl.export.export import export_policy
 
     exported = tmp_path / "policy.onnx"
-    export_onnx(str(reach_run.path), checkpoint="best", output=exported)
+    export_policy(str(reach_run.path), ["onnx"], checkpoint="best", output=exported)
     code = (
         "import sys; from rlctl.cli import run\n"
         f"code = run(['eval', {str(exported)!r}, '--task', 'reach', '--episodes', '6', '--json', 'result.json'])\n"

@@ -18,6 +18,7 @@ OBSERVATIONS = {
         {"camera": IMAGE, "joints": VECTOR, "mode": spaces.Discrete(5), "switch": spaces.MultiBinary(2)}
     ),
     "taken": spaces.Dict({"action": VECTOR, "joints": VECTOR}),
+    "parts": spaces.Dict({"joints": VECTOR, "mode": spaces.Discrete(5), "switch": spaces.MultiBinary(2)}),
 }
 ACTIONS = {
     "box": spaces.Box(np.array([-2.0, -0.5], np.float32), np.array([1.0, 3.0], np.float32)),

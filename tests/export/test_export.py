@@ -10,7 +10,7 @@ import pytest
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.export.agreement import Comparison
-from rlctl.export.export import export_onnx
+from rlctl.export.export import export_policy
 from rlctl.export.report import show
 from rlctl.export.verify import PolicyFiles, compare_episodes, verify
 from rlctl.rollout.collect import Episode
@@ -20,8 +20,9 @@ from rlctl.run.policy import read_policy
 from rlctl.run.torch_policy import TorchPolicy
 
 
-def export(path, output=None):
-    return export_onnx(str(path), checkpoint="best", output=output)
+def export(path, output=None, formats=("onnx",)):
+    (report,) = export_policy(str(path), formats, checkpoint="best", output=output)
+    return report
 
 
 def assert_verified(report):
@@ -78,10 +79,10 @@ def test_run_gets_it_into_its_exports(small, train, write, tmp_path, monkeypatch
     policies.mkdir(parents=True)
     shutil.copy(write(train("ppo", small(), steps=0), "ppo", small()), policies / "best.safetensors")
     (policies.parent / "run.json").write_text(json.dumps({"task": "reach"}))
-    report = export_onnx(str(policies.parent), checkpoint="best", output=None)
+    (report,) = export_policy(str(policies.parent), ["onnx"], checkpoint="best", output=None)
     assert report.path == policies.parent / "exports" / "policy.onnx"
     with pytest.raises(ArtifactError, match="no last policy yet"):
-        export_onnx(None, checkpoint="last", output=None)
+        export_policy(None, ["onnx"], checkpoint="last", output=None)
 
 
 def test_not_verified_is_not_kept(small, train, write, tmp_path):
@@ -235,7 +236,7 @@ def test_command_line_when_the_answer_is_no(rlctl, small, train, write, tmp_path
 def test_report_as_json_file(small, train, write, tmp_path):
     spec = small()
     report = export(write(train("ppo", spec, steps=0), "ppo", spec))
-    show(report, str(tmp_path / "report.json"))
+    show([report], str(tmp_path / "report.json"))
     content = json.loads((tmp_path / "report.json").read_text())
     assert content["closed_loop"]["episodes"] == 20
     assert content["agreement"]["batch_sizes"] == [1, 64]
