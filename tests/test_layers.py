@@ -17,6 +17,7 @@ LAYERS = [
     {"train"},
     {"export", "replay", "tasks", "runs"},
     {"check_env", "eval"},
+    {"deploy"},
     {"rollout"},
     {"run"},
     {"gym"},
@@ -36,6 +37,7 @@ ALSO = {
     ("__init__", "run"),
     ("__init__", "python_api"),
     ("train", "python_api"),
+    ("rollout", "deploy"),  # a worker bounds its policy's actions by the filter that robots are behind
 }
 NOT_AMONG_VERBS = {("export", "check_env"), ("replay", "check_env"), ("replay", "export")}
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
@@ -147,5 +149,6 @@ def test_environments_come_without_learning_libraries():
         "import rlctl; rlctl.make('reach').close()",
         "from rlctl.env_spec import EnvSpec; EnvSpec('Pendulum-v1').make()",
         "from rlctl.rollout import collect, workers, worker_process",
+        "from rlctl.deploy import SafetyFilter",
     )
     assert {line: modules & TORCH for line, modules in loaded.items() if modules & TORCH} == {}

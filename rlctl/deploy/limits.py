@@ -1,0 +1,161 @@
+"""`limits.yaml`: what a robot may be told to do, by the names of its joints. Typed, every key checked."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import Field
+
+from rlctl.errors import RecipeError, did_you_mean, short_repr
+from rlctl.run import schema_text, untrusted, yaml_text
+from rlctl.run.quantities import Number, Whole
+
+_LONGEST = 2**20  # [bytes]
+_NUMBER_WITH_UNIT = re.compile(r"^\s*[-+]?\d[\d.eE+-]*\s*[^\d\s.]")
+_UNITS = {
+    "position": "rad or m",
+    "speed": "rad/s or m/s",
+    "acceleration": "rad/s^2 or m/s^2",
+    "torque": "N m or N",
+    "rate": "1/s",
+    "scale": "rad, m, N m or their like per 1 of the action",
+    "lowpass_hz": "Hz",
+    "control_dt": "s",
+    "blend_in_s": "s",
+    "frozen_s": "s",
+}
+
+Positive = Annotated[Number, Field(gt=0)]
+
+
+def _check_order(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] >= value[1]:
+        raise ValueError(f"the lower bound {value[0]:g} is not below the upper one, {value[1]:g}; write [low, high]")
+    return value
+
+
+Bounds = Annotated[tuple[Number, Number], pydantic.AfterValidator(_check_order)]
+
+
+class _Section(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class JointLimits(_Section):
+    """Limits of one joint, or of all."""
+
+    position: Bounds | None = None
+    """Lowest and highest position [rad or m]; for commands of position, step and speed."""
+    speed: Positive | None = None
+    """Highest speed [rad/s or m/s]; for commands of position, step and speed."""
+    acceleration: Positive | None = None
+    """Highest acceleration [rad/s^2 or m/s^2]; for commands of position, step and speed."""
+    torque: Positive | None = None
+    """Highest torque or force [N m or N]; for commands of torque."""
+    rate: Positive | None = None
+    """Largest change of the command per second; for commands of torque and action."""
+    action: Bounds | None = None
+    """Lowest and highest value of the action itself, whatever it commands."""
+
+
+class Sensor(_Section):
+    """What is checked of one named observation; every observation must be finite in any case."""
+
+    range: Bounds | None = None
+    """Lowest and highest value."""
+    frozen_s: Positive | None = None
+    """Time after which a value that has not changed by a single bit is a fault [s]."""
+
+
+class Measured(_Section):
+    """Which observations are the joints' own state, an element per element of the action."""
+
+    position: str | None = None
+    """Name of the observation with the joint positions."""
+
+
+class Limits(_Section):
+    """What a robot may be told to do."""
+
+    command: Literal["position", "step", "speed", "torque", "action"] = "action"
+    """What an action commands: joint positions, steps from the present positions, speeds, torques, or anything."""
+    scale: Positive | list[Positive] = 1.0
+    """Size of 1 of the action in the unit of the command; one number, or one per joint."""
+    joints: list[str] | None = None
+    """Names of the joints in the order of the action."""
+    limits: dict[str, JointLimits] = {}
+    """Limits by joint name; `all` is for every joint, and a joint's own are put over it."""
+    lowpass_hz: Positive | None = None
+    """Cut-off frequency of the low-pass on the command [Hz]."""
+    blend_in_s: Annotated[Number, Field(ge=0)] = 0.0
+    """Time in which the policy's command takes over after a start, a hold or an override [s]."""
+    measured: Measured = Measured()
+    """Which observations are the joints' own state."""
+    sensors: dict[str, Sensor] = {}
+    """Checks by the name of the observation."""
+    max_age_periods: Positive = 3.0
+    """Age of an observation, in control periods, beyond which it is a fault."""
+    watchdog_periods: Annotated[Number, Field(ge=0)] = 3.0
+    """Control periods without an observation after which a server stops; 0: never."""
+    on_fault: Literal["hold", "home", "stop"] = "hold"
+    """What a fault of a sensor or of the policy leads to: `hold` and `home` are left when the fault is over."""
+    home: list[Number] | None = None
+    """Joint positions to go to."""
+    safe_action: list[Number] | None = None
+    """The action that is given while holding or stopped, for commands of torque and action; null: zero."""
+    control_dt: Positive | None = None
+    """Time between two actions [s]; null: the policy's."""
+    log_lines: Whole = Field(1000, ge=1, le=1_000_000)
+    """How many of the last events the filter keeps."""
+
+
+def read_limits(path: Path) -> Limits:
+    """Read a limits file; raises `ArtifactError` if it cannot be read, `RecipeError` for what is wrong in it."""
+    try:
+        text = untrusted.read_bytes(path, _LONGEST).decode()
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start:,}; save it as UTF-8") from None
+    content = yaml_text.load(text, str(path))
+    if not isinstance(content, dict):
+        raise RecipeError(f"{path}: a limits file is a mapping of keys to values, such as `limits: {{all: ...}}`")
+    try:
+        return Limits.model_validate(content)
+    except pydantic.ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        schema = Limits.model_json_schema()
+        unknown = problem["type"] == "extra_forbidden"
+        loc = problem["loc"]
+        place = loc if unknown else loc[: schema_text.find_depth(schema, loc)]
+        line = yaml_text.find_line(text, place)
+        raise RecipeError(f"{path}:{line}: {_explain(problem, place, schema, content)}") from None
+
+
+def _explain(problem: Any, place: tuple[str | int, ...], schema: schema_text.Schema, content: Any) -> str:
+    key = ".".join(str(part) for part in place)
+    if problem["type"] == "extra_forbidden":
+        keys = schema_text.list_keys(schema, schema_text.find_schema(schema, place[:-1]))
+        return f"no key {key!r}.{did_you_mean(str(place[-1]), keys)} Keys here: {', '.join(keys)}."
+    if problem["type"] == "value_error":
+        return f"{key}: {problem['ctx']['error']}"
+    given = content
+    for part in place:
+        given = given[part]
+    unit = _UNITS.get(str(place[-1]), "")
+    if isinstance(given, str) and unit and _NUMBER_WITH_UNIT.match(given):
+        return f"{key}: write the number alone, in {unit}, got {short_repr(given)!r}"
+    expected = schema_text.describe_value(schema, schema_text.find_schema(schema, place)).removesuffix(" or null")
+    return f"{key}: expected {expected}{f' [{unit}]' if unit else ''}, got {short_repr(given)}"
+
+
+def check_names(kind: str, given: Any, known: Any, where: str = "") -> None:
+    """Raise `RecipeError` for a name that is not known, with the closest one."""
+    known = list(known)
+    for name in given:
+        if name not in known:
+            listed = short_repr(", ".join(known) or "none", 200)
+            raise RecipeError(
+                f"{where}no {kind} {short_repr(name)!r}.{did_you_mean(str(name), known)} Known: {listed}."
+            )

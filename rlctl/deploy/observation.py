@@ -1,0 +1,129 @@
+"""Observations as clients send them: by name in any order, or flat; and as a policy takes them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.dict_spaces import SINGLE, join, split, split_space
+from rlctl.errors import did_you_mean, short_repr
+from rlctl.run.env_info import EnvInfo
+
+Array = NDArray[Any]
+
+WHOLE = "observation"
+"""Name of an observation whose parts have no names."""
+
+
+class ObservationError(ValueError):
+    """What somebody sent is not an observation of this policy; the message says why."""
+
+
+class ObservationLayout:
+    """Where each named observation is in what a policy takes."""
+
+    def __init__(self, info: EnvInfo) -> None:
+        self.space, _ = info.spaces()
+        self._keys = split_space(self.space)
+        self.slices: dict[str, slice] = {}
+        """Where each named observation is in the flat vector; pictures are not in it."""
+        self.shapes: dict[str, tuple[int, ...]] = {}
+        """The shape of each named observation."""
+        if isinstance(self.space, spaces.Dict):
+            start = 0
+            for key, part in self._keys.items():
+                self.shapes[key] = part.shape or ()
+                if not _is_picture(part):
+                    self.slices[key] = slice(start, start := start + math.prod(part.shape or ()))
+            self.size = start
+            return
+        self.size = math.prod(self.space.shape or ())
+        sizes = info.observation_sizes
+        # With stacked observations the names are those of one of them.
+        self._named = len(self.space.shape or ()) == 1 and sum(sizes.values()) == self.size
+        start = 0
+        for name, size in sizes.items() if self._named else [(WHOLE, self.size)]:
+            self.slices[name] = slice(start, start := start + size)
+            self.shapes[name] = (size,) if self._named else (self.space.shape or ())
+
+    def read(self, given: Any) -> Any:
+        """Return an observation as the policy takes it, from names and values or the flat vector.
+
+        Raises `ObservationError` that names what is missing, unknown, or of another size.
+        """
+        if isinstance(given, Mapping):
+            parts = self._read_names(given)
+            if isinstance(self.space, spaces.Dict):
+                return parts
+            return np.concatenate([parts[name].ravel() for name in self.slices]).reshape(self.space.shape or ())
+        if isinstance(self.space, spaces.Dict):
+            raise ObservationError(f"this policy takes observations by name: {', '.join(self.shapes)}")
+        return _convert(given, WHOLE, self.space.shape or (), self._dtype(SINGLE))
+
+    def _read_names(self, given: Mapping[Any, Any]) -> dict[str, Array]:
+        known = self.shapes
+        problems = []
+        if unknown := [name for name in given if name not in known]:
+            close = did_you_mean(str(unknown[0]), known)
+            problems.append(f"unknown: {_list(unknown)}{close and f' ({close.strip()})'}")
+        if missing := [name for name in known if name not in given]:
+            problems.append(f"missing: {_list(missing)}")
+        if problems:
+            raise ObservationError(f"observation names {'; '.join(problems)}")
+        keyed = isinstance(self.space, spaces.Dict)
+        return {
+            name: _convert(given[name], name, shape, self._dtype(name if keyed else SINGLE))
+            for name, shape in known.items()
+        }
+
+    def _dtype(self, key: str) -> np.dtype[Any]:
+        return np.dtype(self._keys[key].dtype)
+
+    def flatten(self, observation: Any) -> NDArray[np.float64]:
+        """Return the numbers of an observation that are not pictures, shape (size,)."""
+        parts = split(observation)
+        if SINGLE in parts:
+            return np.asarray(parts[SINGLE], np.float64).ravel()
+        if not self.slices:
+            return np.zeros(0)
+        return np.concatenate([np.asarray(parts[key], np.float64).ravel() for key in self.slices])
+
+    def zeros(self) -> Any:
+        """Return an observation of zeros, or of the first of its alternatives."""
+        return join(
+            {
+                key: np.full(space.shape or (), getattr(space, "start", 0), space.dtype)
+                for key, space in self._keys.items()
+            }
+        )
+
+
+def _convert(value: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        raise ObservationError(f"observation {name!r} is not an array of numbers") from None
+    if array.dtype.kind not in "biuf":
+        raise ObservationError(f"observation {name!r} is {array.dtype}, not numbers")
+    if array.shape != shape:
+        if array.size != math.prod(shape):
+            raise ObservationError(f"observation {name!r} has shape {array.shape}, the policy takes {shape}")
+        array = array.reshape(shape)
+    if array.dtype != dtype:
+        with np.errstate(all="ignore"):  # what is not finite then is found by the checks of sensors
+            array = array.astype(dtype)
+    return array
+
+
+def _list(names: list[Any]) -> str:
+    shown = ", ".join(short_repr(name, 40) for name in names[:8])
+    return f"{shown}, ..." if len(names) > 8 else shown
+
+
+def _is_picture(space: spaces.Space[Any]) -> bool:
+    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3
