@@ -91,7 +91,8 @@ class Biped(Legged):
         self.build_ground(sim)
         self.load_robot(sim)
         self.body.set_friction(1.0)  # times the ground's
-        self.joints = self.body.find_joints(JOINTS)
+        first, *_, last = self.body.find_joints(JOINTS)
+        self.joints = slice(first, last + 1)  # a view of joint arrays, where a list would copy
 
     def reset(self, rng: np.random.Generator) -> None:
         """Stand still, one leg before the other."""
@@ -103,7 +104,7 @@ class Biped(Legged):
 
     def act(self, action: np.ndarray) -> None:
         """Set the joints' target angles."""
-        self.body.drive_to(ANGLE * action.astype(np.float64), max_force=FORCE, gain=GAIN, joints=JOINTS)
+        self.body.drive_to(ANGLE * action, max_force=FORCE, gain=GAIN, joints=JOINTS)
         self.note_action(action)
 
     def observe(self) -> dict[str, np.ndarray]:
@@ -111,7 +112,7 @@ class Biped(Legged):
         (vx, _, vz), (_, pitch_rate, _) = self.trunk.velocity, self.trunk.angular_velocity
         return {
             **self.observe_legs(),
-            "attitude": np.array([self.trunk.roll_pitch_yaw[1]]),  # [rad], pitch
+            "attitude": np.array([self.attitude[1]]),  # [rad], pitch
             "velocity": np.array([vx, vz]),
             "angular_velocity": np.array([pitch_rate]),
         }
@@ -129,13 +130,14 @@ class Biped(Legged):
     def rewards(self, action: np.ndarray) -> dict[str, float]:
         """Return how fast and how well it walks; `fall` is 1 in the step that ends an episode."""
         fallen = self.is_fallen()
+        roll, pitch, _ = self.attitude
         speed = min(self.trunk.velocity[0], self.top_speed)
         return {
             "progress": speed,
             "forward_while_alive": 0.0 if fallen else speed,
             "alive": rewards.alive(fallen),
             "fall": float(fallen),
-            "posture": rewards.posture(np.array(self.trunk.orientation)),
+            "posture": roll**2 + pitch**2,
             "energy": rewards.power(self.body.joint_torques[self.joints], self.body.joint_velocities[self.joints]),
             "smoothness": rewards.squared(self.action_change),
         }
@@ -167,11 +169,11 @@ class Biped3D(Biped):
         """Return the state of joints and trunk, and which feet touch the ground."""
         return {
             **self.observe_legs(),
-            "attitude": np.array(self.trunk.roll_pitch_yaw),  # [rad], roll, pitch and yaw
+            "attitude": np.array(self.attitude),  # [rad], roll, pitch and yaw
             "velocity": np.array(self.trunk.velocity),
             "angular_velocity": np.array(self.trunk.angular_velocity),
         }
 
     def rewards(self, action: np.ndarray) -> dict[str, float]:
         """Return what the biped on a rail gets, and how far the robot has turned [rad^2]."""
-        return {**super().rewards(action), "heading": self.trunk.roll_pitch_yaw[2] ** 2}
+        return {**super().rewards(action), "heading": self.attitude[2] ** 2}

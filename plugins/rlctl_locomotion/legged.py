@@ -58,6 +58,7 @@ class Legged(Task):
     def update(self) -> None:
         """Read what rewards and observations share, once per step."""
         self.trunk = self.body.mass_state("trunk")
+        self.attitude = self.trunk.roll_pitch_yaw  # [rad]
         touching = self.body.links_touching(self.ground)
         self.foot_contacts = np.array([float(foot in touching) for foot in self.feet])
 

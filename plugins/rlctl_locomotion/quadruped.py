@@ -101,7 +101,7 @@ class Quadruped(Legged):
             "joint_positions": self.body.joint_positions,
             "joint_velocities": self.body.joint_velocities,
             "height": np.array([self.trunk.position[2]]),
-            "attitude": np.array(self.trunk.roll_pitch_yaw),
+            "attitude": np.array(self.attitude),
             "velocity": np.array(self.trunk.velocity),
             "angular_velocity": np.array(self.trunk.angular_velocity),
             "foot_contacts": self.foot_contacts,
@@ -112,7 +112,7 @@ class Quadruped(Legged):
     def rewards(self, action: np.ndarray) -> dict[str, float]:
         """Return how well the speed is kept, and document A's terms."""
         speed = self.trunk.velocity[0]
-        roll, pitch, yaw = self.trunk.roll_pitch_yaw
+        roll, pitch, yaw = self.attitude
         return {
             "tracking": rewards.closeness(speed - self.command, SPEED_SCALE),
             "forward": min(speed, self.command),  # faster earns no more
