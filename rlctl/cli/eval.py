@@ -39,6 +39,16 @@ def evaluate(
         float | None,
         typer.Option(metavar="RETURN", help="Gate: exit 1 below this mean return.", show_default=False),
     ] = None,
+    vary: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME=LOW:HIGH:COUNT|all",
+            help="Map over an event or parameter of the task, e.g. mass=0.6:1.4:9; twice for two together.",
+            show_default=False,
+        ),
+    ] = [],
+    push: Annotated[bool, typer.Option("--push", help="Find from which push on it fails.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a long --vary.")] = False,
     env_timeout: EnvTimeout = 60.0,
     json: Json = None,
 ) -> None:
@@ -48,20 +58,25 @@ def evaluate(
     from rlctl.eval.report import show_all
 
     gates = Gates(min_success, min_success_lower, min_return)
-    results = run_evaluations(
-        EvalRequest(
-            run=run,
-            task=task,
-            checkpoint=checkpoint,
-            episodes=episodes,
-            seed=seed,
-            changes=parse_changes(settings),
-            stage=stage,
-            deterministic=not stochastic,
-            n_envs=n_envs,
-            env_timeout_s=env_timeout,
-        ),
-        gates,
+    request = EvalRequest(
+        run=run,
+        task=task,
+        checkpoint=checkpoint,
+        episodes=episodes,
+        seed=seed,
+        changes=parse_changes(settings),
+        stage=stage,
+        deterministic=not stochastic,
+        n_envs=n_envs,
+        env_timeout_s=env_timeout,
     )
+    if vary or push:
+        from rlctl.eval.robustness_report import show
+        from rlctl.eval.vary import RobustnessRequest, check_gates, measure_robustness
+
+        robustness = measure_robustness(request, RobustnessRequest(vary, push, yes), gates)
+        show(robustness, json)
+        return check_gates(robustness, gates)
+    results = run_evaluations(request, gates)
     show_all(results, json)
-    gates.check(*results)
+    return gates.check(*results)

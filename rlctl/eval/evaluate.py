@@ -83,19 +83,20 @@ class Gates:
         missed = []
         for result in results:
             stage = f"stage {result.spec.stage}: " if len(results) > 1 else ""
-            missed += [stage + each for each in self._list_missed(result)]
+            found = self.list_missed(result.success_rate, result.success_interval, result.returns.mean)
+            missed += [stage + each for each in found]
         if missed:
             raise AnswerIsNo("gate missed: " + "; ".join(missed))
 
-    def _list_missed(self, result: Evaluation) -> list[str]:
-        rate, interval = result.success_rate, result.success_interval
+    def list_missed(self, rate: float | None, interval: tuple[float, float] | None, mean_return: float) -> list[str]:
+        """Return what is missed by a success rate, its interval and a mean return, a phrase for each gate."""
         missed = []
         if self.min_success is not None and rate is not None and rate < self.min_success:
             missed.append(f"success rate {rate:.3f} is below {self.min_success:g}")
         if self.min_success_lower is not None and interval is not None and interval[0] < self.min_success_lower:
             missed.append(f"lower bound {interval[0]:.3f} of the success rate is below {self.min_success_lower:g}")
-        if self.min_return is not None and result.returns.mean < self.min_return:
-            missed.append(f"mean return {result.returns.mean:.3f} is below {self.min_return:g}")
+        if self.min_return is not None and mean_return < self.min_return:
+            missed.append(f"mean return {mean_return:.3f} is below {self.min_return:g}")
         return missed
 
 
@@ -109,32 +110,43 @@ def run_evaluations(request: EvalRequest, gates: Gates) -> list[Evaluation]:
     """Find the policy and evaluate it as `run_evaluation` does, in every stage that was asked for, with equal seeds."""
     found = lookup.find_policy(request.run, request.checkpoint)
     output.print_notes(found.notes)
-    path = found.file
-    policy = _load_policy(path, request.deterministic)
-    specs = [found.locate(spec) for spec in _choose_specs(policy.info, request)]
-    return [_evaluate(path, policy, spec, request, gates) for spec in specs]
+    policy = load_player(found.file, request.deterministic)
+    specs = [found.locate(spec) for spec in choose_specs(policy.info, request)]
+    return [_evaluate(policy, spec, request, gates) for spec in specs]
 
 
 @dataclasses.dataclass(frozen=True)
-class _LoadedPolicy:
+class LoadedPolicy:
+    """A policy that workers can play."""
+
+    path: Path
     info: PolicyInfo
     tensors: dict[str, NDArray[Any]] | None
     """None for an exported file, which the workers load themselves."""
 
+    def give_to(self, workers: Workers) -> None:
+        """Let workers act with it; raises `ArtifactError` if it is for other spaces than their environments have."""
+        self.info.check_fits(workers.info, self.path)
+        if self.tensors is None:
+            workers.set_other_policy(str(self.path.resolve()))
+        else:
+            workers.set_policy(self.info, self.tensors)
 
-def _load_policy(path: Path, deterministic: bool) -> _LoadedPolicy:
+
+def load_player(path: Path, deterministic: bool) -> LoadedPolicy:
     """Read and try a policy; raises `ArtifactError` for a damaged one."""
     if path.suffix == ".onnx":
         policy = load_policy(path)
         if not deterministic:
             raise UsageError("an exported policy cannot sample: only its deterministic action is in the ONNX file")
-        return _LoadedPolicy(policy.info, None)
+        return LoadedPolicy(path, policy.info, None)
     info, tensors = read_policy(path)
     check_playable(info, tensors, path)
-    return _LoadedPolicy(info, tensors)
+    return LoadedPolicy(path, info, tensors)
 
 
-def _choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
+def choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
+    """Return what to evaluate on: the policy's task or another, with changes, or the stages that were asked for."""
     if request.stage is None:
         return [info.derive_spec(request.task, request.changes)]
     if request.task is not None and request.task != info.spec.task:
@@ -155,18 +167,19 @@ def _choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
     return [request.changes.apply(info.stages[number - 1]) for number in numbers]
 
 
-def _evaluate(path: Path, policy: _LoadedPolicy, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
+def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
+    """Start workers for the episodes of a request: as many as there are cores, but no more than episodes."""
     n_envs = min(request.n_envs or available_cores(), request.episodes)
-    with Workers(spec, n_envs, timeout_s=request.env_timeout_s) as workers:
-        policy.info.check_fits(workers.info, path)
+    return Workers(spec, n_envs, timeout_s=request.env_timeout_s)
+
+
+def _evaluate(policy: LoadedPolicy, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
+    with start_workers(spec, request) as workers:
+        policy.give_to(workers)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
-        if policy.tensors is None:
-            workers.set_other_policy(str(path.resolve()))
-        else:
-            workers.set_policy(policy.info, policy.tensors)
         episodes, events = _play(workers, request), workers.info.events
-    evaluation = _summarize(path, policy.info, spec, events, request, episodes)
+    evaluation = _summarize(policy.path, policy.info, spec, events, request, episodes)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
 

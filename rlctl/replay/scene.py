@@ -156,7 +156,7 @@ class _BodyReader:
             positions=np.array([[pose[0] for pose in poses] for poses in self._poses], np.float64),
             orientations=np.array([[pose[1] for pose in poses] for poses in self._poses], np.float64),
             shapes=shapes,
-            trunk=self._trunk({shape.link for shape in shapes}),
+            trunk=self._trunk(),
             chain=self._is_chain(),
         )
 
@@ -176,16 +176,11 @@ class _BodyReader:
         ]
         return len(parents) > 1 and parents == list(range(-1, len(parents) - 1))
 
-    def _trunk(self, drawn: set[str]) -> int | None:
-        if not self.body.joint_names:
+    def _trunk(self) -> int | None:
+        trunk = self.body.find_trunk() if self.body.joint_names else None
+        if trunk is None:
             return None
-        if not self.body.fixed:
-            return 0
-        first = pybullet.getJointInfo(self.body.id, 0, physicsClientId=self.client)
-        limited = first[8] <= first[9]
-        if first[2] != pybullet.JOINT_PRISMATIC or limited:
-            return None
-        return next((index for index, link in enumerate(self.links) if link in drawn), None)
+        return 0 if not self.body.fixed else self.links.index(trunk, 1)
 
     def _shapes(self) -> list[Shape]:
         if self.body.file.suffix == ".xml":

@@ -15,6 +15,15 @@ class Build:
 
 
 @dataclasses.dataclass(frozen=True)
+class SetEvents:
+    """Let the events of another spec act, which differs in nothing else."""
+
+    spec: dict[str, Any]
+    push: dict[str, Any] | None = None
+    """Parameters of `rlctl.task.events.push` and `every_s`: a push that the task does not offer."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Attach:
     """Map the shared arrays, with room for segments of `steps` steps."""
 
@@ -75,9 +84,10 @@ class Play:
     """Per environment the number of the training episode that begins where one ends; empty: none begins."""
 
 
-Message = Build | Attach | Reset | Step | ReplayActions | ComputeRewards | LoadPolicy | Play
+Message = Build | SetEvents | Attach | Reset | Step | ReplayActions | ComputeRewards | LoadPolicy | Play
 _TYPES: dict[str, type[Message]] = {
-    each.__name__: each for each in (Build, Attach, Reset, Step, ReplayActions, ComputeRewards, LoadPolicy, Play)
+    each.__name__: each
+    for each in (Build, SetEvents, Attach, Reset, Step, ReplayActions, ComputeRewards, LoadPolicy, Play)
 }
 
 

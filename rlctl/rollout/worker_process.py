@@ -34,6 +34,7 @@ from rlctl.rollout.worker_output import write_stderr
 from rlctl.run.env_info import describe
 from rlctl.run.policy import PolicyInfo
 from rlctl.task.env import TaskEnv
+from rlctl.task.events import Event, EventSettings, push
 
 
 class _Episode:
@@ -114,6 +115,23 @@ class Worker:
         self.arrays: SharedArrays
         self.player: Player
         self._states: NDArray[Any] | None = None
+
+    def set_events(self, message: messages.SetEvents) -> None:
+        """Let other events act in all environments; none of them is in an episode then."""
+        spec = EnvSpec(**message.spec)
+        added = (
+            {}
+            if message.push is None
+            else {"push at mid-episode": Event("interval", push, enabled=True, **message.push)}
+        )
+        for episode in self.episodes:
+            env = episode.env.unwrapped
+            if not isinstance(env, TaskEnv):
+                raise TypeError(f"{spec.task}: a plain Gymnasium environment has no events")
+            env.set_events(EventSettings(spec.randomize, spec.events), added)
+            env.set_level(spec.level)
+            episode.active = False
+        self.info = describe(self.episodes[0].env)
 
     def attach(self, message: messages.Attach) -> None:
         """Map the shared arrays."""
@@ -382,6 +400,9 @@ def _serve(connection: Connection, job: Job, spec: dict[str, Any]) -> None:
                 return {"ended": worker.replay_actions(message, connection.recv_bytes())}
             case messages.ComputeRewards():
                 return {"rewards": goal_rewards.compute_answer(worker.episodes[0].env, connection.recv_bytes())}
+            case messages.SetEvents():
+                worker.set_events(message)
+                return {"info": worker.info.model_dump()}
             case messages.Attach():
                 worker.attach(message)
             case messages.LoadPolicy():

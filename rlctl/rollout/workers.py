@@ -188,6 +188,20 @@ class Workers:
             self._send(worker, messages.Build(dataclasses.asdict(spec)))
         return self.info
 
+    def set_events(self, spec: EnvSpec, push: Mapping[str, Any] | None = None) -> EnvInfo:
+        """Let the events of `spec` act, which differs from the present one in nothing else; return what they are now.
+
+        Worlds, policy and arrays stay. `push` are the parameters, and `every_s`, of a push that the task does not have.
+        None of the environments is in an episode then.
+        """
+        self._wait_until_built()
+        self._spec = spec
+        answers = self._ask_all(
+            messages.SetEvents(dataclasses.asdict(spec), dict(push) if push else None), "changing events"
+        )
+        self._info = EnvInfo.model_validate(answers[0]["info"])
+        return self._info
+
     def reset(self, seeds: dict[int, int]) -> None:
         """Start an episode in some environments: environment index -> seed; a negative one lets it rest."""
         self._wait_until_built()

@@ -55,6 +55,8 @@ class Axis(_Content):
     values: list[float]
     nominal: float | None
     """The value of the world as it was built; None where it is not one number."""
+    whole: bool = False
+    """Whether only whole numbers are possible."""
 
 
 class RobustnessMap(_Content):

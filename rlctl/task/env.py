@@ -13,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, TaskError, did_you_mean
-from rlctl.task.events import EventSettings
+from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_methods, check_parameters, has_compute_reward, has_success
@@ -72,7 +72,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self._acting.try_once(["reset"], self.sim)
             task.reset(np.random.default_rng(0))
             self._acting.try_once(["start", "interval"], self.sim)
-            first = task.observe()
+            self._first = first = task.observe()
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
             self._signals.try_once()
             # A task knows its markers once an episode has begun; they join the world as it was built.
@@ -95,6 +95,16 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         if not 0.0 <= level <= 1.0:
             raise RecipeError(f"level: {level!r} is not in [0, 1]")
         self.level = float(level)
+
+    def set_events(self, events: EventSettings, added: Mapping[str, Event] | None = None) -> None:
+        """Let other events act: those of `events`, and `added` ones; the running episode is over, so call `reset`.
+
+        The world stays. Raises `RecipeError` as building the environment does.
+        """
+        self.events = events.apply({**self.task.events, **(added or {})})
+        self._acting = ActingEvents(self.events, self.task.control_dt)
+        self._signals = Signals(self.events, self._first, self.action_space, self.task.observation_bounds)
+        self._running = False
 
     def _build(self) -> None:
         self.task.sim = self.sim

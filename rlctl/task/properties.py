@@ -30,6 +30,7 @@ class Properties:
     id: int
     file: Path
     base_name: str
+    fixed: bool
     joint_names: list[str]
     joint_indices: list[int]
     _links: dict[str, int]
@@ -121,6 +122,26 @@ class Properties:
 
     def _select_links(self, links: Sequence[str]) -> list[int]:
         return [self._part_index(link) for link in links] or list(range(-1, len(self._links)))
+
+    def total_mass(self) -> float:
+        """Return the mass of all links as the world was built [kg]."""
+        return sum(dynamics.mass for dynamics in self._dynamics.values())
+
+    def find_trunk(self) -> str | None:
+        """Return what moves about: a free base, or what sliding joints without limits carry; None if nothing does."""
+        if not self.fixed:
+            return self.base_name
+        if not self._links:
+            return None
+        first = pybullet.getJointInfo(self.id, 0, physicsClientId=self.client)
+        limited = first[8] <= first[9]
+        if first[2] != pybullet.JOINT_PRISMATIC or limited:
+            return None
+        shapes = (
+            (name, pybullet.getCollisionShapeData(self.id, index, physicsClientId=self.client))
+            for name, index in self._links.items()
+        )
+        return next((name for name, shape in shapes if shape), None)
 
     def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
         """Set mass and inertia to `factor` times the built world's values, until the next reset."""

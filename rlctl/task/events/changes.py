@@ -18,7 +18,7 @@ from rlctl.task.sim import Sim
 Rng = np.random.Generator
 
 
-@acts_at("reset", "start", "interval")
+@acts_at("reset", "start", "interval", factor=1.0)
 def scale_mass(sim: Sim, rng: Rng, *, body: str, factor: Positive, links: Sequence[str] = ()) -> Drawn:
     """Scale the mass and inertia of `links`, or of the whole body, by one factor."""
     drawn = float(rng.uniform(*factor))
@@ -34,7 +34,7 @@ def set_friction(sim: Sim, rng: Rng, *, body: str, friction: NotNegative, links:
     return {"friction": drawn}
 
 
-@acts_at("reset", "start", "interval")
+@acts_at("reset", "start", "interval", change=0.0)
 def shift_gravity(sim: Sim, rng: Rng, *, change: Range) -> Drawn:
     """Add `change` [m/s^2] to the vertical gravity: -9.81 with (-0.5, 0.5) is -10.31 to -9.31."""
     drawn = float(rng.uniform(*change))
@@ -42,7 +42,7 @@ def shift_gravity(sim: Sim, rng: Rng, *, change: Range) -> Drawn:
     return {"change": drawn}
 
 
-@acts_at("reset", "start", "interval")
+@acts_at("reset", "start", "interval", factor=1.0)
 def scale_joint_damping(sim: Sim, rng: Rng, *, body: str, factor: NotNegative, joints: Sequence[str] = ()) -> Drawn:
     """Scale the damping of `joints`, or of all, by one factor."""
     drawn = float(rng.uniform(*factor))
@@ -58,7 +58,7 @@ def set_joint_damping(sim: Sim, rng: Rng, *, body: str, damping: NotNegative, jo
     return {"damping": drawn}
 
 
-@acts_at("reset", "start", "interval")
+@acts_at("reset", "start", "interval", factor=1.0)
 def scale_motor_strength(sim: Sim, rng: Rng, *, body: str, factor: NotNegative, joints: Sequence[str] = ()) -> Drawn:
     """Scale the force that the motors of `joints`, or of all, give by one factor."""
     drawn = float(rng.uniform(*factor))
@@ -76,7 +76,7 @@ def set_color(
     return dict(zip(("red", "green", "blue"), drawn, strict=True))
 
 
-@acts_at("start")
+@acts_at("start", position=0.0, velocity=0.0)
 def offset_joints(
     sim: Sim,
     rng: Rng,
@@ -106,7 +106,7 @@ def offset_joints(
     return drawn | {f"{name} velocity": float(by) for name, by in zip(names, by_velocity, strict=True)}
 
 
-@acts_at("start", "interval")
+@acts_at("start", "interval", force=0.0)
 def push(
     sim: Sim,
     rng: Rng,
@@ -129,7 +129,7 @@ def push(
     return drawn
 
 
-@acts_at("start", "interval")
+@acts_at("start", "interval", speed=0.0)
 def kick(sim: Sim, rng: Rng, *, body: str, speed: NotNegative) -> Drawn:
     """Change the velocity of the base, at once, by a horizontal `speed` [m/s] in a random direction."""
     kicked = sim.body(body)

@@ -29,15 +29,20 @@ _MOMENTS: tuple[When, ...] = typing.get_args(When)
 _ALL_MOMENTS = f"There are: {', '.join(_MOMENTS)}."
 _SETTINGS: Mapping[When, list[str]] = {"interval": ["every_s"], "observation": ["of"]}
 _acts_at: dict[Callable[..., Any], tuple[When, ...]] = {}
+_nominal: dict[Callable[..., Any], Mapping[str, float]] = {}
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def acts_at(*when: When) -> Callable[[_Function], _Function]:
-    """Mark an event function with the moments at which it makes sense; any, without this."""
+def acts_at(*when: When, **nominal: float) -> Callable[[_Function], _Function]:
+    """Mark an event function with the moments at which it makes sense; any, without this.
+
+    `nominal` are the values of parameters at which it changes nothing.
+    """
 
     def mark(function: _Function) -> _Function:
         _acts_at[function] = when
+        _nominal[function] = nominal
         return function
 
     return mark
@@ -82,6 +87,17 @@ class Event:
     def _signature(self) -> dict[str, inspect.Parameter]:
         found = list(inspect.signature(self.function).parameters.values())[2:]
         return {p.name: p for p in found if p.kind is not p.VAR_KEYWORD}
+
+    @property
+    def ranges(self) -> dict[str, Limits]:
+        """The parameters that are drawn from, those first that the task sets, with what they may hold."""
+        names = sorted(self._signature, key=lambda name: name not in self.parameters)
+        found = {name: _find_limits(self._hints.get(name)) for name in names}
+        return {name: limits for name, limits in found.items() if limits is not None}
+
+    def nominal(self, parameter: str) -> float | None:
+        """Return the value of a parameter at which nothing changes; None where there is no such number."""
+        return _nominal.get(self.function, {}).get(parameter)
 
     def with_parameters(self, name: str, changes: Mapping[str, Any]) -> Event:
         """Return this event, enabled, with some parameters replaced; `name` is for the error."""
@@ -130,13 +146,20 @@ class Event:
 
     def _read(self, where: str, key: str, value: Any, error: type[RlctlError]) -> Any:
         hint = self._hints.get(key)
-        limits = next((m for m in getattr(hint, "__metadata__", ()) if isinstance(m, Limits)), Limits())
+        limits = _find_limits(hint)
         widens = hint is None and isinstance(value, Mapping) and value.keys() == {"from", "to"}
-        if widens or hint == Range or getattr(hint, "__origin__", None) == Range:
-            return read_range(where, value, limits, error)
+        if widens or limits is not None:
+            return read_range(where, value, limits or Limits(), error)
         if hint is not None:
             _check_type(where, hint, value, error)
         return value
+
+
+def _find_limits(hint: Any) -> Limits | None:
+    """Return what a range of this type may hold; None for a type that is not a range."""
+    if hint != Range and getattr(hint, "__origin__", None) != Range:
+        return None
+    return next((m for m in getattr(hint, "__metadata__", ()) if isinstance(m, Limits)), Limits())
 
 
 def _check_type(where: str, hint: Any, value: Any, error: type[RlctlError]) -> None:

@@ -12,7 +12,7 @@ from rlctl.task.events.ranges import NotNegative, Steps
 Rng = np.random.Generator
 
 
-@acts_at("observation", "action")
+@acts_at("observation", "action", std=0.0)
 def noise(rng: Rng, first: Parts, *, std: NotNegative) -> tuple[Drawn, Signal]:
     """Add normal noise to every element at every step.
 
@@ -26,7 +26,7 @@ def noise(rng: Rng, first: Parts, *, std: NotNegative) -> tuple[Drawn, Signal]:
     return {"std": drawn}, disturb
 
 
-@acts_at("observation", "action")
+@acts_at("observation", "action", steps=0.0)
 def delay(rng: Rng, first: Parts, *, steps: Steps) -> tuple[Drawn, Signal]:
     """Pass everything on some control steps late; how many is drawn once per episode, both ends included.
 

@@ -1,0 +1,158 @@
+"""What `rlctl eval --vary` and `--push` print: heat maps and the push that a policy withstands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rlctl import output
+from rlctl.eval.vary import format_cell
+from rlctl.run.robustness import Axis, Cell, Outcome, PushTest, Robustness, RobustnessMap
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+_MOST_COLUMNS = 25  # of a map that is drawn
+_MOST_ROWS = 60
+_NOMINAL, _WORST = "*", "<"
+
+
+def show(result: Robustness, json: str | None) -> None:
+    """Print the maps and the push, or write the result as JSON."""
+    if json is not None:
+        output.write_result_json(json, result.model_dump(mode="json"))
+        return
+    out = output.out()
+    out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})", markup=False)
+    mode = "" if result.deterministic else ", sampled actions"
+    out.print(f"{result.episodes} episodes in every cell, the same seeds (seed {result.seed}){mode}")
+    out.print(f"nominal: {format_outcome(result.nominal)}")
+    worst = result.find_worst()
+    for each in result.maps:
+        out.print()
+        _show_map(each, worst[1] if worst else None)
+    if worst is not None:
+        found, cell = worst
+        out.print(f"\nworst: {format_cell(found, cell)}: {format_outcome(cell)}", markup=False)
+        settings = " ".join(
+            f"--set {axis.setting}={value:g}" for axis, value in zip(found.axes, cell.values, strict=True)
+        )
+        alone = f"rlctl eval {result.policy_file} --set randomize=false {settings}"
+        out.print(f"the same episodes alone: {alone}", markup=False)
+    if result.push is not None:
+        out.print()
+        _show_push(result.push)
+
+
+def format_outcome(outcome: Outcome) -> str:
+    """Return an outcome for people: `success 97.0 % (91.5 to 99.0), return 123 (119 to 127)`."""
+    parts = []
+    if outcome.success_rate is not None and outcome.success_interval is not None:
+        low, high = outcome.success_interval
+        parts.append(f"success {outcome.success_rate:.1%} ({low:.1%} to {high:.1%})")
+    interval = outcome.return_interval
+    spread = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
+    return ", ".join([*parts, f"return {outcome.mean_return:.4g}{spread}"])
+
+
+def _show_map(found: RobustnessMap, worst: Cell | None) -> None:
+    out = output.out()
+    columns, rows = len(found.axes[-1].values), len(found.cells) // len(found.axes[-1].values)
+    if len(found.axes) == 1 and columns <= _MOST_ROWS:
+        _show_list(found, worst)
+    elif columns <= _MOST_COLUMNS and rows <= _MOST_ROWS:
+        _show_grid(found, worst)
+    else:
+        out.print(f"{_name_axes(found.axes)}: {len(found.cells):,} cells, too many to draw; --json has them all")
+
+
+def _name_axes(axes: Sequence[Axis]) -> str:
+    return " x ".join(axis.name for axis in axes)
+
+
+def _show_list(found: RobustnessMap, worst: Cell | None) -> None:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    table.add_column(found.axes[0].name, justify="right", header_style="bold")
+    has_success = found.cells[0].success_rate is not None
+    for column in (*(("success", "95 % interval") if has_success else ()), "return", "95 % interval"):
+        table.add_column(column, justify="right", header_style="bold")
+    table.add_column("")
+    for cell, color in zip(found.cells, _color_cells(found), strict=True):
+        values: list[str | Text] = [f"{cell.values[0]:g}"]
+        if cell.success_rate is not None:
+            values += [_paint(f"{cell.success_rate:.1%}", color), _format_interval(cell.success_interval, percent=True)]
+        value = f"{cell.mean_return:.4g}"
+        values += [value if has_success else _paint(value, color), _format_interval(cell.return_interval)]
+        marks = [*(["nominal"] if cell.nominal else []), *(["worst"] if cell is worst else [])]
+        table.add_row(*values, ", ".join(marks))
+    output.out().print(table)
+
+
+def _format_interval(interval: tuple[float, float] | None, *, percent: bool = False) -> str:
+    if interval is None:
+        return "-"
+    low, high = interval
+    return f"{low:.1%} to {high:.1%}" if percent else f"{low:.4g} to {high:.4g}"
+
+
+def _show_grid(found: RobustnessMap, worst: Cell | None) -> None:
+    """Print a heat map: the first axis downwards, the second across."""
+    from rich.table import Table
+
+    down, across = found.axes
+    has_success = found.cells[0].success_rate is not None
+    table = Table(box=None, pad_edge=False, padding=(0, 0))
+    table.add_column(f"{down.name} \\ {across.name} ", justify="right", header_style="bold")
+    for value in across.values:
+        table.add_column(f" {value:.3g} ", justify="right", header_style="bold")
+    cells = list(zip(found.cells, _color_cells(found), strict=True))
+    width = len(across.values)
+    rows = [cells[start : start + width] for start in range(0, len(cells), width)]
+    for value, row in zip(down.values, rows, strict=True):
+        table.add_row(f"{value:.3g} ", *(_draw_cell(cell, color, cell is worst) for cell, color in row))
+    out = output.out()
+    out.print(table)
+    marks = [*([f"{_NOMINAL} nominal"] if any(cell.nominal for cell in found.cells) else []), f"{_WORST} worst"]
+    out.print(f"{'success [%]' if has_success else 'mean return'}; {', '.join(marks)}")
+
+
+def _draw_cell(cell: Cell, color: str, is_worst: bool) -> Text:
+    text = f"{cell.mean_return:.3g}" if cell.success_rate is None else f"{100 * cell.success_rate:.0f}"
+    mark = f"{_NOMINAL if cell.nominal else ''}{_WORST if is_worst else ''}"
+    return _paint(f" {text}{mark or ' '}", color)
+
+
+def _paint(text: str, color: str) -> Text:
+    from rich.text import Text
+
+    return Text(text, style=f"black on {color}")
+
+
+def _color_cells(found: RobustnessMap) -> list[str]:
+    """Return a colour per cell, from red over yellow to green: of success rates from 0 to 1, else of the returns."""
+    rates = [cell.success_rate for cell in found.cells]
+    returns = [cell.mean_return for cell in found.cells]
+    low, high = min(returns), max(returns)
+    parts = [
+        (mean - low) / (high - low or 1.0) if rate is None else rate for rate, mean in zip(rates, returns, strict=True)
+    ]
+    return [f"rgb({min(255, round(510 * (1 - part)))},{min(255, round(510 * part))},80)" for part in parts]
+
+
+def _show_push(push: PushTest) -> None:
+    from rich.table import Table
+
+    out = output.out()
+    what = push.body if push.link is None else f"{push.link} of {push.body}"
+    out.print(f"push on {what} in the middle of the episode, {push.duration_s:g} s, from a random side", markup=False)
+    table = Table(box=None, pad_edge=False)
+    name = "success" if push.measure == "success" else "up to the end"
+    for column in ("push [N s]", "of a speed of [m/s]", name, "return"):
+        table.add_column(column, justify="right", header_style="bold")
+    for level in push.levels:
+        speed = level.impulse / push.mass if push.mass else 0.0
+        table.add_row(f"{level.impulse:.3g}", f"{speed:.2g}", f"{level.held:.1%}", f"{level.mean_return:.4g}")
+    out.print(table)
+    out.print(push.verdict, markup=False)

@@ -1,0 +1,221 @@
+"""`rlctl eval --vary` and `--push`: how robust a policy is, with the same episodes in every cell."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from rlctl import output
+from rlctl.env_spec import EnvChanges, EnvSpec
+from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.eval import axes as axes_of
+from rlctl.eval.evaluate import EvalRequest, Gates, LoadedPolicy, choose_specs, load_player, start_workers
+from rlctl.eval.statistics import mean_return, return_interval, success_interval, success_rate
+from rlctl.rollout.acting import Exploration
+from rlctl.rollout.collect import play_episodes
+from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.run import lookup, robustness
+from rlctl.run.policy import collect_versions
+from rlctl.run.robustness import Axis, Cell, Outcome, PushTest, Robustness, RobustnessMap
+
+ASK_ABOVE_S = 600.0
+"""A measurement that takes longer than this [s] is begun only after asking."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RobustnessRequest:
+    """What the command line asks for, beside what every evaluation has."""
+
+    vary: Sequence[str] = ()
+    """`NAME=LOWEST:HIGHEST:VALUES`, one or two; or `all`."""
+    push: bool = False
+    yes: bool = False
+    """Do not ask before a long measurement."""
+
+
+class CellPlayer:
+    """Plays the same episodes in one environment after the other, in workers that stay."""
+
+    def __init__(self, workers: Workers, policy: LoadedPolicy, request: EvalRequest) -> None:
+        self.workers = workers
+        self._policy = policy
+        self._seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
+        self._exploration = Exploration(stochastic=not request.deterministic)
+
+    def play(self, spec: EnvSpec, push: dict[str, object] | None = None) -> list[EpisodeResult]:
+        """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`."""
+        workers = self.workers
+        if spec.parameters != workers.spec.parameters:
+            workers.rebuild(spec)
+            self._policy.give_to(workers)
+        if workers.info.reward_weights:  # a plain environment has no events
+            workers.set_events(spec, push)
+        return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration)]
+
+
+def measure_robustness(request: EvalRequest, wanted: RobustnessRequest, gates: Gates) -> Robustness:
+    """Measure a policy in every cell of the maps that are asked for, and keep the result with its run.
+
+    Random changes that the policy was trained with do not act, unless the request's own changes say so.
+    """
+    if request.stage == "all":
+        raise UsageError("--stage all: --vary and --push measure one stage")
+    if request.changes.randomize is None:
+        request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
+    found = lookup.find_policy(request.run, request.checkpoint)
+    output.print_notes(found.notes)
+    policy = load_player(found.file, request.deterministic)
+    (spec,) = [found.locate(each) for each in choose_specs(policy.info, request)]
+    maps = axes_of.read_axes(wanted.vary, spec) if wanted.vary else []
+    axes_of.count_cells(maps)
+    with start_workers(spec, request) as workers:
+        policy.give_to(workers)
+        nominal, measured, push = _measure(CellPlayer(workers, policy, request), spec, maps, wanted, gates)
+    result = Robustness(
+        task=spec.task,
+        parameters=dict(spec.parameters),
+        policy_file=str(found.file),
+        algo=policy.info.algo,
+        training_steps=policy.info.training_steps,
+        episodes=request.episodes,
+        seed=request.seed,
+        deterministic=request.deterministic,
+        nominal=nominal,
+        maps=measured,
+        push=push,
+        command=shlex.join(["rlctl", *sys.argv[1:]]),
+        versions=collect_versions(),
+    )
+    if found.run is not None and request.task in (None, policy.info.spec.task):
+        _keep(found.run.robustness_file, result)
+    return result
+
+
+def _measure(
+    player: CellPlayer, spec: EnvSpec, maps: Sequence[Sequence[Axis]], wanted: RobustnessRequest, gates: Gates
+) -> tuple[Outcome, list[RobustnessMap], PushTest | None]:
+    from rlctl.eval.push import measure_push
+
+    start = time.monotonic()
+    episodes = player.play(spec)
+    nominal = summarize(episodes)
+    gates.check_possible(nominal.success_rate is not None)
+    _ask(axes_of.count_cells(maps), time.monotonic() - start, wanted.yes)
+    measured = []
+    with _show_progress(axes_of.count_cells(maps)) as progress:
+        for axes in maps:
+            measured.append(RobustnessMap(axes=list(axes), cells=_play_cells(player, spec, axes, progress)))
+    push = measure_push(player, spec, episodes) if wanted.push else None
+    return nominal, measured, push
+
+
+def _play_cells(player: CellPlayer, spec: EnvSpec, axes: Sequence[Axis], on_cell: Callable[[], None]) -> list[Cell]:
+    places = list(itertools.product(*(axis.values for axis in axes)))
+    specs = [_combine(axes, values).apply(spec) for values in places]
+    cells: dict[int, Cell] = {}
+    # Another parameter of the task means other worlds: cells that share it are played one after the other.
+    for index in sorted(range(len(places)), key=lambda index: sorted(specs[index].parameters.items(), key=repr)):
+        outcome = summarize(player.play(specs[index]))
+        cells[index] = Cell(
+            **outcome.model_dump(), values=list(places[index]), nominal=_is_nominal(axes, places[index])
+        )
+        on_cell()
+    return [cells[index] for index in range(len(places))]
+
+
+def _combine(axes: Sequence[Axis], values: Sequence[float]) -> EnvChanges:
+    changes = [axes_of.change(axis, value) for axis, value in zip(axes, values, strict=True)]
+    events: dict[str, dict[str, object]] = {}
+    for each in changes:
+        for name, parameters in each.events.items():
+            events.setdefault(name, {}).update(parameters)
+    return EnvChanges({name: value for each in changes for name, value in each.parameters.items()}, events=events)
+
+
+def _is_nominal(axes: Sequence[Axis], values: Sequence[float]) -> bool:
+    pairs = zip(axes, values, strict=True)
+    return all(axis.nominal is not None and abs(axis.nominal - value) < 1e-9 for axis, value in pairs)
+
+
+def summarize(results: Sequence[EpisodeResult]) -> Outcome:
+    """Return the numbers of a cell's episodes, by the functions of every evaluation."""
+    return Outcome(
+        success_rate=success_rate(results),
+        success_interval=success_interval(results),
+        mean_return=mean_return(results),
+        return_interval=return_interval(results),
+    )
+
+
+def _ask(cells: int, seconds: float, yes: bool) -> None:
+    """Say how long many cells will take and ask whether to begin; raises `UsageError` where nobody can be asked."""
+    total = cells * seconds
+    if yes or total <= ASK_ABOVE_S:
+        return
+    expected = f"{cells:,} cells will take about {format_duration(total)}: the nominal one took {seconds:.1f} s"
+    if not sys.stdin.isatty():
+        raise UsageError(f"--vary: {expected}; take fewer values or --episodes, or begin all the same: --yes")
+    import typer
+
+    if not typer.confirm(f"{expected}; begin?", err=True):
+        raise UsageError("--vary: not begun")
+
+
+def format_duration(seconds: float) -> str:
+    """Return a time for people: `50 s`, `12 min`, `3.4 h`, `2.5 days`."""
+    for size, unit in ((86_400, "days"), (3600, "h")):
+        if seconds >= size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{seconds:.0f} s"
+
+
+@contextlib.contextmanager
+def _show_progress(cells: int) -> Iterator[Callable[[], None]]:
+    console = output.err()
+    if not console.is_terminal:
+        yield lambda: None
+        return
+    done, start = 0, time.monotonic()
+    with console.status("varying", spinner="dots" if output.is_utf8() else "line") as status:
+
+        def count() -> None:
+            nonlocal done
+            done += 1
+            left = (time.monotonic() - start) / done * (cells - done)
+            status.update(f"varying: cell {done} of {cells}, {format_duration(left)} left")
+
+        yield count
+
+
+def _keep(file: Path, result: Robustness) -> None:
+    """Write the result into its run, with what was measured before of the same policy in the same way."""
+    with contextlib.suppress(ArtifactError):
+        before = robustness.read(file)
+        same = ("task", "parameters", "policy_file", "training_steps", "episodes", "seed", "deterministic")
+        if all(getattr(before, name) == getattr(result, name) for name in same):
+            kept = {"maps": result.maps or before.maps, "push": result.push or before.push}
+            result = result.model_copy(update=kept)
+    try:
+        robustness.write(file, result)
+    except OSError as error:
+        output.err().print(f"warning: {file}: not written: {error.strerror}", markup=False)
+
+
+def check_gates(result: Robustness, gates: Gates) -> None:
+    """Raise `AnswerIsNo` if the worst cell of all maps misses a gate; without maps, the nominal one."""
+    found = result.find_worst()
+    where, outcome = ("nominal", result.nominal) if found is None else (format_cell(*found), found[1])
+    if missed := gates.list_missed(outcome.success_rate, outcome.success_interval, outcome.mean_return):
+        raise AnswerIsNo(f"gate missed in the worst cell, {where}: " + "; ".join(missed))
+
+
+def format_cell(found: RobustnessMap, cell: Cell) -> str:
+    """Return where a cell is: `mass 0.6, friction 0.2`."""
+    return ", ".join(f"{axis.name} {value:g}" for axis, value in zip(found.axes, cell.values, strict=True))
