@@ -14,6 +14,9 @@ from rlctl.errors import TaskError, did_you_mean
 from rlctl.task.bullet import pybullet
 
 
+_RAIL = 100.0  # [m]
+
+
 class _Dynamics(NamedTuple):
     mass: float  # [kg]
     friction: float
@@ -128,20 +131,18 @@ class Properties:
         return sum(dynamics.mass for dynamics in self._dynamics.values())
 
     def find_trunk(self) -> str | None:
-        """Return what moves about: a free base, or what sliding joints without limits carry; None if nothing does."""
+        """Return what moves about: a free base, or what rails carry, longer than 100 m; None if nothing does."""
         if not self.fixed:
             return self.base_name
         if not self._links:
             return None
         first = pybullet.getJointInfo(self.id, 0, physicsClientId=self.client)
-        limited = first[8] <= first[9]
+        limited = 0 <= first[9] - first[8] < _RAIL  # without limits the lower one is above the upper
         if first[2] != pybullet.JOINT_PRISMATIC or limited:
             return None
-        shapes = (
-            (name, pybullet.getCollisionShapeData(self.id, index, physicsClientId=self.client))
-            for name, index in self._links.items()
-        )
-        return next((name for name, shape in shapes if shape), None)
+        # PyBullet 3.2.7 crashes when it is asked for the collision shapes of a body of an MJCF file.
+        drawn = {shape[1] for shape in pybullet.getVisualShapeData(self.id, physicsClientId=self.client)}
+        return next((name for name, index in self._links.items() if index in drawn), None)
 
     def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
         """Set mass and inertia to `factor` times the built world's values, until the next reset."""

@@ -78,6 +78,6 @@ def test_threshold_of_known_rates():
     threshold, (low, high) = find_threshold([0.0, 1.0, 2.0], held)
     # From 0.8 at 1 to 0.2 at 2: half way.
     assert threshold == pytest.approx(1.5)
-    assert 1.0 < low < 1.5 < high < 2.0
+    assert 0.5 < low < 1.5 < high <= 2.0
     assert find_threshold([0.0, 1.0], held[:2]) == (None, None)
     assert find_threshold([0.0, 1.0], held[1:][::-1]) == (None, None)

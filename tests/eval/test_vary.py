@@ -74,11 +74,11 @@ def test_parameters_of_the_task_are_varied_too(block_run):
 
 
 def test_command_line_draws_the_map_and_gates_the_worst_cell(rlctl, block_run):
-    arguments = ("eval", block_run.path, "--episodes", 3, "--vary", "push=0:3:2", "--vary", "mass=1:2:2")
+    arguments = ("eval", block_run.path, "--episodes", 3, "--vary", "push=0:6:2", "--vary", "mass=1:2:2")
     done = rlctl(*arguments, "--min-success", "0.5")
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1] == (
-        "error: gate missed in the worst cell, push 3, mass 1: success rate 0.000 is below 0.5"
+        "error: gate missed in the worst cell, push 6, mass 1: success rate 0.000 is below 0.5"
     )
     lines = done.stdout.splitlines()
     assert lines[1:3] == [
@@ -88,12 +88,12 @@ def test_command_line_draws_the_map_and_gates_the_worst_cell(rlctl, block_run):
     assert [line.split() for line in lines[4:8]] == [
         ["push", "\\", "mass", "1", "2"],
         ["0", "100*", "100"],
-        ["3", "0<", "0"],
+        ["6", "0<", "0"],
         ["success", "[%];", "*", "nominal,", "<", "worst"],
     ]
-    assert lines[9].startswith("worst: push 3, mass 1: success 0.0% (0.0% to 56.2%), return -")
+    assert lines[9].startswith("worst: push 6, mass 1: success 0.0% (0.0% to 56.1%), return -")
     assert lines[10].startswith("the same episodes alone: rlctl eval ")
-    assert lines[10].endswith("--set randomize=false --set events.push.force=3 --set events.mass.factor=1")
+    assert lines[10].endswith("--set randomize=false --set events.push.force=6 --set events.mass.factor=1")
 
 
 def test_command_line_as_json(rlctl, block_run):
