@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError, did_you_mean
 from rlctl.task.bullet import pybullet
 
-
 _RAIL = 100.0  # [m]
 
 
