@@ -70,7 +70,7 @@ def check(
     or a hang of more than `env_timeout_s` seconds in a call included, is in the report.
     """
     started = time.monotonic()
-    records = Records(spec.task, normalizes=_normalizes(spec.task))
+    records = Records(spec.task, normalizes=lambda: _normalizes(spec.task))
     mistakes: list[UsageError] = []
 
     def receive(message: Message) -> None:
@@ -98,10 +98,10 @@ def check(
 
 def _normalizes(task: str) -> bool | None:
     """Say whether the recipe that comes with a task normalises observations."""
-    from rlctl.run import recipe
-
     if registry.find_recipe_file(task) is None:
         return None
+    from rlctl.run import recipe  # takes a quarter of a second
+
     normalize = recipe.resolve(task, None, {}).normalize
     return normalize is not None and normalize.observation
 

@@ -57,6 +57,8 @@ def _apply(rule: str, records: Records, verdict: Verdict) -> None:
         verdict.not_judged[rule] = str(reason)
     except NotApplicable as reason:
         verdict.not_applicable[rule] = str(reason)
+    except UsageError:  # the recipe that comes with the task
+        raise
     except Exception:  # a rule's bug must not hide what the other rules found, and must not look like a pass
         verdict.crashed[rule] = traceback.format_exc()
     else:

@@ -139,7 +139,7 @@ class Recording:
         except Exception:  # a ragged list, or an object of its own kind; its type is noted, and is a finding
             self._count_form("observation", type_name(value), index, None, None)
             return 0
-        self._count_form("observation", type_name(value), index, str(array.dtype), array.shape)
+        self._count_form("observation", type_name(value), index, array.dtype, array.shape)
         self._compare_memory(index, value, array)
         if array.shape != leaf.shape or array.dtype.kind not in "biuf":
             return 0
@@ -181,7 +181,11 @@ class Recording:
                 for name, (steps, values) in self._infos.items()
             },
             forms=[
-                Form(**dict(zip(names, key, strict=False)), step=step, count=count)
+                Form(**dict(zip(names, map(_plain, key), strict=False)), step=step, count=count)
                 for key, (step, count) in self._forms.items()
             ],
         )
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, np.dtype) else value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 from rlctl.check_env.finding import Finding, NotJudged
@@ -47,8 +48,8 @@ class Records:
     """Experiments that came to their end."""
     crashes: dict[str, str] = dataclasses.field(default_factory=dict)
     """Per experiment that crashed by itself, its traceback."""
-    normalizes: bool | None = None
-    """Whether the packaged recipe normalises observations; None without a recipe."""
+    normalizes: Callable[[], bool | None] = lambda: None
+    """Says whether the packaged recipe normalises observations; None without a recipe."""
     printed_lines: int = 0
     """Lines that the environment of the first process wrote to stdout."""
     printed_first: str = ""

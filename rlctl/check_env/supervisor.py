@@ -22,11 +22,11 @@ from rlctl.rollout.child_process import ChildProcess, LineReader
 from rlctl.rollout.shared_arrays import anonymous_file
 
 AT_ONCE = 2
-"""The libraries' checkers load torch, which takes as much memory as everything else: they wait for a place."""
+"""So many processes at once; the libraries' checkers wait for a place."""
 TOTAL_S = 26.0
 """What is left of this is for the libraries' checkers, the last to start [s]."""
 LEAST_CHECKERS_S = 8.0
-"""They get this much in any case: loading torch is part of it [s]."""
+"""They get this much in any case; Stable-Baselines3's may have to load torch [s]."""
 LEAST_REST_S = 4.0
 """A process that goes on for another one gets this much in any case [s]."""
 BUILD_TIMEOUT_S = 60.0
@@ -36,7 +36,7 @@ FIRST_CALL_TIMEOUT_S = 30.0
 CHECKER_CALLS = 40
 """A library's checker is one call to us; it makes at most so many calls into the environment."""
 IDLE_TIMEOUT_S = 300.0
-"""How long a child may do nothing with the environment: loading torch on a busy machine, at the worst."""
+"""How long a child may do nothing with the environment: loading libraries on a busy machine, at the worst."""
 _POLL_S = 0.1
 _KEPT_LINES = 8
 _PYBULLETS = ("pybullet build time", "argv[")

@@ -1,41 +1,48 @@
-"""How a child process sends what it has found: dataclasses as JSON, arrays beside it in `.npz`; nothing is pickled."""
+"""How a child process sends what it has found: dataclasses as JSON, arrays as bytes behind it; nothing is pickled."""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
-import io
 import json
+import math
+import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-_HEADER = "header"
 _PACKAGE = __name__.rpartition(".")[0]
 
 
 def encode(message: Any) -> bytes:
     """Return a dataclass of this package as bytes; it may hold others, arrays, and what JSON can hold."""
-    arrays: dict[str, NDArray[Any]] = {}
-    text = json.dumps(_to_plain(message, arrays)).encode()
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{_HEADER: np.frombuffer(text, np.uint8)}, **arrays)
-    return buffer.getvalue()
+    arrays: list[NDArray[Any]] = []
+    plain = _to_plain(message, arrays)
+    header = json.dumps([plain, [[each.dtype.str, each.shape] for each in arrays]]).encode()
+    return b"".join([struct.pack("<q", len(header)), header, *(each.tobytes() for each in arrays)])
 
 
 def decode(content: bytes) -> Any:
     """Return the dataclass that `encode` was given."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    return _from_plain(json.loads(arrays.pop(_HEADER).tobytes()), arrays)
+    (length,) = struct.unpack_from("<q", content)
+    start = 8 + length
+    plain, forms = json.loads(content[8:start])
+    arrays = []
+    for kind, shape in forms:
+        array = np.frombuffer(content, kind, math.prod(shape), start).reshape(shape)
+        arrays.append(array.copy())  # its own memory, which can be written
+        start += array.nbytes
+    return _from_plain(plain, arrays)
 
 
-def _to_plain(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+def _to_plain(value: Any, arrays: list[NDArray[Any]]) -> Any:
     if isinstance(value, np.ndarray):
-        name = f"array {len(arrays)}"
-        arrays[name] = value
-        return {"array": name}
+        if value.dtype.hasobject:
+            raise TypeError(f"an array of {value.dtype} cannot be sent")
+        arrays.append(value)
+        return {"array": len(arrays) - 1}
     if dataclasses.is_dataclass(value):
         fields = {field.name: _to_plain(getattr(value, field.name), arrays) for field in dataclasses.fields(value)}
         return {"class": f"{type(value).__module__}:{type(value).__name__}", "fields": fields}
@@ -48,7 +55,7 @@ def _to_plain(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _from_plain(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+def _from_plain(value: Any, arrays: Sequence[NDArray[Any]]) -> Any:
     if isinstance(value, list):
         return [_from_plain(each, arrays) for each in value]
     if not isinstance(value, dict):

@@ -57,6 +57,10 @@ def claim_stdout() -> None:
 
 def parse_changes(settings: list[str]) -> EnvChanges:
     """Read the `--set` options of a command that changes an environment."""
-    from rlctl.run.recipe import parse_changes
+    from rlctl.env_spec import UNCHANGED
+
+    if not settings:
+        return UNCHANGED
+    from rlctl.run.recipe import parse_changes  # takes a quarter of a second
 
     return parse_changes(settings)

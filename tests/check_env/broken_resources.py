@@ -2,7 +2,6 @@
 
 import multiprocessing
 import os
-import sys
 import threading
 import time
 
@@ -140,11 +139,3 @@ class SlowInWorker(Clean):
         super().__init__()
         if in_worker():
             time.sleep(100)
-
-
-class NeedsPath(Clean):
-    """Finds its module only where its folder is on the path."""
-
-    def __init__(self):
-        super().__init__()
-        assert any(entry.endswith("check_env") for entry in sys.path)

@@ -69,7 +69,7 @@ def test_scales_matter_as_far_as_nothing_normalises():
     evidence = records_of(f"{BROKEN}:Millimetres")
     severities = []
     for normalizes in (None, False, True):
-        findings = judge(dataclasses.replace(evidence, normalizes=normalizes)).findings
+        findings = judge(dataclasses.replace(evidence, normalizes=lambda: normalizes)).findings  # noqa: B023
         severities.append([str(finding.severity) for finding in findings if finding.rule == "RL112"])
     assert severities == [["info"], ["warning"], []]
 

@@ -7,12 +7,14 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from rlctl.check_env import families, judge
+from rlctl.check_env import families, judge, wire
 from rlctl.check_env.check import check
 from rlctl.check_env.experiment import Check
 from rlctl.check_env.finding import RULES
+from rlctl.check_env.messages import Fact, Series
 from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, UsageError
@@ -110,6 +112,33 @@ def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert run.stdout == "[]\n"
+
+
+def test_the_checker_of_sb3_is_loaded_without_torch_and_leaves_the_real_one():
+    code = (
+        "import sys, importlib.util, gymnasium; from rlctl.check_env.sb3_checker import load_sb3_checker; "
+        "load_sb3_checker()(gymnasium.make('Pendulum-v1').unwrapped); "
+        "print([name for name in sys.modules if name.partition('.')[0] in ('torch', 'stable_baselines3')], "
+        "importlib.util.find_spec('torch').origin.endswith('torch/__init__.py'))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert run.stdout == "[] True\n"
+    assert "We recommend you to use a symmetric and normalized Box action space" in run.stderr
+
+
+def test_messages_arrive_as_they_were_sent():
+    values = {0: Series(np.arange(3), np.zeros((3, 2), np.float32)), 1: Series(np.zeros(0, np.int64), np.array(True))}
+    sent = Fact("numbers", {"tuple": (1, "two"), "series": values, "numpy": np.float64(0.5)})
+    received = wire.decode(wire.encode(sent))
+    assert received.value["tuple"] == (1, "two")
+    assert received.value["numpy"] == 0.5
+    for key, series in values.items():
+        for name in ("steps", "values"):
+            one, other = getattr(series, name), getattr(received.value["series"][key], name)
+            assert (one.dtype, one.shape) == (other.dtype, other.shape)
+            np.testing.assert_array_equal(one, other)
+    with pytest.raises(TypeError, match="object cannot be sent"):
+        wire.encode(Fact("objects", np.array([None])))
 
 
 def test_a_rule_that_crashes_is_no_pass(monkeypatch):

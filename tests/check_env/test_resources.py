@@ -2,9 +2,12 @@
 
 import pytest
 
+from rlctl.check_env import supervisor
+from rlctl.check_env.check import check
 from rlctl.check_env.families import resources
 from rlctl.check_env.finding import NotJudged
-from tests.check_env.judging import case, check_case, findings
+from rlctl.env_spec import EnvSpec
+from tests.check_env.judging import FOLDER, case, check_case, findings
 
 FILE = "broken_resources.py"
 CASES = [
@@ -16,7 +19,6 @@ CASES = [
     case(f"{FILE}:ClassObservations", ("RL404", "info")),
     case(f"{FILE}:SharedGenerator", ("RL404", "warning")),
     case(f"{FILE}:StartsProcess", ("RL406", "error")),
-    case(f"{FILE}:ExitsInWorker", ("RL406", "error")),
 ]
 
 
@@ -74,18 +76,20 @@ def test_too_few_resets_are_not_judged():
 
 def test_the_worker_says_what_it_raised():
     finding = the_finding("StartsProcess", "RL406")
-    assert finding.message.startswith("in a spawned, daemonic worker build raises TaskError: task ")
+    assert finding.message.startswith("in a daemonic worker build raises TaskError: task ")
     assert "AssertionError: daemonic processes are not allowed to have children" in finding.message
     assert finding.evidence["call"] == "build"
-    finding = the_finding("ExitsInWorker", "RL406")
-    assert finding.message == "in a spawned, daemonic worker reset ended with exit code 3"
 
 
-def test_a_worker_that_hangs_is_a_finding(monkeypatch):
-    monkeypatch.setattr(resources, "WORKER_HANG_S", 0.3)
-    finding = the_finding("SlowInWorker", "RL406")
-    assert finding.message == "in a spawned, daemonic worker build did not come back in 0.3 s"
-
-
-def test_the_path_reaches_the_worker():
-    assert findings(f"{FILE}:NeedsPath", "RL406") == []
+@pytest.mark.parametrize(
+    ("name", "end"),
+    [
+        ("ExitsInWorker", "ends the process: it ended with exit code 3"),
+        ("SlowInWorker", "hangs: it did not come back in 1 s"),
+    ],
+)
+def test_a_worker_that_ends_or_hangs_is_a_finding(name, end, monkeypatch):
+    monkeypatch.setattr(supervisor, "BUILD_TIMEOUT_S", 1.0)
+    (finding,) = check(EnvSpec(str(FOLDER / f"{FILE}:{name}")), rules=["RL406"], env_timeout_s=1.0).verdict.findings
+    assert (finding.rule, finding.severity) == ("RL406", "error")
+    assert finding.message == f"use in a daemonic worker {end}"

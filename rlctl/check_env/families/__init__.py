@@ -99,7 +99,6 @@ PROCESSES = {
             actions.compare_actions,
             attributes.read_attributes,
             variants.play_variants,
-            resources.build_in_worker,
             actions.exceed_bounds,
             interface.step_before_reset,
             interface.close_twice,
@@ -108,9 +107,11 @@ PROCESSES = {
         ),
         hash_seed=1,  # another one, so that hash order shows
     ),
-    "checkers": Process((library_checkers.run_gymnasium_checker, library_checkers.run_sb3_checker)),
+    "checkers": Process(
+        (library_checkers.run_gymnasium_checker, library_checkers.run_sb3_checker, resources.build_in_worker)
+    ),
 }
-"""The child processes; the last one loads torch, and waits for a place."""
+"""The child processes; the last one waits until there is a place for it."""
 
 CHECKERS = ("gymnasium checker", "sb3 checker")
 

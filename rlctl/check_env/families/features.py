@@ -158,8 +158,6 @@ def _line(x: Numbers, y: Numbers, precision: float) -> tuple[float, float] | Non
 @check("RL112", *WITH_SEARCH)
 def find_unequal_scales(records: Records) -> Iterator[Finding]:
     built = records.require_built()
-    if records.normalizes:
-        return
     for index, _, rows in _vectors(records):
         rows = rows[np.isfinite(rows).all(axis=1)]
         deviations = rows.std(axis=0)
@@ -167,13 +165,15 @@ def find_unequal_scales(records: Records) -> Iterator[Finding]:
         ordered = moving[np.argsort(deviations[moving])]
         if len(ordered) < 2 or deviations[ordered[-1]] <= APART * deviations[ordered[0]]:
             continue
+        if normalizes := records.normalizes():
+            return
         large, small = int(ordered[-1]), int(ordered[0])
         ratio, names = float(deviations[large] / deviations[small]), [built.element(index, i) for i in (large, small)]
-        recipe = "no recipe says to normalise" if records.normalizes is None else "the recipe does not normalise"
+        recipe = "no recipe says to normalise" if normalizes is None else "the recipe does not normalise"
         yield Finding(
             "RL112",
             f"{names[0]} varies by {deviations[large]:.3g}, {names[1]} by {deviations[small]:.3g}: {ratio:.2g} times "
             f"less, and {recipe}",
             {"value": ratio, "expected": f"up to {APART:g}", "elements": names},
-            Severity.INFO if records.normalizes is None else Severity.WARNING,
+            Severity.INFO if normalizes is None else Severity.WARNING,
         )

@@ -34,7 +34,7 @@ def run_gymnasium_checker(context: Context) -> Iterator[Message]:
 @experiment("sb3 checker", share=10.0)
 def run_sb3_checker(context: Context) -> Iterator[Message]:
     """Run Stable-Baselines3's checker on an instance of its own."""
-    yield _run(SB3, context, _load_sb3s)  # loads torch, which takes seconds
+    yield _run(SB3, context, _load_sb3s)
 
 
 def _load_gymnasiums() -> Callable[[Any], None]:
@@ -52,8 +52,9 @@ def _load_gymnasiums() -> Callable[[Any], None]:
 
 
 def _load_sb3s() -> Callable[[Any], None]:
-    from stable_baselines3.common.env_checker import check_env
+    from rlctl.check_env.sb3_checker import load_sb3_checker
 
+    check_env = load_sb3_checker()
     return lambda env: check_env(_without_gymnasiums_wrappers(env))
 
 

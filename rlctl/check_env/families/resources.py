@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import dataclasses
 import gc
-import json
 import multiprocessing
 import os
 import sys
-import time
-import traceback
-from collections.abc import Callable, Iterator
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from rlctl.check_env.actions import actions
 from rlctl.check_env.bullet_clients import connected
 from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
-from rlctl.check_env.failures import EnvironmentRaised, describe, failure
+from rlctl.check_env.failures import EnvironmentRaised, failure
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.messages import FIRST_SEED, Fact, Message
 from rlctl.check_env.records import Records
@@ -47,10 +39,6 @@ MEMORY_GROWTH = 8 * 2**20
 fills the memory of 16 workers in a day."""
 LATER_SHARE = 0.4
 """Of the growth, so much must be in the second half: what fills once slows down, a leak does not."""
-WORKER_HANG_S = 10.0
-"""A call in the worker that takes longer hangs: each took less than a second or two in this process, or its time
-would be over before this is tried [s]."""
-WORKER_S = 30.0
 
 _PROCESS = Path("/proc/self")
 
@@ -160,87 +148,30 @@ def _report(
     return Finding("RL405", message, evidence, severity)
 
 
-@experiment("worker build", share=3.0)
+@experiment("worker build", "RL406", provokes="use in a daemonic worker")
 def build_in_worker(context: Context) -> Iterator[Message]:
-    """Build, reset, step and close in a worker as Stable-Baselines3's SubprocVecEnv starts them: spawned, daemonic."""
-    spawn = multiprocessing.get_context("spawn")
-    ours, theirs = spawn.Pipe(duplex=False)
-    worker = spawn.Process(target=_work, args=(theirs, json.dumps(dataclasses.asdict(context.spec))), daemon=True)
-    worker.start()
-    theirs.close()
+    """Build, reset, step and close in a daemonic process, as the workers of Stable-Baselines3's SubprocVecEnv are."""
+    process = multiprocessing.current_process()
+    process.daemon = True  # nothing else is different there: each process of a check is a fresh interpreter
     try:
-        call, error, details = _follow(ours, worker, context.budget.seconds_left)
-    finally:
-        ours.close()
-        worker.kill()
-        worker.join()
-    yield Fact("worker", {"call": call, "error": error, "details": details})
-
-
-def _follow(connection: Connection, worker: SpawnProcess, seconds_left: float) -> tuple[str, str, str | None]:
-    """Follow the worker to its end, or to where it fails; return its last call, what went wrong, and a traceback."""
-    deadline = time.monotonic() + min(WORKER_S, seconds_left)
-    call = "import"
-    while True:
-        left_s = deadline - time.monotonic()
-        limit_s = left_s if call == "import" else min(WORKER_HANG_S, left_s)
-        if not connection.poll(max(0.0, limit_s)):
-            if limit_s < WORKER_HANG_S or call == "import":
-                raise NotJudged("there was too little time for a worker process")
-            return call, f"did not come back in {limit_s:g} s", None
-        try:
-            message = json.loads(connection.recv_bytes())
-        except EOFError:
-            worker.join(5.0)
-            code = worker.exitcode
-            how = f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
-            return call, how, None
-        if "error" in message:
-            return call, f"raises {message['error']}", message["details"]
-        if message["call"] == "done":
-            return call, "", None
-        call = message["call"]
-
-
-def _work(connection: Connection, spec: str) -> None:
-    def send(**message: Any) -> None:
-        connection.send_bytes(json.dumps(message).encode())
-
-    try:
-        _play(json.loads(spec), lambda call: send(call=call))
-    except BaseException as error:  # `SystemExit` too: an environment may raise anything
-        send(error=describe(error), details=traceback.format_exc())
+        with context.fresh() as instance:
+            for _ in Episode(instance, FIRST_SEED, max_steps=1):
+                pass
+    except EnvironmentRaised as error:
+        yield Fact("worker", failure(error, context.progress))
     else:
-        send(call="done")
-
-
-def _play(spec: dict[str, Any], enter: Callable[[str], None]) -> None:
-    from rlctl import env_spec, registry
-
-    enter("load")
-    made_from = env_spec.EnvSpec(**spec)
-    registry.load(made_from.task)
-    enter("build")
-    env = made_from.make()
-    enter("reset")
-    env.reset()
-    enter("step")
-    env.step(next(actions(env.action_space, "random", FIRST_SEED)))
-    enter("close")
-    with contextlib.suppress(Exception):  # closing is tried elsewhere
-        env.close()
+        yield Fact("worker", None)
+    finally:
+        process.daemon = False
 
 
 @check("RL406", "worker build")
 def find_failure_in_worker(records: Records) -> Iterator[Finding]:
-    worker = records.require_fact("worker", "worker build")
-    if not worker["error"]:
+    failed = records.require_fact("worker", "worker build")
+    if failed is None:
         return
     if any(each.call in ("load", "build") for each in records.failures):
         raise NotJudged("a second instance cannot be built at all (RL403)")
-    if any(each.call == worker["call"] for each in records.failures):
-        raise NotJudged(f"{worker['call']} fails outside of a worker, too")
-    doing = "the import" if worker["call"] in ("import", "load") else worker["call"]
-    details = {"traceback": worker["details"]} if worker["details"] else {}
-    message = f"in a spawned, daemonic worker {doing} {worker['error']}"
-    yield Finding("RL406", message, {"call": worker["call"], **details})
+    if any(each.call == failed.call for each in records.failures):
+        raise NotJudged(f"{failed.call} fails outside of a worker, too")
+    yield Finding("RL406", f"in a daemonic worker {failed.call} raises {failed.error}", failed.place)

@@ -80,7 +80,7 @@ def find_badly_scaled(records: Records) -> Iterator[Finding]:
     else:
         return
     evidence = at_step(largest, step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
-    yield Finding("RL603", message, evidence, Severity.INFO if records.normalizes else Severity.WARNING)
+    yield Finding("RL603", message, evidence, Severity.INFO if records.normalizes() else Severity.WARNING)
 
 
 @check("RL607", *WITH_SEARCH)

@@ -21,7 +21,7 @@ from rlctl.check_env.sampling import Sampler, Samples, Stopwatch, TimedCall
 FIRST_SPEED_SEED = 5000
 TIMED_STEPS = 200
 TIMED_RESETS = 5
-SAMPLED_S = 0.25
+SAMPLED_S = 0.15
 """How long steps are sampled, and resets: some hundred samples each [s]."""
 MOST_STEPS = 20_000
 """So many steps, or resets, are enough."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,13 @@ from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
+from rlctl.check_env.instance import Instance
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
-from rlctl.run.env_info import EnvInfo
-from rlctl.run.env_info import describe as describe_env
-from rlctl.run.recipe import read, validate
+
+if TYPE_CHECKING:
+    from rlctl.run.env_info import EnvInfo
 
 STEPS = 60
 """Of each variant: an event at an interval of a second acts in them."""
@@ -33,7 +34,7 @@ def play_variants(context: Context) -> Iterator[Message]:
     if not registry.is_task(type(task)):
         raise NotApplicable("events and stages are those of a rlctl.task.Task")
     try:
-        repeats = _play(context, context.spec)[1]
+        repeats = _play(context, context.spec)
     except EnvironmentRaised:
         raise NotJudged("the task raises whatever the events (RL2)") from None
     if task.events:
@@ -49,7 +50,11 @@ def play_variants(context: Context) -> Iterator[Message]:
 def _find_stages(name: str, task: Any) -> Sequence[Any]:
     """Return the stages that training would use: those of the recipe that comes with the task, or of its class."""
     file = registry.find_recipe_file(name)
-    stages = read(file).get("stages", task.stages) if file else task.stages
+    stages = task.stages
+    if file is not None and "stages" in file.read_text(encoding="utf-8", errors="replace"):
+        from rlctl.run.recipe import read  # pydantic's models take a quarter of a second to load
+
+        stages = read(file).get("stages", stages)
     return stages if isinstance(stages, list | tuple) else ()  # another type is refused with the recipe
 
 
@@ -57,7 +62,7 @@ def _play_events(context: Context, repeats: bool) -> Iterator[Finding]:
     for randomize in {True, False} - {context.spec.randomize}:
         where = f"with randomize={str(randomize).lower()}"
         try:
-            _, same = _play(context, dataclasses.replace(context.spec, randomize=randomize))
+            same = _play(context, dataclasses.replace(context.spec, randomize=randomize))
         except EnvironmentRaised as error:
             yield Finding("RL011", f"{where}: {_explain(error)}")
             continue
@@ -67,6 +72,8 @@ def _play_events(context: Context, repeats: bool) -> Iterator[Finding]:
 
 
 def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[Finding]:
+    from rlctl.run.recipe import validate
+
     spec, first = context.spec, None
     settings = {"task": spec.parameters, "events": spec.events, "randomize": spec.randomize, "stages": list(stages)}
     try:
@@ -76,7 +83,7 @@ def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[Finding]:
         return
     for number, each in enumerate(specs, start=1):
         try:
-            info, _ = _play(context, each)
+            info = _describe(context, each)
         except EnvironmentRaised as error:
             yield Finding("RL012", f"stage {number} of {len(specs)}: {_explain(error)}")
             continue
@@ -86,16 +93,26 @@ def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[Finding]:
             yield Finding("RL012", f"stage {number} of {len(specs)}: {difference}", fix=fix)
 
 
-def _play(context: Context, spec: EnvSpec) -> tuple[EnvInfo, bool]:
-    """Return what the environment of `spec` is, and whether two episodes of one seed in it are equal."""
+def _play(context: Context, spec: EnvSpec) -> bool:
+    """Say whether two episodes of one seed are equal in the environment of `spec`."""
     with Context(spec, context.progress).fresh() as instance:
-        deadline = context.budget.deadline
-        episodes = [
-            np.concatenate([_flatten(moment.observation) for moment in episode])
-            for episode in (Episode(instance, FIRST_SEED, max_steps=STEPS, deadline=deadline) for _ in range(2))
-        ]
-        shortest = min(len(each) for each in episodes)  # where time was up
-        return describe_env(instance.env), bool(np.array_equal(episodes[0][:shortest], episodes[1][:shortest]))
+        episodes = [_record(context, instance) for _ in range(2)]
+    shortest = min(len(each) for each in episodes)  # where time was up
+    return bool(np.array_equal(episodes[0][:shortest], episodes[1][:shortest]))
+
+
+def _describe(context: Context, spec: EnvSpec) -> EnvInfo:
+    """Play an episode in the environment of `spec`; return what it is."""
+    from rlctl.run import env_info
+
+    with Context(spec, context.progress).fresh() as instance:
+        _record(context, instance)
+        return env_info.describe(instance.env)
+
+
+def _record(context: Context, instance: Instance) -> NDArray[np.float64]:
+    episode = Episode(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
+    return np.concatenate([_flatten(moment.observation) for moment in episode])
 
 
 def _explain(error: EnvironmentRaised) -> str:

@@ -13,7 +13,6 @@ from rlctl.check_env.check import Report
 from rlctl.check_env.families.speed import format_speed
 from rlctl.check_env.finding import FAMILIES, RULES, Finding, Severity
 from rlctl.check_env.formats.ranges import Row, action_rows, observation_rows
-from rlctl.run.env_info import describe_randomization
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -118,8 +117,10 @@ def _facts(report: Report) -> Iterator[str]:
         if len(built.action_leaves) > 1:
             yield from _table(action_rows(report.records))
         yield f"speed {format_speed(report.records) or 'not measured'}"
-        if randomization := describe_randomization(built.events):
-            yield f"events: {randomization}"
+        if built.events:
+            from rlctl.run.env_info import describe_randomization
+
+            yield f"events: {describe_randomization(built.events)}"
     if verdict.crashed:
         yield f"crashed: {', '.join(verdict.crashed)}; what they would find is not known"
     if built is None:
