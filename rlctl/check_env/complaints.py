@@ -27,6 +27,12 @@ NOISE = tuple(
 )
 """Complaints that say nothing about an environment's quality."""
 
+EXPLAINED = (
+    (re.compile(r"support for the `seed` function is dropped"), {"RL202", "RL210", "RL301", "RL302", "RL308"}),
+    (re.compile(r"precision lowered by casting"), {"RL102", "RL103", "RL106"}),
+)
+"""Complaints that no rule owns, and rules that name the cause of one where they have found something."""
+
 UNOWNED = {GYMNASIUM: "RL290", SB3: "RL291"}
 """The rule that owns what no other rule does, per checker."""
 
@@ -47,6 +53,8 @@ def judge_complaints(records: Records, rules: Collection[str], found: Collection
     owned: dict[str, list[Complaint]] = {}
     for complaint in records.complaints:
         if any(pattern.search(complaint.text) for pattern in NOISE):
+            continue
+        if any(pattern.search(complaint.text) and not causes.isdisjoint(found) for pattern, causes in EXPLAINED):
             continue
         owners = [rule.id for rule in RULES.values() if rule.owns(complaint.text)]
         if any(owner in found for owner in owners):

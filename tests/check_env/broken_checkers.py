@@ -17,6 +17,23 @@ class RewardOfNoGoal(Clean):
         return 0.0
 
 
+class OwnReward(Clean):
+    """A method of that name which is not for goals."""
+
+    def compute_reward(self):
+        return 0.0
+
+
+class SeedsItself(Clean):
+    """Old gym's way of seeding, which no longer reaches the environment."""
+
+    def seed(self, seed=None):
+        return [seed]
+
+    def start(self):
+        self.position = np.random.default_rng().uniform(-0.5, 0.5, 2).astype(np.float32)
+
+
 class Goal(Clean):
     """The point has to go to a place that is drawn: nothing is wrong with it."""
 

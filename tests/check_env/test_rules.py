@@ -64,7 +64,7 @@ CASES = [
     case("broken_envs.py:EndsAtOnce", ("RL504", "warning")),
     case("broken_envs.py:NanReward", ("RL601", "error")),
     case("broken_checkers.py:OwnSeed", ("RL290", "info")),
-    case("broken_checkers.py:RewardOfNoGoal", ("RL291", "error")),
+    case("broken_checkers.py:RewardOfNoGoal", ("RL291", "error"), twin="broken_checkers.py:OwnReward"),
     case("broken_checkers.py:OtherReward", ("RL614", "error"), twin="broken_checkers.py:Goal"),
     case("broken_checkers.py:OneByOne", ("RL614", "error"), twin="broken_checkers.py:RoundedReward"),
     case("broken_checkers.py:ArrayReward", ("RL614", "warning")),
@@ -109,6 +109,15 @@ def test_hindsight_rewards_are_compared():
     (finding,) = findings("broken_checkers.py:OtherReward", "RL614")
     # Each reward is 0.5 below what compute_reward says.
     assert finding.evidence["value"] - finding.evidence["expected"] == pytest.approx(0.5)
+
+
+def test_goals_that_are_not_arrays_are_not_asked_for_rewards_by_sb3():
+    rules, checker = ("RL101", "RL207", "RL291", "RL614"), ("sb3 checker",)
+    assert found("broken_checkers.py:NestedGoal", *rules, also_needs=checker) == set()
+
+
+def test_a_complaint_whose_cause_another_rule_names_is_left_out():
+    assert found("broken_checkers.py:SeedsItself", "RL290", "RL301") == {("RL301", "error")}
 
 
 def test_an_assertion_without_a_message_is_quoted(tmp_path):

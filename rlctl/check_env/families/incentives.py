@@ -117,6 +117,8 @@ def find_paid_hovering(records: Records) -> Iterator[Finding]:
     others = [each for each in records.role("search") if each.steps and not _finishes(each, is_reported)]
     longest = longest_episode(records, episodes)
     pairs = [pair for one in finished for two in others if (pair := pair_up(one, two, longest)) is not None]
+    if not is_reported:
+        pairs = [pair for pair in pairs if pair.finishing > 0]  # an end that costs more than it pays is no goal
     if not pairs:
         raise NotJudged("no episode that stops just before the goal could be played")
     best = max(pairs, key=lambda pair: pair.hovering - pair.finishing)
@@ -138,7 +140,8 @@ def _finishes(episode: Trajectory, success_is_reported: bool) -> bool:
     if success_is_reported:
         return ends_in_success(episode)
     begin = episode.rewards[: episode.steps // 2]
-    return len(begin) > 1 and bool(episode.rewards[-1] > begin.max() + FAR_ABOVE * np.ptp(begin))
+    last = episode.rewards[-1]
+    return len(begin) > 1 and bool(last > begin.max() + FAR_ABOVE * np.ptp(begin) and last >= episode.rewards.max())
 
 
 def pair_up(one: Trajectory, two: Trajectory, longest: int) -> Pair | None:

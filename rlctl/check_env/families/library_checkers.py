@@ -18,6 +18,7 @@ from typing import Any
 from rlctl.check_env.context import Context
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import describe
+from rlctl.check_env.families.hindsight import GOALS
 from rlctl.check_env.messages import GYMNASIUM, RAISED, SB3, Checked, Complaint, Message
 
 _LIBRARIES = re.compile(r"[/\\](gymnasium|stable_baselines3|rlctl[/\\]check_env)[/\\](?!envs[/\\])")
@@ -55,7 +56,40 @@ def _load_sb3s() -> Callable[[Any], None]:
     from rlctl.check_env.sb3_checker import load_sb3_checker
 
     check_env = load_sb3_checker()
-    return lambda env: check_env(_without_gymnasiums_wrappers(env))
+
+    def check(env: Any) -> None:
+        env = _without_gymnasiums_wrappers(env)
+        check_env(_without_goals(env) if _has_other_compute_reward(env) else env)
+
+    return check
+
+
+def _has_other_compute_reward(env: Any) -> bool:
+    """Say whether `compute_reward` is not for goals that are arrays, for which SB3's checker takes any such method."""
+    compute = getattr(getattr(env, "unwrapped", env), "compute_reward", None)
+    if not callable(compute):
+        return False
+    try:
+        inspect.signature(compute).bind(*GOALS, "info")
+    except (TypeError, ValueError):
+        return True
+    parts = getattr(getattr(env, "observation_space", None), "spaces", None)
+    return isinstance(parts, dict) and any(hasattr(parts.get(name), "spaces") for name in GOALS)
+
+
+def _without_goals(env: Any) -> Any:
+    """Return an environment that does the same and has no `compute_reward`."""
+    import gymnasium
+
+    if not isinstance(env, gymnasium.Env):
+        return env
+
+    class WithoutGoals(gymnasium.Wrapper[Any, Any, Any, Any]):
+        @property
+        def unwrapped(self) -> Any:
+            return self
+
+    return WithoutGoals(env)
 
 
 def _without_gymnasiums_wrappers(env: Any) -> Any:
