@@ -13,6 +13,8 @@ pytest.register_assert_rewrite("tests.crash.contract", "tests.train.comparing")
 PARTS = 101
 """A test that repeats itself is in so many parts, of which the first runs with all other tests."""
 
+ALGORITHMS = ["ppo", pytest.param("sac", marks=pytest.mark.crash)]
+
 
 def parts(function):
     """Let a test run in parts: it takes those of its trials whose number leaves `part` when divided by `PARTS`."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.crash.conftest import PARTS, parts
+from tests.crash.conftest import ALGORITHMS, PARTS, parts
 from tests.crash.contract import assert_nothing_lost, assert_quiet, assert_same_end
 from tests.crash.trials import ARGUMENTS, only_run
 
@@ -17,7 +17,7 @@ def errors(part, operations, each=3):
 
 
 @parts
-@pytest.mark.parametrize("name", ["ppo", "sac"])
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_error_once_costs_nothing(trials, whole, folders, name, part):
     before = whole(name)
     for at, error in errors(part, before.operations):
@@ -33,7 +33,7 @@ def test_an_error_once_costs_nothing(trials, whole, folders, name, part):
 
 
 @parts
-@pytest.mark.parametrize("name", ["ppo", "sac"])
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_short_writes_cost_nothing(trials, whole, folders, name, part):
     before = whole(name)
     for at in range(part or PARTS, before.operations + 1, PARTS):
@@ -45,7 +45,7 @@ def test_short_writes_cost_nothing(trials, whole, folders, name, part):
 
 
 @parts
-@pytest.mark.parametrize("name", ["ppo", "sac"])
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_disk_that_has_failed_for_good(trials, whole, folders, name, part):
     before = whole(name)
     final = before.announced

@@ -15,8 +15,13 @@ def every(part, operations):
 
 
 @parts
-@pytest.mark.parametrize("fault", ["kill", "half", "power"])
-@pytest.mark.parametrize("name", ["ppo", "sac"])
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        *(("ppo", "kill"), ("ppo", "half"), ("ppo", "power"), ("sac", "kill")),
+        *(pytest.param("sac", fault, marks=pytest.mark.crash) for fault in ("half", "power")),
+    ],
+)
 def test_killed_at_an_operation(trials, whole, folders, name, fault, part):
     before = whole(name)
     for at in every(part, before.operations):
@@ -44,7 +49,7 @@ def half_done(trials, whole, tmp_path_factory):
 
 
 @parts
-@pytest.mark.parametrize(("name", "saved"), [("ppo", 0), ("ppo", 16), ("sac", 16)])
+@pytest.mark.parametrize(("name", "saved"), [pytest.param("ppo", 0, marks=pytest.mark.crash), ("ppo", 16), ("sac", 16)])
 def test_killed_again_while_resuming(trials, whole, half_done, folders, name, saved, part):
     before = half_done(name, saved)
     first = next(folders)

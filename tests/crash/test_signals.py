@@ -32,7 +32,9 @@ def cases(some):
 
 
 @pytest.mark.parametrize(("phase", "number"), cases(SOME))
-@pytest.mark.parametrize("everybody", [False, True], ids=["alone", "everybody"])
+@pytest.mark.parametrize(
+    "everybody", [pytest.param(False, id="alone"), pytest.param(True, id="everybody", marks=pytest.mark.crash)]
+)
 def test_a_signal_in_a_phase(trials, whole, tmp_path, phase, number, everybody):
     before = whole("ppo")
     ended = trials.run(

@@ -59,7 +59,14 @@ def test_export_is_verified(algo, observation, action, small, train, write):
     assert sorted(each.name for each in path.parent.iterdir()) == ["policy.onnx", "policy.safetensors"]
 
 
-@pytest.mark.parametrize(("algo", "task"), [("ppo", "reach"), ("sac", "Pendulum-v1"), ("dqn", "CartPole-v1")])
+@pytest.mark.parametrize(
+    ("algo", "task"),
+    [
+        ("ppo", "reach"),
+        pytest.param("sac", "Pendulum-v1", marks=pytest.mark.slow),
+        pytest.param("dqn", "CartPole-v1", marks=pytest.mark.slow),
+    ],
+)
 def test_export_of_known_tasks(algo, task, train, write):
     spec = EnvSpec(task)
     report = export(write(train(algo, spec), algo, spec))

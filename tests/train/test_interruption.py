@@ -74,7 +74,9 @@ def start(tmp_path):
         process.wait()
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)]
+)
 def test_a_signal_saves_a_checkpoint_and_leaves_no_child(start, rlctl, tmp_path, number, code):
     training = start(tmp_path)
     wait_for(lambda: list(tmp_path.glob("runs/*/*/metrics.csv")))
@@ -137,6 +139,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_costs_warnings_and_an_exit_code(start, rlctl, small_disk):
     filler = small_disk / "filler"
     training = start(small_disk, "--set", "eval.every_steps=1_500", "-n", "3_000")
