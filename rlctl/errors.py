@@ -56,6 +56,10 @@ class TaskError(RlctlError):
     exit_code = 3
 
 
+class PolicyError(TaskError):
+    """A policy that is a function raised, or returned what is not an action."""
+
+
 class EpisodeFailed(TaskError):
     """An environment failed in an episode that can be reproduced, as `hint` says."""
 

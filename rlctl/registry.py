@@ -51,6 +51,12 @@ class TaskEntry:
             return None
         return _keep_existing(file.with_name(f"{self.name}.yaml")) or _keep_existing(file.with_suffix(".yaml"))
 
+    @property
+    def policy_file(self) -> Path | None:
+        """The shipped policy: `policies/<name>.safetensors` beside the module."""
+        file = self.module_file
+        return _keep_existing(file.parent / "policies" / f"{self.name}.safetensors") if file else None
+
 
 def list_installed() -> list[TaskEntry]:
     """Return every installed task, by name; of two with one name the bundled one, or the first, can be used."""

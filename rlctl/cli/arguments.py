@@ -47,6 +47,20 @@ EnvTimeout = Annotated[float, typer.Option(metavar="SECONDS", help="How long a s
 NEnvs = Annotated[int | None, typer.Option(help="Environments stepped side by side.", min=1, show_default=False)]
 Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]
 
+Pretrained = Annotated[bool, typer.Option("--pretrained", help="The policy that ships with the task.")]
+
+
+def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:
+    """Return which policy was asked for, by `--checkpoint` or by `--pretrained`."""
+    if not pretrained:
+        return checkpoint
+    from rlctl.errors import UsageError
+    from rlctl.run.shipped import PRETRAINED
+
+    if checkpoint not in ("best", PRETRAINED):
+        raise UsageError(f"--pretrained is the policy that ships with a task: leave out --checkpoint {checkpoint}")
+    return PRETRAINED
+
 
 def claim_stdout() -> None:
     """Keep stdout for the result: what a plugin prints from now on goes to stderr."""

@@ -6,7 +6,19 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli.arguments import Checkpoint, EnvTimeout, Json, NEnvs, Run, Set, claim_stdout, parse_changes
+from rlctl.cli.arguments import (
+    Checkpoint,
+    EnvTimeout,
+    Json,
+    NEnvs,
+    Pretrained,
+    Run,
+    Set,
+    choose_checkpoint,
+    claim_stdout,
+    parse_changes,
+)
+from rlctl.errors import UsageError
 
 
 def evaluate(
@@ -16,6 +28,15 @@ def evaluate(
         typer.Option(help="Evaluate on this task instead of the one it was trained on.", show_default=False),
     ] = None,
     checkpoint: Checkpoint = "best",
+    pretrained: Pretrained = False,
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            metavar="zero|random|FUNCTION",
+            help="Play a baseline on a TASK: zero, random, MODULE:FUNCTION or PATH.py:FUNCTION.",
+            show_default=False,
+        ),
+    ] = None,
     episodes: Annotated[int, typer.Option("--episodes", help="Episodes, each with its own seed.", min=1)] = 100,
     seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
     stage: Annotated[
@@ -61,7 +82,8 @@ def evaluate(
     request = EvalRequest(
         run=run,
         task=task,
-        checkpoint=checkpoint,
+        checkpoint=choose_checkpoint(checkpoint, pretrained),
+        baseline=policy,
         episodes=episodes,
         seed=seed,
         changes=parse_changes(settings),
@@ -71,6 +93,8 @@ def evaluate(
         env_timeout_s=env_timeout,
     )
     if vary or push:
+        if policy is not None:
+            raise UsageError("--policy plays a task as it is: leave out --vary and --push")
         from rlctl.eval.robustness_report import show
         from rlctl.eval.vary import RobustnessRequest, check_gates, measure_robustness
 

@@ -7,14 +7,24 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli.arguments import Checkpoint, Json, Run, claim_stdout
+from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Run, choose_checkpoint, claim_stdout
+from rlctl.errors import UsageError
 
 
 def export(
     run: Run = None,
     onnx: Annotated[bool, typer.Option("--onnx", help="Write an ONNX file; so without --c as well.")] = False,
     c: Annotated[bool, typer.Option("--c", help="Write a C99 header and source file without dependencies.")] = False,
+    policy: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write the actor with its measured score instead, as plugins ship it (.safetensors).",
+            show_default=False,
+        ),
+    ] = None,
     checkpoint: Checkpoint = "best",
+    pretrained: Pretrained = False,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -29,6 +39,14 @@ def export(
 ) -> None:
     """Turn a policy into a self-contained ONNX file or C source, and verify that it acts the same."""
     claim_stdout()
+    checkpoint = choose_checkpoint(checkpoint, pretrained)
+    if policy is not None:
+        if output is not None or onnx or c:
+            raise UsageError("--policy FILE writes that file and no other: leave out --output, --onnx and --c")
+        from rlctl.export import policy_file
+
+        policy_file.show(policy_file.export_actor(run, checkpoint=checkpoint, target=policy), json)
+        return
     from rlctl.export.export import Format, export_policy
     from rlctl.export.report import show
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rlctl import completion
-from rlctl.cli.arguments import Checkpoint, Json, Set, claim_stdout, parse_changes
+from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Set, choose_checkpoint, claim_stdout, parse_changes
 
 
 def replay(
@@ -24,6 +24,7 @@ def replay(
     episodes: Annotated[int, typer.Option("--episodes", help="Episodes to roll out.", min=1)] = 1,
     seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
     checkpoint: Checkpoint = "best",
+    pretrained: Pretrained = False,
     task: Annotated[
         str | None,
         typer.Option(help="Roll out on this task instead of the one it was trained on.", show_default=False),
@@ -56,7 +57,7 @@ def replay(
             source=source,
             episodes=episodes,
             seed=seed,
-            checkpoint=checkpoint,
+            checkpoint=choose_checkpoint(checkpoint, pretrained),
             task=task,
             changes=parse_changes(settings),
             verify=verify,

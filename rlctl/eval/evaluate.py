@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from rlctl import output
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
-from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
+from rlctl.eval.baseline import Baseline, choose_task, load_baseline
+from rlctl.eval.statistics import Spread, mean_action_change, mean_terms, success_interval, success_rate
 from rlctl.rollout.acting import Exploration, check_playable
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import lookup
+from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo, load_policy, read_policy
 
 
@@ -25,6 +27,7 @@ class EvalRequest:
     """What the command line asks for."""
 
     run: str | None
+    """The task, where `baseline` is given."""
     task: str | None = None
     checkpoint: str = "best"
     episodes: int = 100
@@ -35,14 +38,22 @@ class EvalRequest:
     deterministic: bool = True
     n_envs: int | None = None
     env_timeout_s: float = 60.0
+    baseline: str | None = None
+    """What to play instead of a trained policy: `zero`, `random`, `module:function` or `file.py:function`."""
+    spec: EnvSpec | None = None
+    """What the baseline plays in, where it is not what the task's recipe would train."""
+    measure_actions: bool = False
+    """Whether to measure how much actions change, for which episodes are kept in memory."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
     """The numbers of an evaluation."""
 
-    policy_file: Path
-    policy: PolicyInfo
+    name: str
+    """The policy's file, or the baseline."""
+    policy: PolicyInfo | None
+    """None of a baseline."""
     spec: EnvSpec
     events: dict[str, bool]
     """The events that the task offers, and whether each acted."""
@@ -56,6 +67,9 @@ class Evaluation:
     terms: dict[str, float]
     """Mean over episodes of each weighted term's sum."""
     final_distance: Spread | None
+    max_steps: int | None
+    action_change: float | None = None
+    """Mean of |action - action before|, over elements and steps; None if it was not measured."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +122,8 @@ def run_evaluation(request: EvalRequest, gates: Gates) -> Evaluation:
 
 def run_evaluations(request: EvalRequest, gates: Gates) -> list[Evaluation]:
     """Find the policy and evaluate it as `run_evaluation` does, in every stage that was asked for, with equal seeds."""
+    if request.baseline is not None:
+        return [_evaluate(load_baseline(request), choose_task(request), request, gates)]
     found = lookup.find_policy(request.run, request.checkpoint)
     output.print_notes(found.notes)
     policy = load_player(found.file, request.deterministic)
@@ -123,6 +139,11 @@ class LoadedPolicy:
     info: PolicyInfo
     tensors: dict[str, NDArray[Any]] | None
     """None for an exported file, which the workers load themselves."""
+
+    @property
+    def name(self) -> str:
+        """The file, as it is shown."""
+        return str(self.path)
 
     def give_to(self, workers: Workers) -> None:
         """Let workers act with it; raises `ArtifactError` if it is for other spaces than their environments have."""
@@ -173,13 +194,13 @@ def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
     return Workers(spec, n_envs, timeout_s=request.env_timeout_s)
 
 
-def _evaluate(policy: LoadedPolicy, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
+def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
     with start_workers(spec, request) as workers:
-        policy.give_to(workers)
+        actor.give_to(workers)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
-        episodes, events = _play(workers, request), workers.info.events
-    evaluation = _summarize(policy.path, policy.info, spec, events, request, episodes)
+        episodes, info = _play(workers, request), workers.info
+    evaluation = _summarize(actor, spec, info, request, episodes)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
 
@@ -189,38 +210,36 @@ def _play(workers: Workers, request: EvalRequest) -> list[Episode]:
     exploration = Exploration(stochastic=not request.deterministic)
     console = output.err()
     if not console.is_terminal:
-        return play_episodes(workers, seeds, exploration)
+        return play_episodes(workers, seeds, exploration, record=request.measure_actions)
     with console.status("evaluating", spinner="dots" if output.is_utf8() else "line") as status:
         return play_episodes(
             workers,
             seeds,
             exploration,
+            record=request.measure_actions,
             on_episode=lambda done: status.update(f"evaluating: {done}/{len(seeds)} episodes"),
         )
 
 
 def _summarize(
-    path: Path,
-    policy: PolicyInfo,
-    spec: EnvSpec,
-    events: dict[str, bool],
-    request: EvalRequest,
-    episodes: list[Episode],
+    actor: LoadedPolicy | Baseline, spec: EnvSpec, info: EnvInfo, request: EvalRequest, episodes: list[Episode]
 ) -> Evaluation:
     results = [episode.result for episode in episodes]
     distances = [result.final_distance for result in results if result.final_distance is not None]
     return Evaluation(
-        policy_file=path,
-        policy=policy,
+        name=actor.name,
+        policy=actor.info,
         spec=spec,
-        events=events,
+        events=info.events,
         seed=request.seed,
         deterministic=request.deterministic,
-        episodes=episodes,
+        episodes=[dataclasses.replace(episode, trajectory=None) for episode in episodes],
         success_rate=success_rate(results),
         success_interval=success_interval(results),
         returns=Spread.of([result.total_reward for result in results]),
         lengths=Spread.of([result.length for result in results]),
         terms=mean_terms(results),
         final_distance=Spread.of(distances) if distances else None,
+        max_steps=info.max_steps,
+        action_change=mean_action_change(episodes) if request.measure_actions else None,
     )

@@ -69,7 +69,7 @@ def show(result: Evaluation, json: str | None) -> None:
 
     out = output.out()
     _show_head(result)
-    if result.spec.stage:
+    if result.spec.stage and result.policy is not None:
         out.print(f"stage {result.spec.stage} of {len(result.policy.stages)}")
     if result.success_rate is not None and result.success_interval is not None:
         low, high = result.success_interval
@@ -88,11 +88,17 @@ def show(result: Evaluation, json: str | None) -> None:
 
 
 def _show_head(result: Evaluation) -> None:
-    out, info = output.out(), result.policy
+    out = output.out()
     mode = "" if result.deterministic else ", sampled actions"
-    out.print(f"{result.spec.task}: {result.policy_file} ({info.algo}, step {info.training_steps:,})", markup=False)
+    out.print(f"{result.spec.task}: {describe_policy(result)}", markup=False)
     randomization = describe_randomization(result.events)
     out.print(f"{len(result.episodes)} episodes, seed {result.seed}{mode}{randomization and f', {randomization}'}")
+
+
+def describe_policy(result: Evaluation) -> str:
+    """Return `best.safetensors (ppo, step 100,000)`, or `policy zero`."""
+    info = result.policy
+    return f"policy {result.name}" if info is None else f"{result.name} ({info.algo}, step {info.training_steps:,})"
 
 
 def _format_spread(spread: Spread) -> list[str]:
@@ -105,8 +111,10 @@ def as_json(result: Evaluation) -> dict[str, Any]:
     return {
         "task": {"name": result.spec.task, "parameters": dict(result.spec.parameters)},
         **({"stage": result.spec.stage} if result.spec.stage else {}),
-        "policy": {
-            "file": str(result.policy_file),
+        "policy": {"baseline": result.name}
+        if info is None
+        else {
+            "file": result.name,
             "algo": info.algo,
             "training_steps": info.training_steps,
             "versions": info.versions,

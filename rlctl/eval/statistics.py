@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from rlctl.rollout.collect import Episode
 from rlctl.rollout.workers import EpisodeResult
 
 
@@ -69,6 +71,31 @@ def return_interval(results: Sequence[EpisodeResult]) -> tuple[float, float] | N
 def mean_return(results: Sequence[EpisodeResult]) -> float:
     """Return the mean of the episodes' sums of rewards."""
     return float(np.mean([result.total_reward for result in results]))
+
+
+def mean_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of independent values, by Student's t; the value itself, twice, for one."""
+    from scipy.stats import t
+
+    mean, count = float(np.mean(values)), len(values)
+    if count < 2:
+        return mean, mean
+    half = float(t.ppf(0.975, count - 1)) * float(np.std(values, ddof=1)) / math.sqrt(count)
+    return mean - half, mean + half
+
+
+def mean_action_change(episodes: Sequence[Episode]) -> float:
+    """Return the mean of |action - action before| over elements and steps of recorded episodes.
+
+    It is 0 for actions that are no real numbers, and for episodes of one step.
+    """
+    changes = [
+        np.abs(np.diff(each.trajectory.actions, axis=0)).ravel()
+        for each in episodes
+        if each.trajectory is not None and each.trajectory.actions.dtype.kind == "f"
+    ]
+    together = np.concatenate([np.zeros(0), *changes])
+    return float(together.mean()) if together.size else 0.0
 
 
 def mean_terms(results: Sequence[EpisodeResult]) -> dict[str, float]:

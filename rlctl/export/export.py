@@ -14,6 +14,7 @@ from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import files, lookup, onnx_file
 from rlctl.run.lookup import FoundPolicy
 from rlctl.run.policy import Policy, PolicyInfo, read_policy
+from rlctl.run.shipped import PRETRAINED
 
 if TYPE_CHECKING:
     import onnx
@@ -43,16 +44,17 @@ def export_policy(
     """Export a policy in one or more formats and verify each file in the policy's own environment.
 
     `run` is what the user typed: a run, a policy file, or None for the latest run. Files are written to `output`, by
-    default into the run's folder, or beside a policy file that belongs to none; of several formats each has its own
-    suffix. Raises `UsageError` for a policy that has no such form, and `AnswerIsNo` with the numbers if a file does
-    not act as the policy does; then that file is not left.
+    default into the run's folder, beside a policy file that belongs to none, or here for a shipped policy; of several
+    formats each has its own suffix. Raises `UsageError` for a policy that has no such form, and `AnswerIsNo` with the
+    numbers if a file does not act as the policy does; then that file is not left.
     """
     found = lookup.find_policy(run, checkpoint)
     print_notes(found.notes)
     if found.file.suffix == ".onnx":
         raise UsageError(f"{found.file}: an ONNX file already; export the run or its .safetensors file")
     if output is None:
-        output = found.run.onnx_file if found.run else found.file.with_suffix(".onnx")
+        beside = Path() if checkpoint == PRETRAINED else found.file.parent
+        output = found.run.onnx_file if found.run else beside / found.file.name
         output = output.with_suffix(f".{formats[0]}")
     if output.suffix not in [f".{each}" for each in formats]:
         kind = "an ONNX file" if formats[0] == "onnx" else "a C file"

@@ -66,6 +66,8 @@ def _check_request(request: ReplayRequest) -> None:
     if request.gui and target is not None:
         raise UsageError("--gui shows a window and writes nothing: leave out --output")
     recorded = request.verify is not None or _is_episode(source)
+    if recorded and request.checkpoint != "best":
+        raise UsageError("a recorded episode is replayed as it was: leave out --checkpoint and --pretrained")
     if recorded and (request.task is not None or request.changes or request.episodes != 1):
         raise UsageError("a recorded episode is replayed as it was: leave out --task, --set and --episodes")
     if target is None:

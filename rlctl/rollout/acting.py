@@ -58,13 +58,14 @@ class Noise:
         block, row = divmod(step, _BLOCK)
         if block != self._block or seed != self._seed:
             self._seed, self._block = seed, block
-            generator = _generator(seed, _STEP_NOISE, block)
+            generator = make_generator(seed, _STEP_NOISE, block)
             self._normal = generator.standard_normal((_BLOCK, 2, self._size), np.float32)
             self._uniform = generator.random((_BLOCK, self._size + 1))
         return self._normal[row], self._uniform[row]
 
 
-def _generator(seed: int, use: int, counter: int) -> np.random.Generator:
+def make_generator(seed: int, use: int, counter: int) -> np.random.Generator:
+    """Return the generator of a step of the episode of a seed, for one use of random numbers."""
     # A counter-based generator begins anywhere without drawing what comes before.
     return np.random.Generator(np.random.Philox(key=np.array([seed, use], np.uint64), counter=[0, counter, 0, 0]))
 
@@ -116,7 +117,7 @@ class PolicyPlayer(Player):
         assert log_std is not None  # gSDE has it as a parameter
         std = _expln(log_std) if self._settings.get("use_expln") else np.exp(log_std)
         size = (log_std.shape[0], len(self._low))
-        self._matrix = std * _generator(seed, _MATRIX, step).standard_normal(size, np.float32)
+        self._matrix = std * make_generator(seed, _MATRIX, step).standard_normal(size, np.float32)
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
         exploration = self.exploration
@@ -247,16 +248,4 @@ class ExportedPlayer(Player):
         if step == 0:
             self._policy.reset()
         action = self._policy.predict(observation)
-        return action, action
-
-
-class RandomPlayer(Player):
-    """Plays uniform actions of a space."""
-
-    def __init__(self, space: spaces.Space[Any]) -> None:
-        self._space = space
-
-    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        self._space.seed(int(_generator(seed, _STEP_NOISE, step).integers(2**31)))
-        action = self._space.sample()
         return action, action

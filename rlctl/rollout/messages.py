@@ -56,14 +56,14 @@ class ComputeRewards:
 
 @dataclasses.dataclass(frozen=True)
 class LoadPolicy:
-    """Act with a policy from now on: one whose numbers are in shared memory, an exported file, or a random one."""
+    """Act with a policy from now on: one whose numbers are in shared memory, or another one by its name."""
 
     info: dict[str, Any] | None = None
     """A `PolicyInfo`."""
     layout: list[Any] = dataclasses.field(default_factory=list)
     """Name, shape and dtype of each array of numbers."""
-    exported_file: str | None = None
-    """An ONNX file, or a compiled library."""
+    other: str = ""
+    """An exported file, or a baseline; see `baselines.make_player`."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,7 +25,8 @@ from rlctl.dict_spaces import SINGLE, split, split_space
 from rlctl.env_spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
 from rlctl.rollout import goal_rewards, messages, returned_values
-from rlctl.rollout.acting import Exploration, ExportedPlayer, Player, PolicyPlayer, RandomPlayer
+from rlctl.rollout.acting import Exploration, Player, PolicyPlayer
+from rlctl.rollout.baselines import make_player
 from rlctl.rollout.failures import FailedInEpisode, encode_error
 from rlctl.rollout.returned_values import InvalidReturn
 from rlctl.rollout.seeds import EpisodeAddress, Stream
@@ -143,10 +144,8 @@ class Worker:
     def load_policy(self, message: messages.LoadPolicy) -> None:
         """Act with another policy from now on."""
         self._states = None
-        if message.exported_file is not None:
-            self.player = ExportedPlayer(message.exported_file)
-        elif message.info is None:
-            self.player = RandomPlayer(self.action_space)
+        if message.info is None:
+            self.player = make_player(message.other, self.action_space)
         else:
             layout = {name: (tuple(shape), np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self.job.numbers, layout)

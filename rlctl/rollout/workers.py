@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rlctl import errors
 from rlctl.dict_spaces import Observations, join
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import DivergedError, EpisodeFailed, RlctlError, TaskError
+from rlctl.errors import DivergedError, EpisodeFailed, PolicyError, RlctlError, TaskError
 from rlctl.rollout import goal_rewards, messages
 from rlctl.rollout.acting import Exploration
 from rlctl.rollout.child_process import ChildProcess
@@ -245,11 +245,11 @@ class Workers:
         if layout:
             self._ask_all(messages.LoadPolicy(info.model_dump(mode="json"), layout), "loading the policy")
 
-    def set_other_policy(self, exported_file: str | None = None) -> None:
-        """Act with an exported policy (an ONNX file, a compiled library), or with random actions without a file."""
+    def set_other_policy(self, name: str) -> None:
+        """Act with an exported file, by its whole path, or a baseline: `zero`, `random`, `file.py:function`."""
         self._wait_until_built()
         self._policy_layout = ()
-        self._ask_all(messages.LoadPolicy(exported_file=exported_file), "loading the policy")
+        self._ask_all(messages.LoadPolicy(other=name), "loading the policy")
 
     @property
     def recurrent_state(self) -> NDArray[np.float32] | None:
@@ -400,7 +400,8 @@ class Workers:
             failed = EpisodeFailed(message, *where, hint=self._hint, details=details)
             if kind is TaskError:
                 return failed
-            message = str(failed) if kind is not DivergedError else str(failed).partition("; ")[0]
+            # What the policy has done wrong, check-env does not show.
+            message = str(failed).rpartition("; ")[0] if kind in (DivergedError, PolicyError) else str(failed)
         result: RlctlError = kind(message, details=details)
         return result
 

@@ -16,6 +16,8 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, did_you_mean
 from rlctl.run.directory import ROOT, RunDirectory, point_latest_to
 from rlctl.run.policy import PolicyInfo, read_info
+from rlctl.run.shipped import PRETRAINED, find_shipped_policy
+from rlctl.run.task_version import describe_task_changes
 
 _MOST_COMPARED = 50  # older runs whose scores are looked at
 _RUN_NAME = re.compile(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_s\d+(_\d+)?$")
@@ -57,16 +59,19 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
             f"rlctl runs import {text} --task TASK"
         )
     names = [each.name for each in root.iterdir() if each.is_dir()] if root.is_dir() else []
-    if registry.find(text):
-        raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}")
+    if entry := registry.find(text):
+        shipped = "; for the policy that it ships: --pretrained" if entry.policy_file else ""
+        raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
     raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{did_you_mean(text, names)}")
 
 
 def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> FoundPolicy:
     """Return the policy for a user's word, which may be a policy file itself.
 
-    A task's name stands for its newest run that has such a policy.
+    A task's name stands for its newest run that has such a policy; with `pretrained` for the policy it ships.
     """
+    if which == PRETRAINED:
+        return _find_shipped(text)
     if text is not None and Path(text).suffix in (".safetensors", ".onnx"):
         path = Path(text)
         if not path.exists():
@@ -84,6 +89,18 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> Fou
             return FoundPolicy(file, candidate, _describe_choice(file, candidate, candidates[:number], older[number:]))
     run.policy_file(which)  # which says why there is none
     raise AssertionError
+
+
+def _find_shipped(task: str | None) -> FoundPolicy:
+    file = find_shipped_policy(task)
+    info = read_info(file)
+    notes = [f"shipped policy {file}: step {info.training_steps:,}"]
+    if info.provenance is not None:
+        # The version of the distribution alone changes nothing.
+        before = {"origin": registry.find_origin(info.spec.task), "source_sha256": info.provenance.source_sha256}
+        changes = describe_task_changes(before, info.spec.task, "this policy was exported")
+        notes += [f"warning: {each}; its score may be another now" for each in changes]
+    return FoundPolicy(file, None, tuple(notes))
 
 
 def find_owner(file: Path) -> RunDirectory | None:

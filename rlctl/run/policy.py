@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 import rlctl
+from rlctl import registry
 from rlctl.dict_spaces import Observations, join, map_parts, split_space
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, short_repr
@@ -29,6 +30,7 @@ from rlctl.named_task import POLICY
 from rlctl.run import files, untrusted
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.named_spec import PolicySpec
+from rlctl.run.shipped import Provenance, find_shipped_policy
 
 FORMAT = 1
 ROWS = 64
@@ -72,6 +74,8 @@ class PolicyInfo(pydantic.BaseModel):
     evaluation: Score | None = None
     """Of the best policy of a run: why it is the best."""
     versions: dict[str, str] = {}
+    provenance: Provenance | None = None
+    """Of an exported policy."""
 
     def derive_spec(self, task: str | None = None, changes: EnvChanges = UNCHANGED) -> EnvSpec:
         """Return what this policy was trained for, or another task, with changes."""
@@ -282,9 +286,10 @@ def _pad(values: NDArray[Any], axis: int = 0) -> NDArray[Any]:
 def load_policy(path: str | Path) -> Policy:
     """Load a policy from a `.safetensors` file, or an exported `.onnx` file (torch is then not imported).
 
-    `load_policy(path).predict(observation)` returns the action. Raises `ArtifactError` for a file that is not one.
+    `load_policy(path).predict(observation)` returns the action. The name of an installed task, `load_policy("ant")`,
+    is the policy that ships with it, never that of a run. Raises `ArtifactError` for a file that is not one.
     """
-    path = Path(path)
+    path = Path(path) if Path(path).suffix or registry.find(str(path)) is None else find_shipped_policy(str(path))
     if path.suffix == ".onnx":
         from rlctl.run.onnx_policy import OnnxPolicy
 

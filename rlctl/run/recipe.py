@@ -256,6 +256,12 @@ def resolve(
     return fill_defaults(validate(merged, *sources))
 
 
+def resolve_packaged(task: str) -> Recipe:
+    """Return the recipe that a task comes with, with the stages that its class declares; the task is imported."""
+    constructor: Any = registry.load(task)
+    return resolve(task, None, {}, constructor.stages if registry.is_task(constructor) else ())
+
+
 _OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events")
 _OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
 

@@ -21,6 +21,7 @@ from torch.overrides import TorchFunctionMode
 
 from rlctl.dict_spaces import Observations, join, split, split_space
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
+from rlctl.run.numpy_policy import select_actor_tensors
 from rlctl.run.policy import ROWS, Policy, PolicyInfo, State, read_policy
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -173,6 +174,7 @@ class _NoLargerThan(TorchFunctionMode):
 
 
 _MAKERS = frozenset({torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn})
+_NOTHING = np.zeros(0)
 _LEAST_COST = 1000  # also many small tensors take memory
 
 
@@ -237,7 +239,11 @@ class TorchPolicy(Policy):
             for name, value in tensors.items()
             if name.startswith(prefix)
         }
-        network.load_state_dict(state)
+        mismatch = network.load_state_dict(state, strict=False)
+        # A shipped policy has no critic, and to act takes none.
+        missing = select_actor_tensors(info, dict.fromkeys((prefix + name for name in mismatch.missing_keys), _NOTHING))
+        if missing or mismatch.unexpected_keys:
+            raise ValueError(f"tensors missing: {list(missing)}, unknown: {mismatch.unexpected_keys}")
         policy = cls(info, network, Normalizer(info, tensors))
         shapes = {key: space.shape for key, space in split_space(policy.observation_space).items()}
         for key in info.normalized_keys:

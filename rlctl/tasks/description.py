@@ -14,6 +14,7 @@ from rlctl.check_env.leaves import Leaf, leaves_of
 from rlctl.errors import TaskError
 from rlctl.plugin_code import call_plugin
 from rlctl.run import recipe as recipes
+from rlctl.run.policy import PolicyInfo, read_info
 from rlctl.tasks import parameters
 from rlctl.tasks.definition import Definition, describe_definition
 from rlctl.tasks.parameters import Parameter
@@ -42,7 +43,7 @@ class Quantity:
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """Everything that is known of a task; plain data but for the recipe."""
+    """Everything that is known of a task; plain data but for the recipe and the shipped policy."""
 
     task: str
     """As it was asked for."""
@@ -64,6 +65,9 @@ class Description:
     """What only a `Task` says; None for a plain Gymnasium environment."""
     recipe: recipes.Recipe
     recipe_file: str | None
+    policy_file: str | None
+    """The policy that ships with it."""
+    policy: PolicyInfo | None
 
 
 def describe(task: str) -> Description:
@@ -72,8 +76,7 @@ def describe(task: str) -> Description:
     Raises `UsageError` for a name that stands for nothing, `TaskError` for a task that cannot be built.
     """
     constructor: Any = registry.load(task)
-    stages = constructor.stages if registry.is_task(constructor) else ()
-    recipe = recipes.resolve(task, None, {}, stages)
+    recipe = recipes.resolve_packaged(task)
     # The last stage is what is wanted. The parts of stacked observations have no names.
     spec = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1)
     env = spec.make()
@@ -96,6 +99,8 @@ def _describe(task: str, constructor: Any, recipe: recipes.Recipe, env: gymnasiu
     target = f"{cls.__module__}:{cls.__qualname__}"
     distribution, version = _find_origin(task, target)
     recipe_file = registry.find_recipe_file(task)
+    entry = registry.find(task)
+    policy_file = entry.policy_file if entry else None
     max_steps: int | None
     if isinstance(built, TaskEnv):
         observations, accepted, max_steps = _list_observations(built), parameters.list_of_task(cls), built.max_steps
@@ -120,6 +125,8 @@ def _describe(task: str, constructor: Any, recipe: recipes.Recipe, env: gymnasiu
         definition=describe_definition(built) if isinstance(built, TaskEnv) else None,
         recipe=recipe,
         recipe_file=str(recipe_file) if recipe_file else None,
+        policy_file=str(policy_file) if policy_file else None,
+        policy=read_info(policy_file) if policy_file else None,
     )
 
 

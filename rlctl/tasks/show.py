@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rlctl import output
+from rlctl.eval.score import describe_score
+from rlctl.run.policy import PolicyInfo
 from rlctl.run.stages import Stage
 from rlctl.tasks.definition import Definition, OfferedEvent
 from rlctl.tasks.description import Description, Quantity
@@ -48,14 +50,39 @@ def show(description: Description, json: str | None) -> None:
     _print_section(out, f"recipe  {description.recipe_file or 'none packaged; the defaults'}", ())
     for line in description.recipe.to_yaml().splitlines():
         out.print(Text(f"  {line}"))
+    _print_section(out, f"shipped policy  {description.policy_file or 'none'}", _list_scores(description.policy))
 
 
 def as_json(description: Description) -> dict[str, Any]:
     """Return a description as plain data."""
     content: dict[str, Any] = to_plain(
-        {**dataclasses.asdict(description), "recipe": description.recipe.model_dump(by_alias=True)}
+        {
+            **dataclasses.asdict(dataclasses.replace(description, policy=None)),
+            "recipe": description.recipe.model_dump(by_alias=True),
+            "policy": None if (info := description.policy) is None else _summarize_policy(info),
+        }
     )
     return content
+
+
+def _summarize_policy(info: PolicyInfo) -> dict[str, Any]:
+    provenance = info.provenance
+    return {
+        "algo": info.algo,
+        "training_steps": info.training_steps,
+        "provenance": None if provenance is None else provenance.model_dump(mode="json"),
+    }
+
+
+def _list_scores(info: PolicyInfo | None) -> list[Row]:
+    """Return the measured scores: of the shipped policy, of zero and of random actions."""
+    if info is None:
+        return []
+    steps = f"{info.algo}, {info.training_steps:,} steps"
+    if (known := info.provenance) is None:
+        return [("policy", steps)]
+    scores = {f"policy ({steps})": known.score, **known.baselines}
+    return [(name, *describe_score(score).split(", ")) for name, score in scores.items()]
 
 
 def _print_section(out: Console, title: str, rows: Iterable[Row], none: str = "") -> None:

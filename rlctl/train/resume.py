@@ -12,7 +12,7 @@ from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.run import files, lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.recipe import Recipe, validate
-from rlctl.train import status
+from rlctl.run.task_version import describe_task_changes
 
 if TYPE_CHECKING:
     from rlctl.train.checkpoint import Checkpoint
@@ -60,7 +60,7 @@ def load_start(word: str | None, settings: Mapping[str, Any], root: Path, *, for
         recipe = validate({**before.model_dump(by_alias=True), **settings}, "recipe")
         before_status = run.status()
         task = lookup.locate_task(_task(before_status, run), run)
-        changes = status.describe_task_changes(before_status, task)
+        changes = describe_task_changes(before_status, task)
         if changes and not force:
             raise UsageError(
                 f"{run.path}: {'; '.join(changes)}. What was learnt may not fit any more; --force goes on all the same"

@@ -5,18 +5,15 @@ from __future__ import annotations
 import datetime
 import os
 import platform
-import subprocess
 import sys
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from rlctl import registry
 from rlctl.errors import DivergedError, Interrupted, RlctlError
-from rlctl.run import files
 from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import collect_versions
-from rlctl.run.recipe import Recipe, resolve
+from rlctl.run.recipe import Recipe, resolve_packaged
 from rlctl.run.recipe_difference import find_difference
+from rlctl.run.task_version import find_git_commit, identify_task
 
 if TYPE_CHECKING:
     from rlctl.train.progress import Progress
@@ -31,13 +28,13 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
         "status": "running",
         "error": None,
         "task": task,
-        **_identity(task),
+        **identify_task(task),
         "algo": recipe.algo,
         "seed": recipe.seed,
         "recipe_changes": _find_recipe_changes(task, recipe),
         "device": device,
         "versions": collect_versions(),
-        "git_commit": _git_commit(),
+        "git_commit": find_git_commit(),
         "command": ["rlctl", *sys.argv[1:]],
         "host": platform.node(),
         "pid": os.getpid(),
@@ -53,34 +50,11 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
 
 def _find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
     """Return the keys in which a recipe differs from the task's own, and their values."""
-    constructor: Any = registry.load(task)
-    stages = constructor.stages if registry.is_task(constructor) else ()
     try:
-        packaged = resolve(task, None, {}, stages)
+        packaged = resolve_packaged(task)
     except RlctlError:  # a packaged recipe that is wrong in itself; this one was made right by --config or --set
         return {}
     return {key: value for key, (value, _) in find_difference(recipe, packaged).items()}
-
-
-def _identity(task: str) -> dict[str, Any]:
-    """Return what identifies a version of a task: its distribution's, and its source."""
-    source = registry.find_source_file(task)
-    digest = files.digest(source.read_bytes()) if source is not None and source.is_file() else None
-    return {"origin": registry.find_origin(task), "source_sha256": digest}
-
-
-def describe_task_changes(before_status: Mapping[str, Any], task: str) -> list[str]:
-    """Describe how a task differs from what `run.json` has of the start; empty if it does not."""
-    now = _identity(task)
-    before, after = (each if isinstance(each, dict) else {} for each in (before_status.get("origin"), now["origin"]))
-    if before != after:
-        names = (" ".join(map(str, each.values())) or "no installed package" for each in (before, after))
-        return ["task {} came from {} when the run began, and comes from {} now".format(task, *names)]
-    if before_status.get("source_sha256") != now["source_sha256"]:
-        file = registry.find_source_file(task)
-        gone = file is not None and not file.is_file()
-        return [f"{file or task} {'is not there any more' if gone else 'is not what it was when the run began'}"]
-    return []
 
 
 def write_failure(run: RunDirectory, error: BaseException) -> None:
@@ -110,11 +84,3 @@ def write_end(run: RunDirectory, steps: int, progress: Progress) -> None:
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-def _git_commit() -> str | None:
-    try:
-        found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5.0, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return found.stdout.strip() or None

@@ -12,6 +12,7 @@ import rlctl
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.run.env_info import EnvInfo, space_to_json
+from rlctl.run.numpy_policy import select_actor_tensors
 from rlctl.run.policy import ROWS, BatchActor, PolicyInfo, compute_digest, read_policy, save_policy
 from rlctl.run.torch_policy import build_network, pin_threads
 
@@ -241,3 +242,20 @@ def test_predict_with_a_wrong_shape(path, saved):
     by_name = rlctl.load_policy(saved(policy="MultiInputPolicy", observation=DICT))
     with pytest.raises(ValueError, match=r"of shape {'a': \(3,\)}, the policy expects {'a': \(3,\), 'b': "):
         by_name.predict({"a": np.zeros(3)})
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac", "td3", "crossq", "recurrent_ppo"])
+def test_an_actor_alone_acts_as_the_whole_policy(tmp_path, algo):
+    info = describe(algo, "MlpLstmPolicy" if algo == "recurrent_ppo" else "MlpPolicy", policy_kwargs={"net_arch": [8]})
+    tensors = tensors_of(info)
+    actor = select_actor_tensors(info, tensors)
+    assert 0 < len(actor) < len(tensors)
+    actions = []
+    for name, content in (("whole", tensors), ("actor", actor)):
+        save_policy(tmp_path / f"{name}.safetensors", info, content)
+        actions.append(rlctl.load_policy(tmp_path / f"{name}.safetensors").predict(np.linspace(-1, 1, 5, dtype="f4")))
+    np.testing.assert_array_equal(*actions)
+    del actor[min(name for name in actor if name.endswith(".weight"))]
+    save_policy(tmp_path / "part.safetensors", info, actor)
+    with pytest.raises(ArtifactError, match="its tensors do not fit its description: tensors missing: "):
+        rlctl.load_policy(tmp_path / "part.safetensors")

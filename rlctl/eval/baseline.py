@@ -1,0 +1,53 @@
+"""What plays without training, on a task as its recipe would train it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import UsageError
+from rlctl.rollout.baselines import BASELINES, load_function
+from rlctl.rollout.workers import Workers
+from rlctl.run.recipe import resolve_packaged
+
+if TYPE_CHECKING:
+    from rlctl.eval.evaluate import EvalRequest
+
+
+@dataclasses.dataclass(frozen=True)
+class Baseline:
+    """Zero or random actions, or a user's function; its name is what `rollout.baselines.make_player` takes."""
+
+    name: str
+    info: None = None
+
+    def give_to(self, workers: Workers) -> None:
+        """Let workers act with it."""
+        workers.set_other_policy(self.name)
+
+
+def load_baseline(request: EvalRequest) -> Baseline:
+    """Return the baseline of a request; raises `UsageError` for one that is not there, and for options of a run."""
+    name = str(request.baseline)
+    if request.checkpoint != "best" or request.stage is not None or not request.deterministic or request.task:
+        raise UsageError(
+            f"--policy {name} needs a task, its --set and --episodes, and nothing of a run: leave out --checkpoint, "
+            "--pretrained, --stage, --stochastic and --task"
+        )
+    if name in BASELINES:
+        return Baseline(name)
+    load_function(name)  # here too, so that what is wrong with it is known before environments are built
+    place, _, function = name.rpartition(":")
+    return Baseline(f"{Path(place).expanduser().resolve()}:{function}" if place.endswith(".py") else name)
+
+
+def choose_task(request: EvalRequest) -> EnvSpec:
+    """Return the task of a request as its recipe would train it, in the last stage; observations are not stacked."""
+    if request.spec is not None:
+        return dataclasses.replace(request.spec, frame_stack=1)
+    if request.run is None:
+        raise UsageError(f"--policy {request.baseline}: give the task to play: rlctl eval reach --policy zero")
+    spec = resolve_packaged(request.run).env_specs(request.run)[-1]
+    return request.changes.apply(dataclasses.replace(spec, frame_stack=1, stage=0))

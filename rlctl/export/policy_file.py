@@ -1,0 +1,82 @@
+"""`rlctl export RUN --policy FILE`: the actor alone, with where it is from and what it scores."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from rlctl import output
+from rlctl.errors import UsageError
+from rlctl.eval.evaluate import EvalRequest
+from rlctl.eval.score import describe_score, measure_score
+from rlctl.rollout.baselines import BASELINES
+from rlctl.run import lookup
+from rlctl.run.memory import format_bytes
+from rlctl.run.numpy_policy import select_actor_tensors
+from rlctl.run.policy import PolicyInfo, read_policy, save_policy
+from rlctl.run.shipped import Provenance
+from rlctl.run.task_version import identify_task
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyFileReport:
+    """A policy file that was written."""
+
+    path: Path
+    info: PolicyInfo
+    provenance: Provenance
+    size: int
+    """[bytes]"""
+
+
+def export_actor(run: str | None, *, checkpoint: str, target: Path, episodes: int = 100) -> PolicyFileReport:
+    """Measure a run's policy and write its actor, with that score, recipe, task version and commit.
+
+    Zero and random actions are measured on the same episodes. Raises `UsageError` for a policy without a run.
+    """
+    if target.suffix != ".safetensors":
+        raise UsageError(f"--policy {target}: the name of a policy file ends in .safetensors")
+    found = lookup.find_policy(run, checkpoint)
+    output.print_notes(found.notes)
+    if found.run is None:
+        raise UsageError(f"{found.file}: no recipe is known of this policy; give the run that it is from")
+    info, tensors = read_policy(found.file)
+    spec = found.locate(info.spec)
+    request = EvalRequest(run=str(found.file), episodes=episodes)
+    provenance = Provenance(
+        run="/".join(found.run.path.resolve().parts[-2:]),
+        **identify_task(spec.task),
+        git_commit=found.run.status().get("git_commit"),
+        recipe=found.run.recipe().model_dump(mode="json", by_alias=True),
+        score=measure_score(request),
+        baselines={name: measure_score(dataclasses.replace(request, baseline=name, spec=spec)) for name in BASELINES},
+    )
+    info = info.model_copy(update={"provenance": provenance})
+    save_policy(target, info, select_actor_tensors(info, tensors))
+    return PolicyFileReport(target, info, provenance, target.stat().st_size)
+
+
+def show(report: PolicyFileReport, json: str | None) -> None:
+    """Print a report, or write it as JSON."""
+    if json is not None:
+        output.write_result_json(json, as_json(report))
+        return
+    out, info, provenance = output.out(), report.info, report.provenance
+    out.print(f"exported {report.path} ({format_bytes(report.size)}): the actor of {provenance.run}", markup=False)
+    out.print(f"{info.algo} for {info.spec.task}, step {info.training_steps:,}", markup=False)
+    for name, score in {"policy": provenance.score, **provenance.baselines}.items():
+        out.print(f"{name:8} {describe_score(score)}", markup=False)
+    out.print(f"{provenance.score.episodes} episodes, seed {provenance.score.seed}; 95 % intervals")
+
+
+def as_json(report: PolicyFileReport) -> dict[str, Any]:
+    """Return a report as plain data."""
+    return {
+        "path": str(report.path),
+        "bytes": report.size,
+        "task": report.info.spec.task,
+        "algo": report.info.algo,
+        "training_steps": report.info.training_steps,
+        **report.provenance.model_dump(mode="json"),
+    }

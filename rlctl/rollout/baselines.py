@@ -1,0 +1,118 @@
+"""Policies that need no training: zero and random actions, and functions that a user writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from rlctl import registry
+from rlctl.dict_spaces import map_parts
+from rlctl.errors import (
+    NoSuchClassError,
+    PolicyError,
+    RlctlError,
+    UsageError,
+    describe_exception,
+    did_you_mean,
+    format_plugin_traceback,
+    short_repr,
+)
+from rlctl.rollout.acting import ExportedPlayer, Player, make_generator
+
+BASELINES = ("zero", "random")
+
+
+def make_player(name: str, space: spaces.Space[Any]) -> Player:
+    """Return what plays `zero`, `random`, an exported file, or a function as `load_function` takes it."""
+    if name == "zero":
+        return ZeroPlayer(space)
+    if name == "random":
+        return RandomPlayer(space)
+    return FunctionPlayer(name, space) if ":" in Path(name).name else ExportedPlayer(name)
+
+
+def load_function(text: str) -> Callable[..., Any]:
+    """Import a function, `module:function` or `path/to/file.py:function`, which returns an action for an observation.
+
+    Raises `UsageError` for text that names none, `TaskError` for a file whose import fails.
+    """
+    if ":" not in text:
+        close = did_you_mean(text, BASELINES)
+        raise UsageError(f"--policy {text}: give zero, random, MODULE:FUNCTION or PATH.py:FUNCTION.{close}")
+    try:
+        return registry.load(text)
+    except NoSuchClassError:
+        place, _, name = text.rpartition(":")
+        raise UsageError(f"--policy {text}: {place} has no function {name!r}") from None
+    except RlctlError as error:
+        raise type(error)(
+            f"--policy {text}: {str(error).removeprefix(f'task {text!r}: ')}", details=error.details
+        ) from None
+
+
+class ZeroPlayer(Player):
+    """Plays the action 0, or what is nearest to it in the space; of discrete actions the first."""
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        if isinstance(space, spaces.Box):
+            self._action: Any = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
+        else:
+            self._action = np.full(space.shape or (), getattr(space, "start", 0), np.int64)
+
+    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        return self._action, self._action
+
+
+class RandomPlayer(Player):
+    """Plays uniform actions of a space."""
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self._space = space
+
+    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        self._space.seed(int(make_generator(seed, 0, step).integers(2**31)))
+        action = self._space.sample()
+        return action, action
+
+
+class FunctionPlayer(Player):
+    """Plays the actions that a user's function returns for observations; those of a Box are clipped to it."""
+
+    def __init__(self, name: str, space: spaces.Space[Any]) -> None:
+        self._function = load_function(name)
+        place, _, function = name.rpartition(":")
+        self._name = f"{Path(place).name}:{function}"
+        self._space = space
+
+    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Call the function; raises `PolicyError` for what it raises, and for what is not an action."""
+        try:
+            given = self._function(map_parts(np.copy, observation))
+        except Exception as error:
+            details = format_plugin_traceback(error) or None
+            raise PolicyError(f"policy {self._name}: {describe_exception(error)}", details=details) from error
+        action = self._check(given)
+        return action, action
+
+    def _check(self, given: Any) -> Any:
+        space = self._space
+        try:
+            action = np.asarray(given, space.dtype)
+        except (ValueError, TypeError):
+            action = np.zeros(0)
+        wanted = space.shape or ()
+        if given is None or action.shape != wanted:
+            raise PolicyError(
+                f"policy {self._name}: it returned {short_repr(given)}, an action has shape {wanted}, {space.dtype}"
+            )
+        if isinstance(space, spaces.Box):
+            if not np.isfinite(action).all():
+                raise PolicyError(f"policy {self._name}: it returned {short_repr(given)}, which is not finite")
+            return np.clip(action, space.low, space.high)
+        if not space.contains(action if wanted else action[()]):
+            raise PolicyError(f"policy {self._name}: it returned {short_repr(given)}, the actions are {space}")
+        return action

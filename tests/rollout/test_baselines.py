@@ -1,0 +1,107 @@
+"""Policies that need no training: what they play, and what a user's function may do wrong."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from rlctl.errors import PolicyError, UsageError
+from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.eval.report import as_json
+from rlctl.rollout.baselines import load_function, make_player
+
+BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
+FUNCTIONS = """
+    import numpy as np
+    def to_goal(observation): return [3.0, -0.5]
+    def of_another_shape(observation): return [1.0]
+    def nothing(observation): pass
+    def not_a_number(observation): return [float("nan"), 0.0]
+    def raises(observation): raise KeyError("hand")
+    def changes(observation): observation[:] = 9.0; return [0.0, 0.0]
+    def seven(observation): return np.ones(7)
+"""
+
+
+@pytest.fixture
+def functions(write_module):
+    return write_module("functions.py", FUNCTIONS)
+
+
+def act(name, space, observation=None):
+    return make_player(str(name), space).act(np.zeros(3) if observation is None else observation, 1, 0)[1]
+
+
+def test_zero():
+    assert act("zero", BOX).tolist() == [0.0, 0.0]
+    assert act("zero", spaces.Box(1.0, 2.0, (1,))).tolist() == [1.0]  # 0 is outside; the nearest
+    assert act("zero", spaces.Discrete(3, start=5)) == 5
+    assert act("zero", spaces.MultiBinary(2)).tolist() == [0, 0]
+
+
+def test_random_follows_from_the_seed_and_the_step():
+    player = make_player("random", spaces.Discrete(1000))
+    assert player.act(None, 1, 0) == player.act(None, 1, 0) != player.act(None, 1, 1)
+
+
+def test_a_function_acts_within_the_space(functions):
+    assert act(f"{functions}:to_goal", BOX).tolist() == [1.0, -0.5]
+    observation = np.zeros(3)
+    act(f"{functions}:changes", BOX, observation)
+    assert observation.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("of_another_shape", r"it returned \[1.0\], an action has shape \(2,\), float32"),
+        ("nothing", "it returned None, an action has shape"),
+        ("not_a_number", r"it returned \[nan, 0.0\], which is not finite"),
+        ("raises", "KeyError: 'hand'"),
+    ],
+)
+def test_what_a_function_does_wrong(functions, name, message):
+    with pytest.raises(PolicyError, match=rf"^policy functions.py:{name}: {message}") as caught:
+        act(f"{functions}:{name}", BOX)
+    assert caught.value.exit_code == 3
+
+
+def test_a_discrete_action_is_one_of_the_space(functions):
+    with pytest.raises(PolicyError, match="an action has shape"):
+        act(f"{functions}:to_goal", spaces.Discrete(2))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("zeros", "--policy zeros: give zero, random, MODULE:FUNCTION or PATH.py:FUNCTION. Did you mean 'zero'?"),
+        ("nowhere.py:act", "--policy nowhere.py:act: no file "),
+        ("no_such_module:act", "--policy no_such_module:act: no module 'no_such_module' is installed or under "),
+    ],
+)
+def test_text_that_names_no_function(text, message):
+    with pytest.raises(UsageError) as caught:
+        load_function(text)
+    assert str(caught.value).startswith(message)
+
+
+def test_a_function_that_is_not_there(functions):
+    with pytest.raises(UsageError, match=r"functions\.py has no function 'acts'"):
+        load_function(f"{functions}:acts")
+
+
+def test_a_baseline_is_evaluated_as_a_policy_is(functions):
+    zero = run_evaluation(EvalRequest("reach", baseline="zero", episodes=2), Gates())
+    assert zero.lengths.mean == 120
+    assert as_json(zero)["policy"] == {"baseline": "zero"}
+    ones = run_evaluation(EvalRequest("reach", baseline=f"{functions}:seven", episodes=2), Gates())
+    assert [each.seed for each in ones.episodes] == [each.seed for each in zero.episodes]
+    assert ones.returns.mean != zero.returns.mean
+    with pytest.raises(PolicyError, match=r"shape \(7,\), float32\nin environment 0, episode seed \d+, step 0$"):
+        run_evaluation(EvalRequest("reach", baseline=f"{functions}:to_goal", episodes=1), Gates())
+
+
+def test_what_a_baseline_does_not_take():
+    with pytest.raises(UsageError, match="nothing of a run: leave out --checkpoint, --pretrained"):
+        run_evaluation(EvalRequest("reach", baseline="zero", checkpoint="pretrained"), Gates())
+    with pytest.raises(UsageError, match="give the task to play: rlctl eval reach --policy zero"):
+        run_evaluation(EvalRequest(None, baseline="zero"), Gates())

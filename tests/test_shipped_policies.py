@@ -1,0 +1,154 @@
+"""Policies that ship with a plugin: each scores what its metadata says, and what else a user may ask of them."""
+
+import numpy as np
+import pytest
+
+import rlctl as package
+from rlctl import registry
+from rlctl.errors import ArtifactError, RlctlError, UsageError
+from rlctl.eval.evaluate import EvalRequest
+from rlctl.eval.score import measure_score
+from rlctl.export.policy_file import export_actor
+from rlctl.run.directory import RunDirectory
+from rlctl.run.env_info import EnvInfo
+from rlctl.run.policy import PolicyInfo, read_info, read_policy, save_policy
+from rlctl.run.recipe import resolve_packaged
+from rlctl.run.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
+
+OURS = [name for name in list_shipped() if registry.find(name).distribution == "rlctl"]
+
+
+def overlap(one, two):
+    return one[0] <= two[1] and two[0] <= one[1]
+
+
+def check_score(task: str, info: PolicyInfo, episodes: int = 20) -> None:
+    """Fail, with what to do, if a shipped policy does not score what its metadata says."""
+    provenance = info.provenance
+    assert provenance is not None, f"{task}: not written by rlctl export RUN --policy FILE"
+    advice = (
+        f"Has {task} changed since its policy was shipped? Then train it again and ship what it learns: rlctl train "
+        f"{task}; rlctl export {task} --policy {find_shipped_policy(task)}. If not, the change is a mistake"
+    )
+    known = provenance.score
+    try:
+        measured = measure_score(EvalRequest(task, checkpoint="pretrained", episodes=episodes, seed=known.seed))
+    except RlctlError as error:
+        pytest.fail(f"{task}: {error}. {advice}")
+    for name in ("return_interval", "success_interval"):
+        now, before = getattr(measured, name), getattr(known, name)
+        if before is not None and (now is None or not overlap(now, before)):
+            pytest.fail(f"{task}: {name} is {now} over {episodes} episodes, its metadata has {before}. {advice}")
+
+
+@pytest.mark.parametrize(
+    "task", [pytest.param(task, marks=[] if task == "reach" else pytest.mark.slow) for task in OURS]
+)
+def test_a_shipped_policy_scores_what_its_metadata_says(task):
+    check_score(task, read_info(find_shipped_policy(task)))
+
+
+def test_a_task_that_has_changed_is_noticed():
+    info = read_info(find_shipped_policy("reach"))
+    better = info.provenance.score.model_copy(update={"return_interval": (900.0, 901.0)})
+    other = info.model_copy(update={"provenance": info.provenance.model_copy(update={"score": better})})
+    with pytest.raises(pytest.fail.Exception, match=r"(900.0, 901.0).* Has reach changed .* rlctl export reach"):
+        check_score("reach", other, episodes=2)
+
+
+def test_shipped_policies_are_small_actors_of_installed_tasks():
+    files = [find_shipped_policy(task) for task in OURS]
+    assert {file.stem for folder in {each.parent for each in files} for file in folder.iterdir()} == set(OURS)
+    assert all(file.stat().st_size <= 400_000 for file in files)
+    assert sum(file.stat().st_size for file in files) <= 4_000_000
+    for task, file in zip(OURS, files, strict=True):
+        info = read_info(file)
+        assert info.spec.task == task
+        assert info.provenance.baselines.keys() == {"zero", "random"}
+        assert info.provenance.score.episodes == 100
+        assert info.provenance.recipe["algo"] == info.algo
+
+
+def test_a_name_loads_the_shipped_policy():
+    policy = package.load_policy("reach")
+    assert policy.predict(np.zeros(20, np.float32)).shape == (7,)
+    with pytest.raises(ArtifactError, match="raech: "):
+        package.load_policy("raech")
+
+
+def test_what_is_not_shipped():
+    with pytest.raises(UsageError, match=r"give a task that ships a policy: .*reach"):
+        find_shipped_policy(None)
+    with pytest.raises(UsageError, match=r"no task 'raech' is installed, .* Did you mean 'reach'\?"):
+        find_shipped_policy("raech")
+
+
+def test_the_actor_of_a_run_and_its_score(tmp_path):
+    run = RunDirectory(tmp_path / "reach" / "2026-01-01_00-00-00_s3")
+    info = read_info(find_shipped_policy("reach")).model_copy(update={"provenance": None})
+    _, tensors = read_policy(find_shipped_policy("reach"))
+    save_policy(run.best_policy, info, {**tensors, "policy/value_net.weight": np.zeros((1, 64), np.float32)})
+    run.write_status({"task": "reach", "git_commit": "abc"})
+    run.write_recipe(resolve_packaged("reach"))
+    target = tmp_path / "reach.safetensors"
+    report = export_actor(str(run.path), checkpoint="best", target=target, episodes=3)
+    written, actor = read_policy(target)
+    assert actor.keys() == tensors.keys()
+    assert written.provenance == report.provenance
+    assert written.provenance.run == "reach/2026-01-01_00-00-00_s3"
+    assert written.provenance.git_commit == "abc"
+    assert written.provenance.recipe["total_timesteps"] == 120_000
+    scores = {"policy": written.provenance.score, **written.provenance.baselines}
+    assert all(each.episodes == 3 and each.seed == 0 and each.ended_early == 0.0 for each in scores.values())
+    assert scores["zero"].action_change == 0.0
+    assert scores["random"].action_change == pytest.approx(2 / 3, abs=0.05)  # two uniform numbers in [-1, 1]
+    assert scores["policy"].mean_return > scores["zero"].mean_return
+    with pytest.raises(UsageError, match=r"policy.txt: the name of a policy file ends in .safetensors"):
+        export_actor(str(run.path), checkpoint="best", target=tmp_path / "policy.txt")
+    with pytest.raises(UsageError, match="no recipe is known of this policy; give the run"):
+        export_actor(str(target), checkpoint="best", target=tmp_path / "other.safetensors")
+
+
+PUSH = """
+    import gymnasium, numpy as np
+    from gymnasium.spaces import Box
+
+    class Push(gymnasium.Env):
+        observation_space, action_space = Box(-1, 1, (2,)), Box(-1, 1, (1,))
+        def reset(self, *, seed=None, options=None): return np.zeros(2, np.float32), {}
+        def step(self, action): return np.zeros(2, np.float32), 0.0, False, True, {}
+"""
+
+
+def write_push_policy(path, size):
+    from gymnasium.spaces import Box
+
+    from rlctl.env_spec import EnvSpec
+    from rlctl.run.env_info import space_to_json
+    from rlctl.run.torch_policy import build_network
+
+    spaces = {"observation_space": Box(-1, 1, (size,)), "action_space": Box(-1, 1, (1,))}
+    env = EnvInfo(**{name: space_to_json(space) for name, space in spaces.items()})
+    score = MeasuredScore(
+        episodes=1, seed=0, mean_return=0.0, return_interval=(0.0, 0.0), success=None, success_interval=None,
+        mean_length=1.0, ended_early=None, action_change=0.0,
+    )  # fmt: skip
+    provenance = Provenance(run="push/x", source_sha256="0" * 64, recipe={}, score=score)
+    info = PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec("push"), provenance=provenance)
+    save_policy(path, info, {f"policy/{k}": v.numpy() for k, v in build_network(info).state_dict().items()})
+
+
+def test_a_plugin_ships_a_policy_and_its_task_changes(rlctl, install):
+    site = install("pushing", {"push": "pushing:Push"}, {"pushing.py": PUSH})
+    none = rlctl("eval", "push", "--pretrained", path=site)
+    assert none.returncode == 5
+    assert "push ships no policy; train one: rlctl train push. Tasks that ship one: " in none.stderr
+    file = site / "policies" / "push.safetensors"
+    write_push_policy(file, 2)
+    good = rlctl("eval", "push", "--pretrained", "--episodes", 2, path=site)
+    assert good.returncode == 0, good.stderr
+    assert f"warning: {site}/pushing.py is not what it was when this policy was exported; its score" in good.stderr
+    write_push_policy(file, 3)
+    changed = rlctl("eval", "push", "--pretrained", "--episodes", 2, path=site)
+    assert changed.returncode == 5
+    assert "this policy is not for this task: its observation space is" in changed.stderr
