@@ -45,7 +45,7 @@ def test_no_run_yet(root):
     expected = f"no run yet under {root}; train one: rlctl train reach"
     assert error(ArtifactError, find_run, None, root) == expected
     assert error(ArtifactError, find_run, "reach", root) == (
-        f"no run of 'reach' yet under {root}; train one: rlctl train reach"
+        f"no run of 'reach' yet under {root}; train one: rlctl train reach; for the policy that it ships: --pretrained"
     )
     assert ArtifactError("").exit_code == 5
 
