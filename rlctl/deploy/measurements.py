@@ -1,0 +1,101 @@
+"""What a server measures of itself: latency, interventions, control error, processor time and memory."""
+
+from __future__ import annotations
+
+import collections
+import os
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+_KEPT = 4096  # requests that quantiles are of
+
+
+class Durations:
+    """The last durations of something, for quantiles."""
+
+    def __init__(self) -> None:
+        self._values: NDArray[np.float64] = np.zeros(_KEPT)
+        self.count = 0
+        self.sum_s = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Add one."""
+        self._values[self.count % _KEPT] = seconds
+        self.count += 1
+        self.sum_s += seconds
+
+    def quantiles(self) -> dict[str, float]:
+        """Return p50 and p99 of the last ones [s]; zeros if there is none."""
+        values = self._values[: min(self.count, _KEPT)]
+        if not len(values):
+            return {"0.5": 0.0, "0.99": 0.0}
+        return dict(zip(("0.5", "0.99"), np.quantile(values, (0.5, 0.99)).tolist(), strict=True))
+
+
+class Measurements:
+    """Counts and durations of all clients together."""
+
+    def __init__(self) -> None:
+        self.started_s = time.time()
+        self.inference, self.request = Durations(), Durations()
+        self.errors = self.deadline_misses = self.connections = self.refused = self.policy_changes = 0
+        self.counts: collections.Counter[str] = collections.Counter()
+        """How often each limit stepped in and each fault occurred."""
+        self.control_error = float("nan")
+        self.spread: float | None = None
+
+    def format_prometheus(self, states: collections.Counter[str]) -> str:
+        """Return everything in Prometheus' text form."""
+        lines: list[str] = []
+
+        def add(name: str, kind: str, text: str, *samples: tuple[str, float]) -> None:
+            lines.append(f"# HELP rlctl_{name} {text}")
+            lines.append(f"# TYPE rlctl_{name} {kind}")
+            lines.extend(f"rlctl_{name}{labels} {value:.9g}" for labels, value in samples)
+
+        for name, durations, text in (
+            ("inference", self.inference, "Time that the policy takes."),
+            ("request", self.request, "Time from a request's arrival to its answer."),
+        ):
+            quantiles = [(f'{{quantile="{key}"}}', value) for key, value in durations.quantiles().items()]
+            add(f"{name}_seconds", "summary", text, *quantiles)
+            lines.append(f"rlctl_{name}_seconds_sum {durations.sum_s:.9g}")
+            lines.append(f"rlctl_{name}_seconds_count {durations.count}")
+        add("errors_total", "counter", "Requests that were not an observation.", ("", self.errors))
+        add("deadline_misses_total", "counter", "Requests longer than control_dt.", ("", self.deadline_misses))
+        add("clients", "gauge", "Connected clients, without those that post.", ("", states.total() - 1))
+        add("connections_total", "counter", "Connections so far.", ("", self.connections))
+        add("refused_total", "counter", "Connections and keys that were refused.", ("", self.refused))
+        add("policy_changes_total", "counter", "Policies that took the place of another.", ("", self.policy_changes))
+        states_now = [(f'{{state="{each}"}}', states[each]) for each in ("idle", "running", "holding", "stopped")]
+        add("state", "gauge", "Clients by state.", *states_now)
+        counts = [(f'{{name="{_escape(name)}"}}', count) for name, count in sorted(self.counts.items())]
+        add("interventions_total", "counter", "How often each limit and fault occurred.", *counts)
+        add("control_error", "gauge", "Largest difference of a joint from its command.", ("", self.control_error))
+        if self.spread is not None:
+            add("action_spread", "gauge", "Mean standard deviation of the policy's actions.", ("", self.spread))
+        add("process_cpu_seconds_total", "counter", "Processor time.", ("", read_cpu_s()))
+        add("process_resident_memory_bytes", "gauge", "Memory.", ("", read_memory()))
+        return "\n".join(lines) + "\n"
+
+
+def _escape(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
+
+
+def read_cpu_s() -> float:
+    """Return the processor time of this process [s]."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+def read_memory() -> int:
+    """Return the memory of this process [bytes]; its highest where the present one is not known."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,0 +1,106 @@
+"""Messages of the WebSocket protocol of openpi's policy server: msgpack, with arrays as maps; and JSON for curl."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from rlctl.errors import short_repr
+
+_ARRAY, _SCALAR = b"__ndarray__", b"__npgeneric__"
+_KINDS = "biuf"
+_LONGEST_DTYPE = 8
+_DIMENSIONS = 32
+
+
+class MessageError(ValueError):
+    """Bytes that are not a message; the text says why."""
+
+
+def pack(value: Any) -> bytes:
+    """Return a message: msgpack, in which an array is a map of its bytes, dtype and shape."""
+    packed: bytes = msgpack.packb(value, default=_encode)
+    return packed
+
+
+def _encode(value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype.kind in _KINDS:
+        return {_ARRAY: True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+    if isinstance(value, np.generic) and value.dtype.kind in _KINDS:
+        return {_SCALAR: True, b"data": value.item(), b"dtype": value.dtype.str}
+    raise TypeError(f"a {type(value).__name__} cannot be sent")
+
+
+def unpack(content: bytes) -> Any:
+    """Return what a message says; raises `MessageError` for what is not one, or has a key twice or another dtype."""
+    try:
+        return msgpack.unpackb(content, object_pairs_hook=_decode, strict_map_key=True)
+    except MessageError:
+        raise
+    except Exception as error:  # msgpack has several, one of them without a public base class
+        raise MessageError(f"not msgpack: {short_repr(str(error) or type(error).__name__)}") from None
+
+
+def _decode(pairs: list[tuple[Any, Any]]) -> Any:
+    content = _join(pairs)
+    if _ARRAY in content:
+        return _decode_array(content)
+    if _SCALAR in content:
+        return _check_dtype(content.get(b"dtype")).type(content.get(b"data"))
+    return content
+
+
+def _decode_array(content: dict[Any, Any]) -> Any:
+    dtype, shape, data = _check_dtype(content.get(b"dtype")), content.get(b"shape"), content.get(b"data")
+    if (
+        not isinstance(shape, list)
+        or len(shape) > _DIMENSIONS
+        or not all(type(size) is int and size >= 0 for size in shape)
+    ):
+        raise MessageError(f"an array of shape {short_repr(shape)}")
+    if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
+        raise MessageError(f"an array of shape {short_repr(shape)} and {dtype} is not as large as its data")
+    return np.frombuffer(data, dtype).reshape(shape)
+
+
+def _check_dtype(text: Any) -> np.dtype[Any]:
+    try:
+        if isinstance(text, str) and len(text) <= _LONGEST_DTYPE and (dtype := np.dtype(text)).kind in _KINDS:
+            return dtype
+    except (TypeError, ValueError):
+        pass
+    raise MessageError(f"an array of dtype {short_repr(text)}; numbers and truth values are read, no V, O or c")
+
+
+def parse_json(content: bytes) -> Any:
+    """Return what JSON says; raises `MessageError` for what is not JSON, or has a key twice."""
+    try:
+        return json.loads(content, object_pairs_hook=_join)
+    except MessageError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise MessageError(f"not JSON: {short_repr(str(error))}") from None
+
+
+def _join(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    content = dict(pairs)
+    if len(content) != len(pairs):
+        names = [name for name, _ in pairs]
+        doubled = next(name for name in names if names.count(name) > 1)
+        raise MessageError(f"doubled: {short_repr(doubled)} is given twice")
+    return content
+
+
+def as_json(value: Any) -> Any:
+    """Return plain data in which arrays are lists, and numbers that are not finite None."""
+    if isinstance(value, dict):
+        return {key: as_json(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(each) for each in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return as_json(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,150 @@
+"""What a server answers over HTTP: actions as JSON, orders, another policy, metrics, and the live page."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from aiohttp import web
+
+from rlctl.deploy import messages
+from rlctl.deploy.access import Access
+from rlctl.deploy.server import PolicyServer
+from rlctl.errors import RlctlError
+
+_LARGEST_POLICY = 256 * 2**20  # [bytes]
+_BODY_TIMEOUT_S = 10.0
+_ORDERS = ("stop", "home", "hold", "resume")
+
+
+def make_app(server: PolicyServer) -> web.Application:
+    """Return the web application of a server."""
+    return _Routes(server).make_app()
+
+
+class _Routes:
+    def __init__(self, server: PolicyServer) -> None:
+        self.server = server
+        self.page = (Path(__file__).parent / "page.html").read_text("utf-8")
+
+    def make_app(self) -> web.Application:
+        access = Access(self.server.settings.host, self.server.settings.api_key, self._note_refused)
+        app = web.Application(middlewares=[access.check], client_max_size=_LARGEST_POLICY)
+        app.add_routes(
+            [
+                web.get("/", self._serve_root),
+                web.get("/healthz", _answer_health),
+                web.get("/metadata", self._serve_metadata),
+                web.get("/metrics", self._serve_metrics),
+                web.get("/live", self._serve_live),
+                web.post("/act", self._serve_act),
+                web.post("/override", self._serve_override),
+                web.post("/policy", self._serve_policy),
+                *(web.post(f"/{order}", self._serve_order) for order in _ORDERS),
+            ]
+        )
+        app.cleanup_ctx.append(self._watch)
+        return app
+
+    def _note_refused(self) -> None:
+        self.server.measurements.refused += 1
+
+    async def _watch(self, app: web.Application) -> Any:
+        task = asyncio.create_task(self.server.check_watchdogs())
+        yield
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+        self.server.close()
+
+    async def _serve_root(self, request: web.Request) -> web.StreamResponse:
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            return await self.server.serve_client(request)
+        policy = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
+        return web.Response(text=self.page, content_type="text/html", headers={"Content-Security-Policy": policy})
+
+    async def _serve_act(self, request: web.Request) -> web.Response:
+        begin, server = time.perf_counter(), self.server
+        try:
+            content = messages.parse_json(await _read_body(request, server.largest_message))
+        except messages.MessageError as error:
+            server.measurements.errors += 1
+            return _refuse(400, str(error))
+        answer = server.answer(server.posting, content)
+        server.note_duration(server.posting, time.perf_counter() - begin)
+        return web.json_response(messages.as_json(answer), status=400 if "error" in answer else 200)
+
+    async def _serve_order(self, request: web.Request) -> web.Response:
+        order = request.path[1:]
+        try:
+            clients = self.server.give_order(order)
+        except RlctlError as error:
+            return _refuse(409, str(error))
+        return web.json_response({"order": order, "clients": clients})
+
+    async def _serve_override(self, request: web.Request) -> web.Response:
+        """Take an action by hand for all clients, `{"action": [...]}`; null gives them back to the policy."""
+        try:
+            content = messages.parse_json(await _read_body(request, 64 * 1024))
+            if not isinstance(content, dict) or list(content) != ["action"]:
+                raise ValueError('write {"action": [numbers]}, or null to end it')
+            self.server.override(content["action"])
+        except (ValueError, TypeError) as error:
+            return _refuse(400, str(error))
+        return web.json_response({"overridden": content["action"] is not None})
+
+    async def _serve_policy(self, request: web.Request) -> web.Response:
+        """Take another policy, whose file is the body."""
+        content = await _read_body(request, _LARGEST_POLICY)
+        name = Path(request.query.get("name", "")).name
+        # The format of safetensors begins with the length of its header, in JSON.
+        suffix = ".safetensors" if content[8:9] == b"{" else ".onnx"
+        with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
+            file = Path(folder) / (name if name.endswith(suffix) and len(name) < 100 else f"uploaded{suffix}")
+            await asyncio.to_thread(file.write_bytes, content)
+            try:
+                await self.server.replace_policy(file)
+            except RlctlError as error:
+                return _refuse(422, str(error).replace(f"{folder}/", ""))
+        policy = self.server.policy
+        return web.json_response({"policy": policy.file.name, "training_steps": policy.info.training_steps})
+
+    async def _serve_metadata(self, request: web.Request) -> web.Response:
+        return web.json_response(messages.as_json(self.server.metadata))
+
+    async def _serve_metrics(self, request: web.Request) -> web.Response:
+        self.server.measure_spread()
+        states = self.server.count_states()
+        text = self.server.measurements.format_prometheus(states)
+        return web.Response(text=text, content_type="text/plain", charset="utf-8")
+
+    async def _serve_live(self, request: web.Request) -> web.Response:
+        return web.json_response(messages.as_json(self.server.describe()))
+
+
+async def _answer_health(request: web.Request) -> web.Response:
+    return web.Response(text="OK\n")
+
+
+async def _read_body(request: web.Request, largest: int) -> bytes:
+    """Read a body of at most `largest` bytes that arrives in time."""
+    if (request.content_length or 0) > largest:
+        raise web.HTTPRequestEntityTooLarge(largest, request.content_length or 0)
+    content = bytearray()
+    try:
+        async with asyncio.timeout(_BODY_TIMEOUT_S):
+            async for chunk in request.content.iter_any():
+                content += chunk
+                if len(content) > largest:
+                    raise web.HTTPRequestEntityTooLarge(largest, len(content))
+    except TimeoutError:
+        raise web.HTTPRequestTimeout from None
+    return bytes(content)
+
+
+def _refuse(status: int, text: str) -> web.Response:
+    return web.json_response({"error": text}, status=status)

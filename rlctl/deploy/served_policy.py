@@ -1,0 +1,118 @@
+"""Policy files as a server uses them: loaded and tried once, acting for many clients, each with a state of its own."""
+
+from __future__ import annotations
+
+import abc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import ArtifactError
+from rlctl.rollout.acting import PolicyPlayer, check_playable
+from rlctl.run.env_info import EnvInfo
+from rlctl.run.numpy_policy import NumpyNetwork, select_actor_tensors
+from rlctl.run.policy import PolicyInfo, read_policy
+
+Array = NDArray[Any]
+
+
+class Actor(abc.ABC):
+    """Acts for one client; a recurrent policy remembers."""
+
+    @abc.abstractmethod
+    def act(self, observation: Any) -> Array:
+        """Return the deterministic action for an observation."""
+
+    @abc.abstractmethod
+    def reset(self) -> None:
+        """Begin an episode."""
+
+
+class ServedPolicy(abc.ABC):
+    """A policy that a server acts with."""
+
+    def __init__(self, file: Path, info: PolicyInfo) -> None:
+        self.file = file
+        self.info = info
+
+    @abc.abstractmethod
+    def make_actor(self) -> Actor:
+        """Return what acts for one client."""
+
+    def measure_spread(self, observation: Any) -> float | None:
+        """Return the mean standard deviation of the actions that were trained with; None where there is none."""
+        return None
+
+    def check_replaces(self, other: EnvInfo) -> None:
+        """Raise `ArtifactError` if this policy cannot take the place of one for another environment."""
+        own = self.info.env
+        difference = own.find_difference(other, "the served policy's")
+        if difference is None and list(own.observation_sizes.items()) != list(other.observation_sizes.items()):
+            difference = "its observation has other names, or another order"
+        if difference is None and own.control_dt != other.control_dt:
+            difference = f"its control_dt is {own.control_dt} s, the served policy's {other.control_dt} s"
+        if difference is not None:
+            raise ArtifactError(f"{self.file.name}: this policy cannot replace the one that is served: {difference}")
+
+
+class _NumpyActor(Actor):
+    def __init__(self, player: PolicyPlayer) -> None:
+        self._player = player
+
+    def act(self, observation: Any) -> Array:
+        return np.asarray(self._player.act(observation, 0, 0)[1])
+
+    def reset(self) -> None:
+        if (state := self._player.state) is not None:
+            state[:] = 0.0
+
+
+class _NumpyPolicy(ServedPolicy):
+    def __init__(self, file: Path) -> None:
+        info, tensors = read_policy(file)
+        check_playable(info, tensors, file)
+        super().__init__(file, info)
+        self._tensors = select_actor_tensors(info, tensors)
+        self._network = NumpyNetwork(info, self._tensors)
+
+    def make_actor(self) -> Actor:
+        return _NumpyActor(PolicyPlayer(self.info, self._tensors))
+
+    def measure_spread(self, observation: Any) -> float | None:
+        network, algo = self._network, self.info.algo
+        if algo in ("td3", "ddpg", "dqn") or self.info.policy_kwargs.get("use_sde"):
+            return None
+        if network.log_std is not None:
+            return float(np.exp(network.log_std).mean())
+        if network.lstm is not None or self.info.env.action_space["type"] != "Box":
+            return None
+        return float(np.exp(network.compute_log_std(network.latent(observation))).mean())
+
+
+class _OnnxActor(Actor):
+    def __init__(self, policy: Any) -> None:
+        self._policy = policy
+
+    def act(self, observation: Any) -> Array:
+        return np.asarray(self._policy.predict(observation))
+
+    def reset(self) -> None:
+        self._policy.reset()
+
+
+class _OnnxServedPolicy(ServedPolicy):
+    def __init__(self, file: Path) -> None:
+        from rlctl.run.onnx_policy import OnnxPolicy  # only here: it imports onnxruntime
+
+        self._policy = OnnxPolicy.load(file)
+        super().__init__(file, self._policy.info)
+
+    def make_actor(self) -> Actor:
+        return _OnnxActor(type(self._policy)(self.info, self._policy.session))
+
+
+def load_served_policy(file: Path) -> ServedPolicy:
+    """Load a `.safetensors` or `.onnx` file and act once; raises `ArtifactError` for what is not a sound policy."""
+    return _OnnxServedPolicy(file) if file.suffix == ".onnx" else _NumpyPolicy(file)

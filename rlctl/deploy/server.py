@@ -1,0 +1,260 @@
+"""A policy server: openpi's WebSocket protocol, JSON over HTTP, orders, metrics and a live page, on one port."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import dataclasses
+import itertools
+import time
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+from aiohttp import web
+
+from rlctl import __version__
+from rlctl.deploy import messages
+from rlctl.deploy.event_log import EventLog
+from rlctl.deploy.limits import Limits
+from rlctl.deploy.measurements import Measurements
+from rlctl.deploy.observation import ObservationLayout
+from rlctl.deploy.safety_filter import SafetyEvent
+from rlctl.deploy.served_policy import ServedPolicy, load_served_policy
+from rlctl.deploy.session import Session
+from rlctl.dict_spaces import split
+from rlctl.errors import RlctlError, short_repr
+
+_HEARTBEAT_S = 30.0
+_SEND_TIMEOUT_S = 10.0
+_SHORTEST_TICK_S = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class ServerSettings:
+    """What a server is started with."""
+
+    host: str = "127.0.0.1"
+    port: int = 8000
+    limits: Limits | None = None
+    log: Path | None = None
+    api_key: str | None = None
+    max_clients: int = 64
+    watchdog: bool = True
+
+
+class PolicyServer:
+    """Serves one policy to many clients; each WebSocket connection is an episode with a filter of its own."""
+
+    def __init__(self, policy: ServedPolicy, settings: ServerSettings) -> None:
+        self.settings = settings
+        self.policy = policy
+        self.measurements = Measurements()
+        self._log = EventLog(settings.log)
+        self._numbers = itertools.count(1)
+        self._sessions: dict[int, Session] = {}
+        self._order: str | None = None
+        """What an operator ordered, for clients that come later too; None: to act."""
+        limits = settings.limits or Limits()
+        self._limits = limits if settings.watchdog else limits.model_copy(update={"watchdog_periods": 0.0})
+        numbers = sum(part.size for part in split(ObservationLayout(policy.info.env).zeros()).values())
+        self.largest_message = 64 * numbers + 64 * 1024  # as text, and with names
+        """Size of a request beyond which it is not read [bytes]."""
+        self.posting = self._open_session()
+        """The session of clients that post."""
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What a client is told first: names, sizes, units and bounds of observations and actions, timing."""
+        info = self.policy.info
+        layout = self.posting.safety.layout
+        return {
+            "server": f"rlctl {__version__}",
+            "task": info.spec.task,
+            "algo": info.algo,
+            "policy": self.policy.file.name,
+            "training_steps": info.training_steps,
+            "control_dt": self.posting.safety.control_dt,
+            "observation": {name: list(shape) for name, shape in layout.shapes.items()},
+            "observation_units": dict(info.env.observation_units),
+            "action_meaning": info.env.action_meaning,
+            "env": info.env.model_dump(mode="json"),
+            "limits": self._limits.model_dump(mode="json", exclude_defaults=True),
+        }
+
+    def _open_session(self) -> Session:
+        session = Session(next(self._numbers), lambda: self.policy, self._limits)
+        session.safety.on_event = lambda event: self._take_event(session, event)
+        self._sessions[session.number] = session
+        self.measurements.connections += 1
+        self._log.write("connected", session.number)
+        if self._order is not None:
+            session.order(self._order)
+        return session
+
+    def _close_session(self, session: Session) -> None:
+        self._sessions.pop(session.number, None)
+        self._log.write("disconnected", session.number, name=session.safety.state, steps=session.safety.steps)
+
+    def _take_event(self, session: Session, event: SafetyEvent) -> None:
+        if event.kind != "state":
+            self.measurements.counts[event.name] += 1
+        self._log.write(event.kind, session.number, name=event.name, value=event.value, limit=event.limit)
+
+    def close(self) -> None:
+        """Close the log."""
+        self._log.close()
+
+    async def check_watchdogs(self) -> None:
+        """Look after clients that fell silent, for ever."""
+        period = max(self.posting.safety.control_dt or 1.0, _SHORTEST_TICK_S)
+        while True:
+            await asyncio.sleep(period)
+            now = time.monotonic()
+            for session in list(self._sessions.values()):
+                session.check_watchdog(now)
+
+    async def serve_client(self, request: web.Request) -> web.StreamResponse:
+        """Serve one WebSocket connection."""
+        if len(self._sessions) > self.settings.max_clients:  # one of them is `posting`
+            self.measurements.refused += 1
+            return web.Response(status=503, text=f"{self.settings.max_clients} clients are connected, which is all\n")
+        session = self._open_session()
+        try:
+            socket = web.WebSocketResponse(
+                compress=False, max_msg_size=self.largest_message, heartbeat=_HEARTBEAT_S, timeout=1.0
+            )
+            await socket.prepare(request)
+            await socket.send_bytes(messages.pack(self.metadata))
+            with contextlib.suppress(ConnectionError, TimeoutError):  # it died, or does not read
+                await self._answer_all(socket, session)
+            return socket
+        finally:
+            self._close_session(session)
+
+    async def _answer_all(self, socket: web.WebSocketResponse, session: Session) -> None:
+        before_s: float | None = None
+        async for message in socket:
+            begin = time.perf_counter()
+            if message.type is not aiohttp.WSMsgType.BINARY:
+                await self._send_error(socket, session, "a text frame; requests are binary frames of msgpack")
+                continue
+            try:
+                request = messages.unpack(message.data)
+            except messages.MessageError as error:
+                await self._send_error(socket, session, str(error))
+                continue
+            answer = self.answer(session, request)
+            if before_s is not None:
+                answer["server_timing"]["prev_total_ms"] = before_s * 1000.0
+            async with asyncio.timeout(_SEND_TIMEOUT_S):  # of a client that does not read
+                await socket.send_bytes(messages.pack(answer))
+            before_s = time.perf_counter() - begin
+            self.note_duration(session, before_s)
+            # The next message may be there already, and the others have their turn first.
+            await asyncio.sleep(0)
+
+    async def _send_error(self, socket: web.WebSocketResponse, session: Session, text: str) -> None:
+        self.measurements.errors += 1
+        self._log.write("fault", session.number, name="message", value=text)
+        async with asyncio.timeout(_SEND_TIMEOUT_S):
+            await socket.send_str(text)
+        await asyncio.sleep(0)
+
+    def answer(self, session: Session, request: Any) -> dict[str, Any]:
+        """Return a session's answer to a request, and measure it."""
+        answer = session.answer(request)
+        measured = self.measurements
+        if (infer_ms := answer["server_timing"]["infer_ms"]) > 0.0:
+            measured.inference.add(infer_ms / 1000.0)
+        measured.control_error = session.safety.control_error
+        if "error" in answer:
+            measured.errors += 1
+        return answer
+
+    def note_duration(self, session: Session, seconds: float) -> None:
+        """Count a request that took so long."""
+        self.measurements.request.add(seconds)
+        if (dt := session.safety.control_dt) is not None and seconds > dt:
+            self.measurements.deadline_misses += 1
+            self._log.write("fault", session.number, name="deadline", value=seconds, limit=dt)
+
+    def give_order(self, order: str) -> int:
+        """Order all clients, present and future, to stop, home, hold or resume; return how many there are.
+
+        Raises `UsageError` for home where none is known.
+        """
+        for session in self._sessions.values():
+            session.order(order)
+        self._order = None if order == "resume" else order
+        self._log.write("order", name=order)
+        return len(self._sessions)
+
+    def override(self, action: Any | None) -> None:
+        """Give all clients an action by hand; None: the policy acts again. Raises `ValueError` for no action of it."""
+        for session in self._sessions.values():
+            session.safety.override(action)
+        self._log.write("order", name="policy" if action is None else "override")
+
+    async def replace_policy(self, file: Path) -> None:
+        """Act with another policy file from the next step of each client on.
+
+        Raises `RlctlError` for a file that is not a sound policy for the same robot; the old one acts on then.
+        """
+        try:
+            policy = await asyncio.to_thread(load_served_policy, file)
+            policy.check_replaces(self.policy.info.env)
+        except RlctlError as error:
+            self._log.write("policy refused", name=file.name, value=short_repr(str(error), 200))
+            raise
+        self.policy = policy
+        self.measurements.policy_changes += 1
+        self._log.write("policy", name=file.name, value=f"step {policy.info.training_steps}")
+
+    def count_states(self) -> collections.Counter[str]:
+        """Return how many clients are in each state."""
+        return collections.Counter(session.safety.state for session in self._sessions.values())
+
+    def measure_spread(self) -> None:
+        """Measure the spread of the policy's actions, for the newest client's observation."""
+        for session in reversed(self._sessions.values()):
+            if session.observation is not None and session.safety.trusts_observation:
+                self.measurements.spread = self.policy.measure_spread(session.observation)
+                return
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the live page shows."""
+        measured = self.measurements
+        self.measure_spread()
+        return {
+            "policy": self.policy.file.name,
+            "task": self.policy.info.spec.task,
+            "control_dt": self.posting.safety.control_dt,
+            "requests": measured.request.count,
+            "request": measured.request.quantiles(),
+            "inference": measured.inference.quantiles(),
+            "deadline_misses": measured.deadline_misses,
+            "errors": measured.errors,
+            "spread": measured.spread,
+            "counts": dict(measured.counts.most_common(20)),
+            "clients": [_describe(session) for session in self._sessions.values() if session.safety.steps],
+        }
+
+
+def _describe(session: Session) -> dict[str, Any]:
+    safety = session.safety
+    flat = None if session.observation is None else safety.layout.flatten(session.observation)
+    return {
+        "number": session.number,
+        "state": safety.state,
+        "reason": safety.reason,
+        "overridden": safety.is_overridden,
+        "steps": safety.steps,
+        "control_error": safety.control_error,
+        "action": None if session.action is None else session.action.ravel()[:32],
+        "observation": {
+            name: [] if flat is None else flat[place][:32] for name, place in list(safety.layout.slices.items())[:16]
+        },
+        "events": [dataclasses.asdict(event) for event in list(safety.events)[-8:]],
+    }
