@@ -38,6 +38,7 @@ ALSO = {
     ("__init__", "python_api"),
     ("train", "python_api"),
     ("rollout", "deploy"),  # a worker bounds its policy's actions by the filter that robots are behind
+    ("runs", "replay"),  # a report has pictures
 }
 NOT_AMONG_VERBS = {("export", "check_env"), ("replay", "check_env"), ("replay", "export")}
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}

@@ -21,7 +21,7 @@ class _RunsGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(cls=_RunsGroup, help="List runs, show one, compare several, remove what is not needed.")
+app = typer.Typer(cls=_RunsGroup, help="List runs, show one, report and compare them, remove what is not needed.")
 
 
 @app.command("list")
@@ -46,6 +46,34 @@ def show_run(run: Run = None, json: Json = None) -> None:
     from rlctl.runs.show import describe, show
 
     show(describe(run), json)
+
+
+@app.command("report")
+def report_runs(
+    runs: Annotated[
+        list[str],
+        typer.Argument(metavar="RUN|GROUP...", help="Runs, globs or folders of runs, all of one task."),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Default: report.html; md goes to stdout.", show_default=False
+        ),
+    ] = None,
+    format: Annotated[
+        str, typer.Option("--format", metavar="html|md", help="A page, or text for pull requests.")
+    ] = "html",
+    pictures: Annotated[
+        bool, typer.Option("--pictures/--no-pictures", help="Play episodes again, to draw them.")
+    ] = True,
+) -> None:
+    """Write what came of runs as one file: result, curves, evaluations, diagnosis, pictures, how to reproduce it."""
+    claim_stdout()
+    from rlctl import output as streams
+    from rlctl.runs.report.write import ReportRequest, write_report
+
+    if (path := write_report(ReportRequest(runs, format, output, pictures))) is not None:
+        streams.out().print(f"report: {path}", markup=False)
 
 
 @app.command("compare")

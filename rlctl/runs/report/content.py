@@ -1,0 +1,191 @@
+"""What a report says, before it has a format."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shlex
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rlctl.errors import ArtifactError, RlctlError, UsageError
+from rlctl.run import robustness
+from rlctl.run.directory import RunDirectory
+from rlctl.run.episode import RecordedEpisode, load_episode
+from rlctl.run.recipe_difference import find_difference
+from rlctl.run.robustness import Robustness
+from rlctl.runs.comparison import find_group
+from rlctl.runs.diagnosis import Finding, diagnose
+from rlctl.runs.show import Rows
+from rlctl.runs.summary import RunSummary, evaluations, read_table, summarize
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportedRun:
+    """A run and what its folder has."""
+
+    run: RunDirectory
+    summary: RunSummary
+    metrics: Rows
+    evaluations: Rows
+    findings: list[Finding]
+    robustness: Robustness | None
+
+    @property
+    def best(self) -> dict[str, float | None] | None:
+        """The row of the best evaluation."""
+        return next((row for row in self.evaluations if row.get("steps") == self.summary.best_step), None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """One run, or several of one task."""
+
+    runs: list[ReportedRun]
+    notes: list[str]
+    """What a reader must know of the runs themselves."""
+
+    @property
+    def title(self) -> str:
+        first = self.runs[0].summary
+        seeds = ", ".join(str(each.summary.seed) for each in self.runs)
+        return f"{first.task}, {first.algo}, {'seed' if len(self.runs) == 1 else 'seeds'} {seeds}"
+
+    @property
+    def terms(self) -> list[str]:
+        """The names of the reward terms."""
+        columns = self.runs[0].metrics[0] if self.runs[0].metrics else {}
+        return [name.removeprefix("term/") for name in columns if name.startswith("term/")]
+
+
+def collect(texts: Sequence[str]) -> Report:
+    """Read the runs that some words stand for.
+
+    Raises `ArtifactError` for a damaged run and one that has nothing yet, `UsageError` for runs of several tasks.
+    """
+    found = {run.path.resolve(): run for text in texts for run in find_group(text)}
+    runs = [_read(run) for run in found.values()]
+    if len(tasks := {each.summary.task for each in runs}) > 1:
+        raise UsageError(f"runs of several tasks, {', '.join(sorted(tasks))}: a report is of one")
+    if not any(each.metrics or each.evaluations for each in runs):
+        raise ArtifactError(f"{runs[0].run.path}: nothing to report yet: not one update is done")
+    return Report(runs, _find_notes(runs))
+
+
+def _read(run: RunDirectory) -> ReportedRun:
+    run.status()  # raises if the run is damaged
+    summary = summarize(run.path)
+    if summary.state == "damaged":
+        raise ArtifactError(f"{run.path}: damaged: {summary.reason}")
+    rows = read_table(run.metrics_file)
+    return ReportedRun(run, summary, rows, evaluations(run), diagnose(run), _read_robustness(run))
+
+
+def _read_robustness(run: RunDirectory) -> Robustness | None:
+    return robustness.read(run.robustness_file) if run.robustness_file.is_file() else None
+
+
+def _find_notes(runs: Sequence[ReportedRun]) -> list[str]:
+    notes = [
+        f"{each.summary.name} is {each.summary.state_text}, {each.summary.steps or 0:,} steps so far"
+        for each in runs
+        if each.summary.state in ("running", "stopped")
+    ]
+    notes += [f"{each.summary.name} {each.summary.state_text}" for each in runs if each.summary.state == "failed"]
+    notes += [f"{each.summary.name} has no evaluation yet" for each in runs if not each.evaluations]
+    try:
+        recipes = [each.run.recipe() for each in runs]
+    except RlctlError as error:
+        return [*notes, f"a recipe cannot be read: {error}"]
+    keys = sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})
+    return [*notes, f"the recipes differ: {', '.join(keys)}"] if keys else notes
+
+
+def summarize_result(report: Report) -> str:
+    """Return the result as a sentence."""
+    scored = [each for each in report.runs if each.best is not None]
+    if not scored:
+        return "No evaluation yet."
+    if len(scored) == 1:
+        best, summary = scored[0].best or {}, scored[0].summary
+        count = f"{best['episodes']:,.0f}" if best.get("episodes") else "the"
+        success = "" if summary.best_success is None else f"succeeds in {summary.best_success:.1%} of "
+        start = f"The best policy {success}" if success else "The best policy, over "
+        middle = f"{count} evaluation episodes"
+        return f"{start}{middle}; its mean return is {summary.best_return:.4g}, at step {summary.best_step:,}."
+    successes = [each.summary.best_success for each in scored if each.summary.best_success is not None]
+    returns = [each.summary.best_return for each in scored if each.summary.best_return is not None]
+    of_returns = f"a mean return of {np.mean(returns):.4g} ({min(returns):.4g} to {max(returns):.4g})"
+    if len(successes) < len(scored):
+        return f"The best policies of {len(scored)} trainings have {of_returns}."
+    rates = f"{np.mean(successes):.1%} of the evaluation episodes ({min(successes):.1%} to {max(successes):.1%})"
+    return f"The best policies of {len(scored)} trainings succeed in {rates}, with {of_returns}."
+
+
+def format_command(run: ReportedRun) -> str:
+    """Return the command that trains the same again."""
+    changes = [
+        f"--set {shlex.quote(f'{key}={value if isinstance(value, str) else json.dumps(value)}')}"
+        for key, value in run.summary.changes.items()
+    ]
+    return " ".join(["rlctl train", shlex.quote(run.summary.task), f"--seed {run.summary.seed or 0}", *changes])
+
+
+def choose_episodes(report: Report) -> list[tuple[str, RecordedEpisode]]:
+    """Return the best and the worst recorded episode of the best evaluation there are episodes of, with their names."""
+    run = max(report.runs, key=lambda each: each.summary.score).run
+    episodes: list[RecordedEpisode] = []
+    for file in sorted(run.episodes.glob("*.npz")):
+        try:
+            episodes.append(load_episode(file))
+        except ArtifactError:
+            continue
+    steps = max((_trained_steps(each) for each in episodes), default=-1)
+    last = [each for each in episodes if _trained_steps(each) == steps and not each.info.failure]
+    if not last:
+        return []
+    ordered = sorted(last, key=lambda each: (each.info.success is True, each.info.total_reward))
+    named = [("best", ordered[-1]), ("worst", ordered[0])] if len(ordered) > 1 else [("recorded", ordered[0])]
+    return [(f"The {name} recorded episode of the last evaluation: {_outcome(each)}", each) for name, each in named]
+
+
+def _trained_steps(episode: RecordedEpisode) -> int:
+    step = episode.info.policy.rpartition(" ")[2]
+    return int(step) if step.isdecimal() else -1
+
+
+def _outcome(episode: RecordedEpisode) -> str:
+    success = {True: "success, ", False: "no success, ", None: ""}[episode.info.success]
+    return f"{success}return {episode.info.total_reward:.4g}, {len(episode.rewards)} steps"
+
+
+def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[str, Any] | None:
+    """Return steps, mean, lowest and highest over several tables at common steps; None without a value.
+
+    All of shape (points,); a single table gives its own rows, averaged where there are more than `points`.
+    """
+    curves = [found for rows in tables if len(found := _points(rows, column))]
+    if not curves:
+        return None
+    if len(curves) == 1:
+        parts = np.array_split(curves[0], min(points, len(curves[0])))
+        steps, values = np.array([part.mean(axis=0) for part in parts]).T
+        return {"steps": steps, "mean": values, "low": values, "high": values, "count": 1}
+    first, last = max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves)
+    if last < first:
+        return None
+    steps = np.linspace(first, last, points)
+    values = np.array([np.interp(steps, *curve.T) for curve in curves])
+    return {"steps": steps, "mean": values.mean(0), "low": values.min(0), "high": values.max(0), "count": len(curves)}
+
+
+def _points(rows: Rows, column: str) -> Any:
+    found = [
+        (steps, value)
+        for row in rows
+        if (steps := row.get("steps")) is not None and (value := row.get(column)) is not None and math.isfinite(value)
+    ]
+    return np.array(found, np.float64).reshape(-1, 2)

@@ -1,0 +1,152 @@
+"""The plots of a report, as SVG texts that stand in an HTML page."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlctl.run.robustness import PushTest, RobustnessMap
+from rlctl.runs.report.content import Report, mean_curve
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_SIZE = (4.4, 2.7)  # [inches]: the width of a phone, so that text is readable there
+_STYLE = {
+    "svg.fonttype": "none",  # text stays text: smaller, and can be searched
+    "font.size": 9,
+    "font.family": "sans-serif",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+}
+_LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8}
+
+
+def plot_learning(report: Report, column: str) -> str | None:
+    """Return the curve of a quantity over training steps, with evaluations; None where there is none.
+
+    Several runs are drawn as their mean, with a band from the lowest to the highest.
+    """
+    training = mean_curve([each.metrics for each in report.runs], column)
+    evaluated = mean_curve([each.evaluations for each in report.runs], column)
+    if training is None and evaluated is None:
+        return None
+    figure, axes = _make_figure()
+    for curve, label, style in ((training, "training", {}), (evaluated, "evaluations", {"marker": "o", "ms": 3})):
+        if curve is not None:
+            _draw_curve(axes, curve, label, style)
+    if column == "success":
+        axes.set_ylim(-0.03, 1.03)
+    axes.legend(loc="best", **_LEGEND)
+    return _finish(figure, axes, "steps", column, f"{column} over training steps")
+
+
+def plot_terms(report: Report) -> str | None:
+    """Return the weighted reward terms over training steps; None where there are none."""
+    curves = {name: mean_curve([each.metrics for each in report.runs], f"term/{name}") for name in report.terms}
+    drawn = {name: curve for name, curve in curves.items() if curve is not None}
+    if not drawn:
+        return None
+    figure, axes = _make_figure()
+    for name, curve in drawn.items():
+        _draw_curve(axes, curve, name, {"linewidth": 1.2})
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), **_LEGEND)
+    return _finish(figure, axes, "steps", "sum per episode", "reward terms over training steps")
+
+
+def _draw_curve(axes: Axes, curve: dict[str, Any], label: str, style: dict[str, Any]) -> None:
+    (line,) = axes.plot(curve["steps"], curve["mean"], label=label, **style)
+    if curve["count"] > 1:
+        axes.fill_between(curve["steps"], curve["low"], curve["high"], color=line.get_color(), alpha=0.2, linewidth=0)
+
+
+def plot_robustness(result: RobustnessMap) -> str:
+    """Return a map of success, or return where there is no success: a heat map, or a curve with its interval."""
+    quantity = "success" if result.cells[0].success_rate is not None else "return"
+    if len(result.axes) == 1:
+        return _plot_varied(result, quantity)
+    rows, columns = result.axes
+    shape = (len(rows.values), len(columns.values))
+    values = np.array([_value(cell, quantity) for cell in result.cells]).reshape(shape)
+    limits = {"vmin": 0, "vmax": 1} if quantity == "success" else {}
+    figure, axes = _make_figure()
+    axes.grid(False)
+    image = axes.imshow(values, origin="lower", aspect="auto", cmap="viridis", **limits)
+    axes.set_xticks(range(shape[1]), [f"{value:g}" for value in columns.values])
+    axes.set_yticks(range(shape[0]), [f"{value:g}" for value in rows.values])
+    for index, cell in enumerate(result.cells):
+        if cell.nominal:
+            axes.plot(index % shape[1], index // shape[1], marker="s", ms=9, mfc="none", mec="white", mew=1.5)
+    figure.colorbar(image, label=quantity)
+    return _finish(figure, axes, columns.name, rows.name, f"{quantity} by {rows.name} and {columns.name}")
+
+
+def _plot_varied(result: RobustnessMap, quantity: str) -> str:
+    (axis,) = result.axes
+    figure, axes = _make_figure()
+    _draw_intervals(axes, axis.values, result.cells, quantity)
+    if axis.nominal is not None:
+        axes.axvline(axis.nominal, linestyle=":", color="gray", label="nominal")
+        axes.legend(loc="best", **_LEGEND)
+    return _finish(figure, axes, axis.name, quantity, f"{quantity} by {axis.name}")
+
+
+def plot_push(test: PushTest) -> str:
+    """Return how many episodes go well by the push."""
+    figure, axes = _make_figure()
+    axes.plot([each.impulse for each in test.levels], [each.held for each in test.levels], marker="o", ms=3)
+    if test.threshold is not None:
+        axes.axvline(test.threshold, linestyle=":", color="gray")
+    axes.set_ylim(-0.03, 1.03)
+    return _finish(figure, axes, "push [N s]", test.measure, f"{test.measure} by push")
+
+
+def _draw_intervals(axes: Axes, places: Sequence[float], cells: Sequence[Any], quantity: str) -> None:
+    values = [_value(cell, quantity) for cell in cells]
+    (line,) = axes.plot(places, values, marker="o", ms=3)
+    intervals = [cell.success_interval if quantity == "success" else cell.return_interval for cell in cells]
+    if all(each is not None for each in intervals):
+        low, high = np.array(intervals).T
+        axes.fill_between(places, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+
+
+def _value(cell: Any, quantity: str) -> float:
+    return float(cell.success_rate if quantity == "success" else cell.mean_return)
+
+
+def _make_figure() -> tuple[Figure, Axes]:
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=_SIZE, layout="constrained")
+        axes = figure.add_subplot()
+    return figure, axes
+
+
+def _finish(figure: Figure, axes: Axes, x: str, y: str, title: str) -> str:
+    import matplotlib
+    from matplotlib.ticker import EngFormatter
+
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    if x == "steps":
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    file = io.StringIO()
+    with matplotlib.rc_context(_STYLE):
+        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    svg = file.getvalue()[file.getvalue().index("<svg") :]
+    # The page scales it; a name is for those who cannot see it.
+    name = title.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    return re.sub(
+        r'^<svg ([^>]*?)width="[^"]*"',
+        rf'<svg role="img" aria-label="{name}" \1',
+        re.sub(r' height="[^"]*pt"', "", svg, count=1),
+    )

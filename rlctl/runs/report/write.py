@@ -1,0 +1,141 @@
+"""Writes a report as one HTML file that needs nothing else, or as Markdown for pull requests."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rlctl import output
+from rlctl.errors import RlctlError, UsageError, did_you_mean
+from rlctl.run import files
+from rlctl.runs.report import content
+from rlctl.runs.report.content import Report, ReportedRun
+
+FORMATS = ("html", "md")
+DEFAULT_FILE = Path("report.html")
+
+_PICTURES = 6
+"""Of an episode."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportRequest:
+    """What the command line asks for."""
+
+    runs: Sequence[str]
+    format: str = "html"
+    output: Path | None = None
+    """None: report.html; Markdown goes to stdout."""
+    pictures: bool = True
+
+
+def write_report(request: ReportRequest) -> Path | None:
+    """Write a report and return its file; None for one that was printed.
+
+    Raises `UsageError` for an unknown format and runs of several tasks, `ArtifactError` for a damaged run or one that
+    has nothing yet.
+    """
+    if request.format not in FORMATS:
+        raise UsageError(f"--format {request.format}: give html or md.{did_you_mean(request.format, FORMATS)}")
+    report = content.collect(request.runs)
+    is_html = request.format == "html"
+    text = _render(f"report.{request.format}.jinja", is_html, _values(report, is_html, request.pictures))
+    if request.output is None and not is_html:
+        output.results().write(text)
+        return None
+    path = request.output or DEFAULT_FILE
+    files.write_bytes(path, text.encode())
+    return path
+
+
+def _render(template: str, escape: bool, values: dict[str, Any]) -> str:
+    import jinja2
+
+    environment = jinja2.Environment(autoescape=escape, trim_blocks=True, undefined=jinja2.StrictUndefined)
+    return environment.from_string(Path(__file__).with_name(template).read_text(encoding="utf-8")).render(values)
+
+
+def _values(report: Report, is_html: bool, pictures: bool) -> dict[str, Any]:
+    single = len(report.runs) == 1
+    first = report.runs[0]
+    findings = [("" if single else f", {each.summary.name}", found) for each in report.runs for found in each.findings]
+    values = {
+        "title": report.title,
+        "result": content.summarize_result(report),
+        "notes": report.notes,
+        "findings": findings,
+        "runs": [_tabulate(each) for each in report.runs],
+        "robustness": list(_describe_robustness(report)),
+        "commands": [content.format_command(each) for each in report.runs],
+        "changes": dict.fromkeys(
+            f"{key} = {value}" for each in report.runs for key, value in each.summary.changes.items()
+        ),
+        "versions": ", ".join(f"{name} {version}" for name, version in first.summary.versions.items()),
+        "recipe": first.run.recipe_file.read_text(encoding="utf-8", errors="replace").strip()
+        if first.run.recipe_file.is_file()
+        else "(missing)",
+    }
+    return {**values, **_drawings(report, pictures)} if is_html else values
+
+
+def _drawings(report: Report, pictures: bool) -> dict[str, Any]:
+    from rlctl.runs.report import plots
+
+    learning = [plots.plot_learning(report, "return"), plots.plot_learning(report, "success"), plots.plot_terms(report)]
+    measured = [each.robustness for each in report.runs if each.robustness is not None]
+    maps = [plots.plot_robustness(each) for result in measured for each in result.maps if len(each.axes) <= 2]
+    maps += [plots.plot_push(result.push) for result in measured if result.push is not None]
+    return {
+        "learning": [plot for plot in learning if plot is not None],
+        "band": f"Mean of {len(report.runs)} trainings, from the lowest to the highest."
+        if len(report.runs) > 1
+        else "",
+        "maps": maps,
+        "pictures": list(_take_pictures(report)) if pictures else [],
+    }
+
+
+def _take_pictures(report: Report) -> Iterator[tuple[str, list[tuple[int, str]]]]:
+    from rlctl.replay.pictures import take_pictures
+
+    for name, episode in content.choose_episodes(report):
+        try:
+            taken = take_pictures(episode, _PICTURES)
+        except RlctlError as error:  # another task by now, or one that cannot draw
+            output.print_notes([f"no pictures: {str(error).splitlines()[0]}"])
+            return
+        yield name, [(step, base64.b64encode(picture).decode()) for step, picture in taken]
+
+
+def _tabulate(run: ReportedRun) -> dict[str, Any]:
+    rows = run.evaluations
+    columns = [name for name in (rows[0] if rows else {}) if any(row.get(name) is not None for row in rows)]
+    cells = [[_cell(name, row.get(name)) for name in columns] for row in rows]
+    return {"name": run.summary.name, "columns": columns, "rows": cells}
+
+
+def _cell(name: str, value: float | None) -> str:
+    if value is None:
+        return ""
+    if name in ("steps", "episodes"):
+        return f"{value:,.0f}"
+    return f"{value:.1%}" if name == "success" else f"{value:.4g}"
+
+
+def _describe_robustness(report: Report) -> Iterator[str]:
+    for each in report.runs:
+        result = each.robustness
+        if result is None:
+            continue
+        if (found := result.find_worst()) is not None:
+            axes, cell = found[0].axes, found[1]
+            where = ", ".join(f"{axis.name} {value:g}" for axis, value in zip(axes, cell.values, strict=True))
+            rate = "" if cell.success_rate is None else f"success {cell.success_rate:.1%}, "
+            yield f"worst of {result.episodes} episodes each at {where}: {rate}return {cell.mean_return:.4g}"
+        if result.push is not None:
+            yield result.push.verdict
+        if result.command:
+            yield f"measured by: {result.command}"

@@ -1,0 +1,168 @@
+"""The report of runs: what must be in it, that it needs nothing else, and what it refuses."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.run import robustness
+from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
+from rlctl.runs.report import content
+from rlctl.runs.report.write import ReportRequest, write_report
+
+LARGEST = 2_000_000  # [bytes]
+HEADER = "steps,seconds,return,success,term/alive\n"
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+
+
+@pytest.fixture
+def group(write_run):
+    """Three trainings of one recipe, seeds 0 to 2."""
+    folders = []
+    for seed in range(3):
+        folder = write_run(
+            f"reach/2026-11-21_10-00-0{seed}_s{seed}",
+            seed=seed,
+            evals=((1000, 0.2, 1.0 + seed), (2000, 0.8 + 0.1 * seed, 9.0 + seed)),
+            recipe_changes={"algo_kwargs.learning_rate": 0.001, "task.name": "<b>&"},
+            versions={"rlctl": "0.1.0"},
+        )
+        rows = (f"{200 * step},{step},{step + seed},{step / 10},{step}\n" for step in range(1, 11))
+        (folder / "metrics.csv").write_text(HEADER + "".join(rows))
+        folders.append(folder)
+    return folders
+
+
+def write(*runs, **options):
+    path = write_report(ReportRequest([str(run) for run in runs], **options))
+    return None if path is None else path.read_text()
+
+
+def test_page_has_everything_and_needs_nothing_else(group):
+    page = write(group[2])
+    assert "The best policy succeeds in 100.0% of 100 evaluation episodes" in page
+    for plot in ("return over training steps", "success over training steps", "reward terms over training steps"):
+        assert f'aria-label="{plot}"' in page
+    assert page.count("<svg") == page.count("</svg>") == 3
+    assert "Nothing unusual in the records of this training." in page
+    assert "rlctl train reach --seed 2 --set algo_kwargs.learning_rate=0.001" in page
+    assert "algo: ppo" in page
+    assert "rlctl 0.1.0" in page
+    assert "<b>&" not in page  # what a run says is text
+    assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//|@import|url\(\s*["']?http|<script|<link""", page)
+    assert len(page) < LARGEST
+
+
+def test_group_is_drawn_with_a_band(group):
+    page = write(group[0].parent)
+    assert "reach, ppo, seeds 0, 1, 2" in page
+    assert "The best policies of 3 trainings succeed in 90.0% of the evaluation episodes (80.0% to 100.0%)" in page
+    assert "Mean of 3 trainings, from the lowest to the highest." in page
+
+
+def test_curves_of_seeds_are_averaged_at_common_steps():
+    tables = [
+        [{"steps": 10.0, "x": 1.0}, {"steps": 30.0, "x": 3.0}],
+        [{"steps": 20.0, "x": 6.0}, {"steps": 40.0, "x": 6.0}],
+    ]
+    curve = content.mean_curve(tables, "x", points=3)
+    assert curve["steps"].tolist() == [20, 25, 30]
+    # The first curve has 2, 2.5 and 3 there, the second 6.
+    assert curve["mean"].tolist() == [4, 4.25, 4.5]
+    assert curve["low"].tolist() == [2, 2.5, 3]
+    assert curve["high"].tolist() == [6, 6, 6]
+
+
+def test_robustness_is_in_it_where_it_was_measured(group):
+    outcome = {"success_interval": (0.1, 0.9), "mean_return": 1.0, "return_interval": (0.0, 2.0)}
+    axis = Axis(name="mass", setting="events.mass.factor", values=[0.6, 1.0], nominal=1.0)
+    cells = [Cell(values=[value], nominal=value == 1, success_rate=value / 2, **outcome) for value in axis.values]
+    grid = [Axis(name=name, setting=name, values=[1.0, 2.0], nominal=1.0) for name in ("mass", "friction")]
+    pairs = [Cell(values=[a, b], nominal=a == b == 1, success_rate=0.5, **outcome) for a in (1, 2) for b in (1, 2)]
+    result = Robustness(
+        task="reach", parameters={}, policy_file="best", algo="ppo", training_steps=1, episodes=20, seed=0,
+        deterministic=True, nominal=Outcome(success_rate=0.5, **outcome),
+        maps=[RobustnessMap(axes=[axis], cells=cells), RobustnessMap(axes=grid, cells=pairs)],
+    )  # fmt: skip
+    robustness.write(group[0] / "robustness.json", result)
+    page = write(group[0])
+    assert "worst of 20 episodes each at mass 0.6: success 30.0%, return 1" in page
+    assert 'aria-label="success by mass"' in page
+    assert 'aria-label="success by mass and friction"' in page
+
+
+def test_markdown_is_printed_for_pull_requests(group, rlctl):
+    done = rlctl("runs", "report", group[0], "--format", "md")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("## reach, ppo, seed 0\n")
+    assert "| steps | seconds | episodes | success | return |\n|---:|---:|---:|---:|---:|\n| 1,000 |" in done.stdout
+    assert "```\nrlctl train reach --seed 0" in done.stdout
+
+
+def test_run_in_progress_is_reported_as_such(group, hold_lock):
+    status = json.loads((group[0] / "run.json").read_text())
+    (group[0] / "run.json").write_text(json.dumps({**status, "status": "running"}))
+    (group[0] / "evals.csv").unlink()
+    hold_lock(group[0])
+    page = write(group[0])
+    assert "No evaluation yet." in page
+    assert "is running, 2,000 steps so far" in page
+
+
+def test_what_cannot_be_reported(group, write_run):
+    with pytest.raises(UsageError, match=r"--format pdf: give html or md"):
+        write(group[0], format="pdf")
+    other = write_run("ant/2026-11-21_10-00-00_s0")
+    with pytest.raises(UsageError, match="runs of several tasks, ant, reach"):
+        write(group[0], other)
+    empty = write_run("reach/2026-11-21_11-00-00_s0", metrics=(), evals=())
+    with pytest.raises(ArtifactError, match="nothing to report yet"):
+        write(empty)
+    (empty / "run.json").write_text("{")
+    with pytest.raises(ArtifactError, match=r"run\.json"):
+        write(empty)
+    with pytest.raises(ArtifactError, match="no run 'nowhere'"):
+        write("nowhere")
+
+
+@pytest.mark.slow
+def test_trained_run_has_pictures_of_its_best_and_worst_episode(rlctl, tmp_path):
+    settings = ("total_timesteps=5120", "eval.every_steps=2560", "eval.episodes=4")
+    done = rlctl("train", "reach", "--no-check", *(part for each in settings for part in ("--set", each)))
+    assert done.returncode == 0, done.stderr
+    done = rlctl("runs", "report")
+    assert done.returncode == 2  # which runs?
+    done = rlctl("runs", "report", "latest", "-o", "all.html")
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "all.html").read_text()
+    pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', page)
+    assert len(pictures) in (6, 12)  # the worst episode may be the first
+    assert all(base64.b64decode(each).startswith(b"\xff\xd8") for each in pictures)
+    assert len(page) < LARGEST
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+@pytest.mark.parametrize("width", [360, 1200])
+def test_browser_shows_it(group, tmp_path, width):
+    write(group[0].parent, output=tmp_path / "all.html")
+    command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    page = tmp_path / "all.html"
+    measure = "<script>document.title = document.documentElement.scrollWidth + ' of ' + window.innerWidth</script>"
+    page.write_text(page.read_text() + measure)
+    done = subprocess.run(
+        [*command, f"--window-size={width},900", "--dump-dom", page.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    content, inside = re.search(r"<title>(\d+) of (\d+)</title>", done.stdout).groups()
+    assert int(content) <= int(inside)  # nothing to scroll sideways
+    assert done.stdout.count("<svg") == 3
+    assert "The best policies of 3 trainings" in done.stdout
