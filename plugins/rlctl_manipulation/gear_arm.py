@@ -93,7 +93,6 @@ class GearArm(Task):
     }
     rlctl_ignore = {
         "RL110": "in the stage reach there is no object whose orientation could change; all stages observe the same",
-        "RL111": "in the stage reach the object is the goal, whose height is given",
         "RL611": "a goal is 5 cm in a circle of 0.4 m, and torques have to hold the arm there",
     }
 

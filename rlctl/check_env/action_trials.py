@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.actions import actions, build_action
-from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode, Moment
 from rlctl.check_env.finding import NotJudged
-from rlctl.check_env.instance import Instance
-from rlctl.check_env.leaves import Leaf, leaf_name, pick
+from rlctl.check_env.instance import Context, Instance
+from rlctl.check_env.leaves import Leaf, element_name, flat_action, flat_numbers, pick
 from rlctl.check_env.messages import FIRST_SEED
-from rlctl.check_env.returned import flat_action
+
+Frame = NDArray[np.float64]
+"""What one call of reset or step returned: the observation's numbers, flat, the reward, and the two flags."""
 
 REPEATED_STEPS = 20
+REWARD = -3
+"""Where the reward is in a frame."""
 
 
 class OutOfTime(Exception):
@@ -39,11 +42,7 @@ class Dimension:
     @property
     def name(self) -> str:
         """How to write it: `action[2]`."""
-        where = "action" + leaf_name(self.leaf).removeprefix("observation")
-        if not self.leaf.shape:
-            return where
-        position = np.unravel_index(self.index, self.leaf.shape)
-        return f"{where}[{', '.join(str(int(i)) for i in position)}]"
+        return element_name(self.leaf, self.index, "action")
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -75,17 +74,6 @@ def dimensions(leaves: list[Leaf]) -> list[Dimension]:
     return [each for each in found if each.bounds[0] < each.bounds[1]]
 
 
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """What one call of reset or step returned."""
-
-    observation: NDArray[Any]
-    """Its numbers, flat."""
-    reward: float
-    ended: tuple[bool, bool]
-    """`terminated` and `truncated`."""
-
-
 class Trials:
     """Plays episodes of one instance, each with a seed and with changed actions; equal ones are played once."""
 
@@ -103,7 +91,7 @@ class Trials:
             for _ in range(2):  # an instance's first episode may differ from all others
                 before = self.plain(FIRST_SEED, REPEATED_STEPS)
                 again = self.play(FIRST_SEED, self.actions(FIRST_SEED, REPEATED_STEPS))
-                if not observations_differ(before, again) and not steps_of_other_rewards(before, again):
+                if not find_differences(before, again):
                     return
                 self._plain[FIRST_SEED, REPEATED_STEPS] = again
         except OutOfTime:
@@ -150,19 +138,19 @@ class Trials:
             raise OutOfTime
         return frames
 
-    def copies(self, dimension: Dimension, seed: int, steps: int, longest_delay: int) -> NDArray[np.intp]:
-        """Return the elements of the observation that only repeat this number of an earlier action."""
-        rows = [frame.observation for frame in self.plain(seed, steps)[1:]]
+    def copies(self, dimension: Dimension, seed: int, steps: int, longest_delay: int) -> list[int]:
+        """Return the columns of a frame that only repeat this number of an earlier action."""
+        rows = [frame[:REWARD] for frame in self.plain(seed, steps)[1:]]
         given = [flat_action(self.instance.action_leaves, each) for each in self.actions(seed, len(rows))]
         values = np.array([each[dimension.column] for each in given])
         if not rows or len({row.shape for row in rows}) > 1:
-            return np.zeros(0, np.intp)
-        returned = np.stack(rows).astype(np.float64)
+            return []
+        returned = np.stack(rows)
         is_copy = np.zeros(returned.shape[1], np.bool_)
         for delay in range(min(longest_delay + 1, len(values) // 2)):
             late = values[: len(values) - delay, None]
             is_copy |= ((returned[delay:] == late) | (returned[delay:] == late.astype(np.float32))).all(axis=0)
-        return np.flatnonzero(is_copy)
+        return (np.flatnonzero(is_copy) + REWARD - len(is_copy)).tolist()
 
 
 def to_frame(moment: Moment) -> Frame:
@@ -171,37 +159,28 @@ def to_frame(moment: Moment) -> Frame:
         reward = float(moment.reward)
     except Exception:  # its type is another rule's matter
         reward = float("nan")
-    return Frame(_flatten(moment.observation), reward, moment.flags)
+    return np.concatenate([flat_numbers(moment.observation).astype(np.float64), [reward, *moment.flags]])
 
 
-def _flatten(observation: Any) -> NDArray[Any]:
-    """Return a copy of all numbers of an observation."""
-    if isinstance(observation, dict):
-        observation = tuple(observation.values())
-    if isinstance(observation, (tuple, list)) and any(isinstance(each, (np.ndarray, dict)) for each in observation):
-        parts = [_flatten(value) for value in observation]
-        return np.concatenate(parts) if parts else np.zeros(0)
-    try:
-        array = np.array(observation)
-    except Exception:  # a ragged list, or an object of its own kind
-        array = np.zeros(0)
-    return array.ravel() if array.dtype.kind in "biuf" else np.zeros(0)
+def find_differences(one: Sequence[Frame], two: Sequence[Frame]) -> dict[int, NDArray[np.intp]]:
+    """Return the columns that differ per step, as far as both go, for steps where any does; NaN equals NaN.
 
-
-def observations_differ(one: list[Frame], two: list[Frame], besides: NDArray[np.intp] | None = None) -> bool:
-    """Say whether observations or ends differ, as far as both go, with some elements left out; NaN equals NaN."""
-    left_out = np.zeros(0, np.intp) if besides is None else besides
-
-    def differ(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    Columns are counted from the end: `REWARD`, -2 and -1 for the flags, the observation's elements before them.
+    """
+    found = {}
+    for step, (a, b) in enumerate(zip(one, two, strict=False)):
         if a.shape != b.shape:
-            return True
-        is_float = a.dtype.kind == "f" and b.dtype.kind == "f"
-        return not np.array_equal(np.delete(a, left_out), np.delete(b, left_out), equal_nan=is_float)
+            found[step] = np.arange(REWARD, 0)
+        elif (differ := (a != b) & ~(np.isnan(a) & np.isnan(b))).any():
+            found[step] = np.flatnonzero(differ) - len(a)
+    return found
 
-    return any(a.ended != b.ended or differ(a.observation, b.observation) for a, b in zip(one, two, strict=False))
+
+def observations_differ(one: Sequence[Frame], two: Sequence[Frame], besides: Sequence[int] = ()) -> bool:
+    """Say whether observations or flags differ, with some columns left out."""
+    return any(not {REWARD, *besides}.issuperset(each.tolist()) for each in find_differences(one, two).values())
 
 
-def steps_of_other_rewards(one: list[Frame], two: list[Frame]) -> list[int]:
-    """Return the steps at which the rewards differ, as far as both go; NaN equals NaN."""
-    rewards = [(a.reward, b.reward) for a, b in zip(one, two, strict=False)]
-    return [step for step, (a, b) in enumerate(rewards) if a != b and not (np.isnan(a) and np.isnan(b))]
+def steps_of_other_rewards(one: Sequence[Frame], two: Sequence[Frame]) -> list[int]:
+    """Return the steps at which the rewards differ."""
+    return [step for step, columns in find_differences(one, two).items() if REWARD in columns]

@@ -1,6 +1,6 @@
-"""Reads a PyBullet client that somebody else made: its bodies, their state, and which links touch.
+"""Reads PyBullet clients that somebody else made: their bodies, how these move, and which links touch.
 
-Nothing here changes a world. `getCollisionShapeData` is left alone: it crashes on some models.
+`getCollisionShapeData` is left alone: it crashes on some models.
 """
 
 from __future__ import annotations
@@ -15,20 +15,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+MOST_CLIENTS = 1024
+"""So many physics clients a process may have, in the wheels of PyBullet 3.2."""
 MOST_BODIES = 20
 """So many bodies of a world are read, robots and free ones first."""
 MOST_JOINTS = 60
 WIDEST_RANGE = 1e3
 """Limits farther apart are none: some models write 1e16 for a joint without limits."""
 
+GRAVITY = -9.81  # [m/s^2]
+WEIGHT_STEPS = 20
+UNMOVED = 1e-3
+"""Gravity changes nothing where no position or speed differs by more [m, rad, m/s, rad/s]."""
+LONGEST_S = 0.1
+"""How long a world goes on without its environment [s]: what was put inside something is thrown out by then."""
+MOST_STEPS = 100
+
 Link = tuple[int, int]
 """Body id and link index; the base is link -1."""
 Pair = tuple[Link, Link]
+POSITION, VELOCITY, ANGULAR, JOINTS = slice(0, 3), slice(3, 6), slice(6, 9), 9
+"""Where in a body's state its base's position [m], velocity [m/s] and angular velocity [rad/s] are, and where its
+joints' begin: all positions, then all speeds [rad, rad/s; m, m/s]."""
 
 
 def bullet() -> Any:
     """Return PyBullet, which the environment has loaded."""
     return sys.modules["pybullet"]
+
+
+def connected() -> list[int]:
+    """Return the ids of the clients that are connected, whoever did it; empty where PyBullet is not loaded."""
+    if "pybullet" not in sys.modules:
+        return []
+    return [each for each in range(MOST_CLIENTS) if bullet().getConnectionInfo(physicsClientId=each)["isConnected"]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,33 +78,8 @@ class Body:
     joints: tuple[Joint, ...]
     is_free: bool
     """Whether its base is not fixed to the world."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Dynamics:
-    """What may be randomised of a body, per link."""
-
-    masses: tuple[float, ...]
-    frictions: tuple[float, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class State:
-    """A body at one moment."""
-
-    position: NDArray[np.float64]
-    """Of the base [m]. Shape (3,)."""
-    velocity: NDArray[np.float64]
-    """Linear [m/s]. Shape (3,)."""
-    angular: NDArray[np.float64]
-    """Angular velocity [rad/s]. Shape (3,)."""
-    joints: NDArray[np.float64]
-    """Positions and speeds [rad, rad/s; m, m/s]. Shape (2, joints)."""
-
-    @property
-    def numbers(self) -> NDArray[np.float64]:
-        """All of it. Shape (9 + 2 * joints,)."""
-        return np.concatenate([self.position, self.velocity, self.angular, self.joints.ravel()])
+    has_heavy_links: bool
+    """Whether it has joints, and anything beside its base has a mass."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,8 +128,11 @@ def _body(client: int, body: int) -> Body:
         if info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)
     ]
     links = [base, *(info[12].decode(errors="replace") for info in infos)]
-    mass = p.getDynamicsInfo(body, -1, physicsClientId=client)[0]
-    return Body(body, name or base or "a body", tuple(links), tuple(joints[:MOST_JOINTS]), mass > 0)
+    base_mass, *masses = (p.getDynamicsInfo(body, i, physicsClientId=client)[0] for i in range(-1, len(infos)))
+    has_heavy_links = bool(joints) and any(mass > 0 for mass in masses)
+    return Body(
+        body, name or base or "a body", tuple(links), tuple(joints[:MOST_JOINTS]), base_mass > 0, has_heavy_links
+    )
 
 
 def _number_names(bodies: list[Body]) -> list[Body]:
@@ -148,24 +146,17 @@ def _number_names(bodies: list[Body]) -> list[Body]:
     return numbered
 
 
-def read_states(world: World) -> list[State]:
-    """Return the state of each body."""
+def read_states(world: World) -> list[NDArray[np.float64]]:
+    """Return the state of each body. Shape (9 + 2 * joints,) each."""
     p, client = bullet(), world.client
     states = []
     for body in world.bodies:
         position, _ = p.getBasePositionAndOrientation(body.id, physicsClientId=client)
-        velocity, angular = p.getBaseVelocity(body.id, physicsClientId=client)
         joints = p.getJointStates(body.id, [j.index for j in body.joints], physicsClientId=client) or ()
-        numbers = np.array([each[:2] for each in joints], np.float64).reshape(-1, 2).T
-        states.append(State(np.array(position), np.array(velocity), np.array(angular), numbers))
+        numbers = np.ravel([each[:2] for each in joints], "F")  # all positions, then all speeds
+        parts = [position, *p.getBaseVelocity(body.id, physicsClientId=client), numbers]
+        states.append(np.concatenate(parts))
     return states
-
-
-def read_dynamics(client: int, body: Body) -> Dynamics:
-    """Return masses and frictions."""
-    p = bullet()
-    infos = [p.getDynamicsInfo(body.id, i - 1, physicsClientId=client) for i in range(len(body.links))]
-    return Dynamics(tuple(float(info[0]) for info in infos), tuple(float(info[1]) for info in infos))
 
 
 def read_gravity(client: int) -> list[float]:
@@ -187,3 +178,55 @@ def thickness(client: int, link: Link) -> float:
     """Return the smallest extent of the box around a link [m]."""
     low, high = bullet().getAABB(*link, physicsClientId=client)
     return float(min(b - a for a, b in zip(low, high, strict=True)))
+
+
+def weight_matters(world: World) -> bool:
+    """Say whether gravity would change how a world without it goes on: not where all that moves moves level."""
+    p, client = bullet(), world.client
+    state = p.saveState(physicsClientId=client)
+    ends = []
+    for gravity in (0.0, GRAVITY):
+        p.restoreState(state, physicsClientId=client)
+        p.setGravity(0.0, 0.0, gravity, physicsClientId=client)
+        for _ in range(WEIGHT_STEPS):
+            p.stepSimulation(physicsClientId=client)
+        ends.append(np.concatenate(read_states(world)))
+    p.restoreState(state, physicsClientId=client)
+    p.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
+    p.removeState(state, physicsClientId=client)
+    return bool(np.abs(ends[0] - ends[1]).max(initial=0.0) > UNMOVED)
+
+
+@dataclasses.dataclass(frozen=True)
+class Jump:
+    """How fast a free body became right after a reset, with nothing done to it."""
+
+    body: str
+    speed: float
+    """[m/s]."""
+    explained: float
+    """The speed that it had, and that falling adds [m/s]."""
+    after_s: float
+    seed: int
+
+
+def find_jumps(world: World, seed: int) -> list[Jump]:
+    """Let a world go on without its environment, and return how fast each free body became."""
+    p, client = bullet(), world.client
+    dt = float(p.getPhysicsEngineParameters(physicsClientId=client)["fixedTimeStep"])
+    gravity = float(np.linalg.norm(read_gravity(client)))
+    speeds = [_free_speeds(world)]
+    for _ in range(min(MOST_STEPS, max(1, round(LONGEST_S / dt))) if dt > 0 else 0):
+        p.stepSimulation(physicsClientId=client)
+        speeds.append(_free_speeds(world))
+    jumps = []
+    for name, before in speeds[0].items():
+        step = max(range(len(speeds)), key=lambda i: speeds[i][name])
+        jumps.append(Jump(name, speeds[step][name], before + gravity * step * dt, step * dt, seed))
+    return jumps
+
+
+def _free_speeds(world: World) -> dict[str, float]:
+    states = zip(world.bodies, read_states(world), strict=True)
+    speeds = {body.name: float(np.linalg.norm(state[VELOCITY])) for body, state in states if body.is_free}
+    return {name: min(speed, 1e6) if math.isfinite(speed) else 1e6 for name, speed in speeds.items()}

@@ -12,12 +12,11 @@ from typing import Any
 from rlctl import env_spec
 from rlctl.check_env import families
 from rlctl.check_env.clock import read_clock
-from rlctl.check_env.context import Context
 from rlctl.check_env.experiment import Experiment
-from rlctl.check_env.failures import EnvironmentRaised, failure
+from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
-from rlctl.check_env.instance import Budget
-from rlctl.check_env.messages import Crash, End, Fact, Failure, Finished, Message, Mistake, Skipped
+from rlctl.check_env.instance import Budget, Context
+from rlctl.check_env.messages import End, Fact, Failure, Finished, Message, Mistake, Skipped
 from rlctl.check_env.progress import Progress
 from rlctl.check_env.wire import encode
 from rlctl.errors import RecipeError, UsageError
@@ -74,7 +73,7 @@ def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> 
 def _run(experiment: Experiment, context: Context) -> Iterator[Message]:
     started = time.monotonic()
     context.progress.phase(experiment.name)
-    is_complete = False
+    is_complete, crash = False, ""
     found: set[str] = set()
     try:
         for message in experiment.run(context):
@@ -90,10 +89,10 @@ def _run(experiment: Experiment, context: Context) -> Iterator[Message]:
                 yield Skipped(name, str(reason), applies=isinstance(reason, NotJudged))
         is_complete = True
     except EnvironmentRaised as error:
-        yield failure(error, context.progress)
+        yield describe_failure(error, context.progress)
     except UsageError:
         raise
     except Exception:
         # The environment's own exceptions were caught where it was called, so this one is ours.
-        yield Crash(experiment.name, traceback.format_exc())
-    yield Finished(experiment.name, time.monotonic() - started, is_complete)
+        crash = traceback.format_exc()
+    yield Finished(experiment.name, time.monotonic() - started, is_complete, crash)

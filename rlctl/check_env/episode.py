@@ -10,7 +10,7 @@ from rlctl.check_env.actions import actions
 from rlctl.check_env.clock import read_clock
 from rlctl.check_env.failures import EnvironmentRaised
 from rlctl.check_env.instance import Instance
-from rlctl.check_env.returned import truth, type_name
+from rlctl.check_env.leaves import truth, type_name
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rlctl.check_env.finding import RULES, Finding
 
 if TYPE_CHECKING:
-    from rlctl.check_env.context import Context
+    from rlctl.check_env.instance import Context
     from rlctl.check_env.messages import Message
     from rlctl.check_env.records import Records
 

@@ -1,12 +1,20 @@
-"""What a call into an environment raised, as plain data."""
+"""What a call into an environment raised, as plain data: when, where, and which file it could not find."""
 
 from __future__ import annotations
 
+import difflib
+import inspect
+import itertools
+import linecache
+import re
+import sys
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
+from typing import Any
 
 from rlctl.check_env.messages import Failure
-from rlctl.check_env.missing_files import missing_file
 from rlctl.check_env.progress import Progress
 from rlctl.errors import RlctlError
 
@@ -21,7 +29,7 @@ class EnvironmentRaised(Exception):
         self.call = call
 
 
-def failure(error: EnvironmentRaised, progress: Progress) -> Failure:
+def describe_failure(error: EnvironmentRaised, progress: Progress) -> Failure:
     """Describe what a call into the environment raised, and when."""
     where = progress.read()
     cause = error.__cause__ or error
@@ -47,3 +55,74 @@ def describe(error: BaseException) -> str:
     place = f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
     text = " ".join(str(error).split()) or "no message"
     return f"{type(error).__name__}: {text}{place}"
+
+
+NO_DISPLAY = re.compile(
+    r"cannot connect to x server|could ?n.t connect to display|could not connect to display|no \$DISPLAY|"
+    r"DISPLAY environment variable is missing|no available video device|cannot open display|"
+    r"could not load the qt platform plugin|NoSuchDisplayException|failed to open display",
+    re.IGNORECASE,
+)
+"""What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
+
+
+def lost_display(failure: Failure) -> bool:
+    """Say whether a process ended for want of a display."""
+    return failure.kind == "died" and NO_DISPLAY.search(failure.details or "") is not None
+
+
+_MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
+_MOST_FILES = 5_000
+"""Files that are looked through for a similar name."""
+
+
+def missing_file(error: BaseException | None) -> dict[str, Any] | None:
+    """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
+    for each in chain(error):
+        if isinstance(each, FileNotFoundError):
+            return _describe(str(each.filename or each), [])
+        if type(each).__module__ == "pybullet" and "load" in str(each).lower():
+            name, data = _find_model(each.__traceback__), sys.modules.get("pybullet_data")
+            return None if name is None else _describe(name, [Path(data.getDataPath())] if data else [])
+    return None
+
+
+def chain(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an exception and those behind it."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _describe(name: str, more: list[Path]) -> dict[str, Any]:
+    searched = [] if Path(name).is_absolute() else [Path.cwd(), *more]
+    return {"file": name, "searched": [str(folder) for folder in searched], "similar": _similar(Path(name), searched)}
+
+
+def _find_model(trace: TracebackType | None) -> str | None:
+    """Return the model that the failing call was given: a text in its source, or the value of a name there."""
+    calls = list(zip(traceback.walk_tb(trace), traceback.extract_tb(trace), strict=True))
+    calls = [pair for pair in calls if _HERE not in Path(pair[1].filename).parents]
+    if not calls:
+        return None
+    (frame, _), summary = calls[-1]
+    lines = linecache.getlines(summary.filename)[(summary.lineno or 1) - 1 : summary.end_lineno]
+    source = "".join(lines)
+    texts = re.findall(r"[\"']([^\"']+)[\"']", source)
+    for name in re.findall(r"[a-zA-Z_][\w.]*", source):
+        root, *attributes = name.split(".")
+        value = frame.f_locals.get(root, frame.f_globals.get(root))
+        for attribute in attributes:
+            value = inspect.getattr_static(value, attribute, None)  # runs no code of the environment
+        texts += [str(value)] if isinstance(value, (str, Path)) else []
+    return next((text for text in texts if _MODEL.fullmatch(text) and not Path(text).is_file()), None)
+
+
+def _similar(wanted: Path, searched: list[Path]) -> str | None:
+    """Return a file of nearly the same name in the folders that were searched, or in the one that was named."""
+    folders = searched or [next((parent for parent in wanted.parents if parent.is_dir()), Path("/nowhere"))]
+    for folder in folders:
+        paths = {path.name: path for path in itertools.islice(folder.rglob(f"*{wanted.suffix}"), _MOST_FILES)}
+        if close := difflib.get_close_matches(wanted.name, paths, n=1, cutoff=0.8):
+            return str(paths[close[0]])
+    return None

@@ -1,15 +1,14 @@
-"""Spaces taken apart into leaves: arrays with a shape, a type and bounds."""
+"""Spaces taken apart into leaves (arrays with a shape, a type and bounds), and what came back, as plain data."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from gymnasium import spaces
 
 Path = tuple[str | int, ...]
 
@@ -33,9 +32,18 @@ class Leaf:
         return self.low is not None
 
 
-def leaf_name(leaf: Leaf) -> str:
-    """Return how to write the leaf of an observation: `observation['camera'][0]`."""
-    return "observation" + "".join(f"[{key!r}]" for key in leaf.path)
+def leaf_name(leaf: Leaf, of: str = "observation") -> str:
+    """Return how to write the leaf of an observation or an action: `observation['camera'][0]`."""
+    return of + "".join(f"[{key!r}]" for key in leaf.path)
+
+
+def element_name(leaf: Leaf, index: int, of: str = "observation") -> str:
+    """Return how to write one number of a leaf, given by its flat index: `observation['camera'][3, 0, 2]`."""
+    where = leaf_name(leaf, of)
+    if not leaf.shape:
+        return where
+    position = np.unravel_index(index, leaf.shape)
+    return f"{where}[{', '.join(str(int(i)) for i in position)}]"
 
 
 def leaves_of(space: Any, path: Path = ()) -> list[Leaf]:
@@ -74,3 +82,60 @@ def pick(value: Any, path: Path) -> Any:
     for key in path:
         value = value[key]
     return value
+
+
+NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
+
+
+def flat_action(leaves: list[Leaf], action: Any) -> NDArray[np.float64]:
+    """Return an action's numbers in the order of the action space's leaves; those of unknown kinds are left out."""
+    parts = [np.ravel(pick(action, leaf.path)).astype(np.float64) for leaf in leaves if leaf.supported]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def flat_numbers(observation: Any) -> NDArray[Any]:
+    """Return a copy of all numbers of an observation; those that are in no array of numbers are left out."""
+    if isinstance(observation, dict):
+        observation = tuple(observation.values())
+    if isinstance(observation, (tuple, list)) and any(isinstance(each, (np.ndarray, dict)) for each in observation):
+        parts = [flat_numbers(value) for value in observation]
+        return np.concatenate(parts) if parts else np.zeros(0)
+    try:
+        array = np.array(observation)
+    except Exception:  # a ragged list, or an object of its own kind
+        array = np.zeros(0)
+    return array.ravel() if array.dtype.kind in "biuf" else np.zeros(0)
+
+
+def numbers_in(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
+    """Yield the numbers of an info by name; those in a dictionary of it as `reward_terms/distance`."""
+    for key, value in info.items():
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                if _is_number(inner):
+                    yield f"{key}/{name}", float(inner)
+        elif _is_number(value):
+            yield str(key), float(value)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is a number, or an array without axes, which some libraries make of a comparison."""
+    return isinstance(value, NUMBERS) or (
+        isinstance(value, np.ndarray) and value.shape == () and value.dtype.kind in "biuf"
+    )
+
+
+def type_name(value: Any) -> str:
+    """Return a type as a user would write it: `numpy.bool`, `list`."""
+    kind = type(value)
+    return kind.__qualname__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__qualname__}"
+
+
+def truth(flag: Any) -> bool:
+    """Return what a flag means, whatever its type; False for what has no truth."""
+    if isinstance(flag, bool):  # nearly always; asking numpy takes a tenth of a robot's step
+        return flag
+    try:
+        return bool(np.any(flag))
+    except Exception:  # its type is noted, and is a finding
+        return False

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.finding import Finding
-from rlctl.check_env.leaves import Leaf, leaf_name
+from rlctl.check_env.leaves import Leaf, element_name
 
 FIRST_SEED = 1000
 SECOND_SEED = 1001
@@ -42,11 +42,6 @@ class Built:
     nondeterministic: bool = False
     """Whether its Gymnasium registration says that equal seeds may give unequal episodes."""
     accepts_seed: bool = True
-    is_env: bool = True
-    """Whether it inherits from `gymnasium.Env`."""
-    is_old_gym: bool = False
-    """Whether it inherits from the old gym."""
-    metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     uses_pybullet: bool = False
     """Whether a PyBullet client was connected once it was built."""
     waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -57,17 +52,13 @@ class Built:
 
     def element(self, leaf: int, index: int) -> str:
         """Name one number of an observation by the place of its array and its flat index."""
-        where = leaf_name(self.leaves[leaf])
         if len(self.leaves) == 1 and sum(self.names.values()) == int(np.prod(self.leaves[0].shape)):
             offset = index
             for name, size in self.names.items():
                 if offset < size:
                     return f"{name}[{offset}]" if size > 1 else name
                 offset -= size
-        if not self.leaves[leaf].shape:
-            return where
-        position = np.unravel_index(index, self.leaves[leaf].shape)
-        return f"{where}[{', '.join(str(int(i)) for i in position)}]"
+        return element_name(self.leaves[leaf], index)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,16 +171,6 @@ class Complaint:
 
 
 @dataclasses.dataclass(frozen=True)
-class Checked:
-    """A library's checker was tried."""
-
-    checker: str
-    problem: str | None
-    """Why it could not run."""
-    complaints: list[Complaint]
-
-
-@dataclasses.dataclass(frozen=True)
 class Fact:
     """Something that a check of the parent, or a later experiment of the same process, needs to know."""
 
@@ -210,19 +191,13 @@ class Skipped:
 
 @dataclasses.dataclass(frozen=True)
 class Finished:
-    """An experiment has come to its end, by itself or by what the environment raised."""
+    """An experiment has come to its end: by itself, by what the environment raised, or by a bug."""
 
     experiment: str
     seconds: float
     is_complete: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class Crash:
-    """An experiment has a bug."""
-
-    experiment: str
-    traceback: str
+    crash: str = ""
+    """The traceback of a bug of the experiment."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -238,4 +213,4 @@ class End:
     """The process has done all it was asked for."""
 
 
-Message = Built | Trajectory | Failure | Checked | Finding | Fact | Skipped | Finished | Crash | Mistake | End
+Message = Built | Trajectory | Failure | Complaint | Finding | Fact | Skipped | Finished | Mistake | End

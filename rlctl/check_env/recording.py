@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.episode import Episode, Moment
-from rlctl.check_env.failures import EnvironmentRaised, failure
+from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.instance import Budget
-from rlctl.check_env.leaves import Leaf, pick
+from rlctl.check_env.leaves import Leaf, flat_action, numbers_in, pick, type_name
 from rlctl.check_env.messages import MOST_INFOS, Failure, Form, Series, Trajectory
-from rlctl.check_env.returned import flat_action, numbers_in, type_name
 
 
 class Recording:
@@ -56,7 +55,7 @@ class Recording:
             moment = call()
         except EnvironmentRaised as error:
             self._ended = "raised"
-            self.failure = failure(error, self.episode.instance.progress)
+            self.failure = describe_failure(error, self.episode.instance.progress)
             return
         self.budget.bytes_left -= self._add(moment)
         self._ended = self.episode.ended or ("memory" if self.budget.bytes_left <= 0 and moment.step else "")

@@ -9,9 +9,7 @@ from typing import Any
 from rlctl.check_env.finding import Finding, NotJudged
 from rlctl.check_env.messages import (
     Built,
-    Checked,
     Complaint,
-    Crash,
     Fact,
     Failure,
     Finished,
@@ -20,7 +18,7 @@ from rlctl.check_env.messages import (
     Trajectory,
 )
 
-OTHERS_MATTER = ("interleaved", "after close", "after the end")
+OTHERS_MATTER = ("interleaved", "interleaved second", "after close", "after the end")
 """Roles of episodes beside another instance, and of steps that no learner takes: rules of their own judge them."""
 
 
@@ -35,8 +33,6 @@ class Records:
     findings: list[Finding] = dataclasses.field(default_factory=list)
     """Those of the experiments."""
     complaints: list[Complaint] = dataclasses.field(default_factory=list)
-    checkers: dict[str, str | None] = dataclasses.field(default_factory=dict)
-    """Per library's checker that was tried: None, or why it could not run."""
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
     """Experiments, roles and rules that were left out, and why."""
@@ -73,11 +69,10 @@ class Records:
                 self.seconds[message.experiment] = message.seconds
                 if message.is_complete:
                     self.complete.add(message.experiment)
-            case Crash():
-                self.crashes[message.experiment] = message.traceback
-            case Checked():
-                self.checkers[message.checker] = message.problem
-                self.complaints += message.complaints
+                if message.crash:
+                    self.crashes[message.experiment] = message.crash
+            case Complaint():
+                self.complaints.append(message)
 
     def role(self, role: str) -> list[Trajectory]:
         """Return what was recorded for one purpose."""

@@ -10,25 +10,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.bullet_clients import connected
 from rlctl.check_env.bullet_worlds import (
-    Dynamics,
+    ANGULAR,
+    JOINTS,
+    VELOCITY,
+    Jump,
     Pair,
-    State,
     World,
     bullet,
+    connected,
+    find_jumps,
     read_contacts,
-    read_dynamics,
     read_gravity,
     read_states,
     read_world,
     thickness,
+    weight_matters,
 )
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.finding import NotApplicable
 from rlctl.check_env.instance import Instance
 from rlctl.check_env.messages import FIRST_SEED
-from rlctl.check_env.world_tests import Jump, Touch, find_jumps, touch_links, weight_matters
 
 MOST_WORLDS = 4
 DEEPEST_FINE = 0.02
@@ -51,8 +53,8 @@ class Log:
 
     world: World
     places: list[Place] = dataclasses.field(default_factory=list)
-    states: list[list[State]] = dataclasses.field(default_factory=list)
-    """Per look, per body."""
+    states: list[list[NDArray[np.float64]]] = dataclasses.field(default_factory=list)
+    """Per look, per body, as `read_states` returns them."""
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)
     """Depth and limit of what is too far inside each other [m]."""
     touching: list[set[int]] = dataclasses.field(default_factory=list)
@@ -79,9 +81,18 @@ class Log:
         """The kind of the episode's actions."""
         return str(self.places[0]["actions"]) if self.places else ""
 
-    def series(self, body: int, name: str) -> NDArray[np.float64]:
-        """Return one field of a body's `State` at every look."""
-        return np.array([getattr(states[body], name) for states in self.states])
+    def series(self, body: int) -> NDArray[np.float64]:
+        """Return a body's state at every look. Shape (looks, 9 + 2 * joints)."""
+        return np.array([states[body] for states in self.states])
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything ever had a speed."""
+        for i, body in enumerate(self.world.bodies) if self.states else ():
+            states = self.series(i)
+            if states[:, VELOCITY].any() or states[:, ANGULAR].any() or states[:, JOINTS + len(body.joints) :].any():
+                return True
+        return False
 
 
 def _limit(client: int, pair: Pair) -> float:
@@ -96,22 +107,10 @@ class LoggedWorld:
     world: World
     gravity: list[float]
     """The strongest [m/s^2]."""
-    built: list[Dynamics] | None
-    """Per body, before the first reset; None where the world was not the same then."""
-    dynamics: list[list[Dynamics]] = dataclasses.field(default_factory=list)
-    """Per reset, per body."""
     logs: list[Log] = dataclasses.field(default_factory=list)
     jumps: list[Jump] = dataclasses.field(default_factory=list)
     weight_matters: bool | None = None
     """Whether anything would move otherwise with gravity; tested only where there is none."""
-    touches: list[dict[int, Touch]] = dataclasses.field(default_factory=list)
-    """Per body and link index; empty for a body that was not tested."""
-
-    @property
-    def moves(self) -> bool:
-        """Whether anything ever had a speed."""
-        states = [state for log in self.logs for states in log.states for state in states]
-        return any(each.velocity.any() or each.angular.any() or each.joints[1].any() for each in states)
 
 
 class WorldLogger:
@@ -122,10 +121,38 @@ class WorldLogger:
             raise NotApplicable("no PyBullet world")
         self.instance = instance
         self.resets = 0
-        self.worlds: dict[int, LoggedWorld] = {}
-        """By their place in the list of worlds: an environment that connects anew may get another client."""
         self._older = older
-        self._built = {(i, world.key): _dynamics(world) for i, world in enumerate(self._read())}
+        self._worlds: dict[int, LoggedWorld] = {}
+        """By their index in the list of worlds: an environment that connects anew may get another client."""
+
+    @property
+    def worlds(self) -> list[LoggedWorld]:
+        """The worlds, without what never moves: a copy of the robot that kinematics are solved with."""
+        moving = [each for each in self._worlds.values() if any(log.moves for log in each.logs)]
+        return moving or list(self._worlds.values())
+
+    def play(self, number: int, kind: str, steps: int, deadline: float) -> None:
+        """Log an episode; where it raises, what was logged before stays."""
+        seed = FIRST_SEED + number
+        logs: list[Log] = []
+        for moment in Episode(self.instance, seed, kind, number=number, max_steps=steps, deadline=deadline):
+            place = {"seed": seed, "episode": number, "actions": kind, "step": moment.step}
+            logs = [log for log in (logs if moment.step else self._begin()) if log.look(place)]
+            if not logs:
+                return
+
+    def _begin(self) -> list[Log]:
+        self.resets += 1
+        logs = []
+        for i, world in enumerate(self._read()):
+            gravity = read_gravity(world.client)
+            logged = self._worlds.setdefault(i, LoggedWorld(world, gravity))
+            logged.gravity = max(logged.gravity, gravity, key=np.linalg.norm)
+            if world.key == logged.world.key:
+                logged.world = world
+            logs.append(Log(world))
+            logged.logs.append(logs[-1])
+        return logs
 
     def _read(self) -> list[World]:
         """Return the worlds of the clients that came with the instance, or of all where it shares older ones."""
@@ -135,51 +162,11 @@ class WorldLogger:
             own = [read_world(each) for each in ids]
         return [world for world in own if world.bodies][:MOST_WORLDS]
 
-    def play(self, number: int, kind: str, steps: int, deadline: float) -> None:
-        """Log an episode; where it raises, what was logged before stays."""
-        seed = FIRST_SEED + number
-        logs: list[Log] = []
-        for moment in Episode(self.instance, seed, kind, number=number, max_steps=steps, deadline=deadline):
-            place = {"seed": seed, "episode": number, "actions": kind, "step": moment.step}
-            logs = [log for log in logs if log.look(place)] if moment.step else self._begin(place)
-            if not logs:
-                return
-
-    def _begin(self, place: Place) -> list[Log]:
-        self.resets += 1
-        logs = []
-        for i, world in enumerate(self._read()):
-            gravity = read_gravity(world.client)
-            logged = self.worlds.setdefault(i, LoggedWorld(world, gravity, self._built.get((i, world.key))))
-            logged.gravity = max(logged.gravity, gravity, key=np.linalg.norm)
-            if world.key == logged.world.key:
-                logged.world = world
-                logged.dynamics.append(_dynamics(world))
-            logs.append(Log(world))
-            logged.logs.append(logs[-1])
-        return [log for log in logs if log.look(place)]
-
     def let_go(self, number: int, deadline: float) -> None:
-        """Reset, and let every world go on without the environment."""
+        """Reset, and let every world go on without the environment, which leaves them unusable."""
         self.play(number, "none", 0, deadline)
-        for logged in self.worlds.values():
+        for logged in self._worlds.values():
             with contextlib.suppress(bullet().error):
                 if not any(logged.gravity):
                     logged.weight_matters = weight_matters(logged.world)
                 logged.jumps += find_jumps(logged.world, FIRST_SEED + number)
-
-    def finish(self) -> list[LoggedWorld]:
-        """Return the worlds; boxes are put into them now, which leaves them unusable."""
-        # What never moves is not simulated: a copy of the robot that kinematics are solved with.
-        worlds = [each for each in self.worlds.values() if each.moves] or list(self.worlds.values())
-        for logged in worlds:
-            for body in logged.world.bodies:
-                try:
-                    logged.touches.append(touch_links(logged.world.client, body))
-                except bullet().error:  # the environment has closed its client
-                    logged.touches.append({})
-        return worlds
-
-
-def _dynamics(world: World) -> list[Dynamics]:
-    return [read_dynamics(world.client, body) for body in world.bodies]

@@ -41,8 +41,8 @@ def check_env(
     claim_stdout()
     from rlctl.check_env import formats
     from rlctl.check_env.check import check
+    from rlctl.check_env.finding import choose_rules
     from rlctl.check_env.formats import rules
-    from rlctl.check_env.selection import choose_rules
     from rlctl.env_spec import EnvSpec
 
     if list_rules or explain is not None:

@@ -8,33 +8,6 @@ from broken_envs import Clean
 from gymnasium import spaces
 
 
-class StepsAtOnce(Clean):
-    """Can be stepped without a reset."""
-
-    def __init__(self):
-        super().__init__()
-        self.steps = 0
-        self.position = np.zeros(2, np.float32)
-
-
-class ExitsAtOnce(Clean):
-    steps = -1
-
-    def step(self, action):
-        if self.steps < 0:
-            os._exit(5)
-        return super().step(action)
-
-
-class ClosesOnce(Clean):
-    is_open = True
-
-    def close(self):
-        if not self.is_open:
-            raise RuntimeError("Not connected to physics server.")
-        self.is_open = False
-
-
 class ListMetadata(Clean):
     metadata = ["human"]
 

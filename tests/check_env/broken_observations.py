@@ -57,16 +57,6 @@ class SomeFlags(Clean):
         return {"position": self.position.copy(), "flags": np.array([self.position[0] > 0, 0], np.int8)}
 
 
-class SameTwice(Wide):
-    def third(self, x, y):
-        return y
-
-
-class Degrees(Wide):
-    def third(self, x, y):
-        return 1.0 - np.degrees(y)
-
-
 class Millimetres(Wide):
     def __init__(self):
         super().__init__()

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from pybullet_utils.bullet_client import BulletClient
 
 CART = str(Path(__file__).parent / "cart.urdf")
-SHOULDER, TIP = 0, 1
+SHOULDER = 0
 STEPS = 30
 STANDING = 0.051  # [m], height of the base when the cart stands
 
@@ -105,21 +105,6 @@ class Flat(FixedCart):
         p.setGravity(0, 0, 0, physicsClientId=self.client)
 
 
-class NoCollisions(Cart):
-    def vary(self):
-        for link in range(-1, 2):
-            p.setCollisionFilterGroupMask(self.cart, link, 0, 0, physicsClientId=self.client)
-
-
-class OnlySomeGroups(Cart):
-    """Collides with one group only, the floor's; nothing is wrong with it."""
-
-    def vary(self):
-        p.setCollisionFilterGroupMask(self.floor, -1, 4, 4, physicsClientId=self.client)
-        for link in range(-1, 2):
-            p.setCollisionFilterGroupMask(self.cart, link, 4, 4, physicsClientId=self.client)
-
-
 class InTheFloor(Cart):
     """A block is set back into the floor at every step."""
 
@@ -155,49 +140,6 @@ class Explodes(Cart):
         super().move(action)
 
 
-class FrictionOfNothing(Cart):
-    def vary(self):
-        p.changeDynamics(self.cart, TIP, lateralFriction=self.np_random.uniform(0.5, 1.5), physicsClientId=self.client)
-
-
-class FrictionOfAll(Cart):
-    """Also of the tip, which touches nothing; nothing is wrong with it."""
-
-    def vary(self):
-        for link in range(-1, 2):
-            friction = self.np_random.uniform(0.5, 1.5)
-            p.changeDynamics(self.cart, link, lateralFriction=friction, physicsClientId=self.client)
-
-
-class MassWithoutBase(Cart):
-    first = 0
-
-    def vary(self):
-        factor = self.np_random.uniform(0.8, 1.2)
-        for link in range(self.first, 2):
-            mass = p.getDynamicsInfo(self.cart, link, physicsClientId=self.client)[0]
-            p.changeDynamics(self.cart, link, mass=factor * mass, physicsClientId=self.client)
-
-
-class MassOfAll(MassWithoutBase):
-    first = -1
-
-
-class FixedBaseGetsMass(FixedCart):
-    """A base that is given a mass is fixed no longer. It is loaded before the first reset, too."""
-
-    def __init__(self):
-        super().__init__()
-        self.loaded = False
-        self.np_random = np.random.default_rng(0)
-        self.start()
-        self.loaded = True
-
-    def vary(self):
-        if self.loaded:
-            p.changeDynamics(self.cart, -1, mass=2.0, physicsClientId=self.client)
-
-
 class StartsInTheFloor(Cart):
     height = -0.02
 
@@ -216,17 +158,6 @@ class OverridesForgetful(ForgetsClient):
     """What forgets the client is overridden, and not called; nothing is wrong with it."""
 
     read = Cart.read
-
-
-class MayForgetClient(Cart):
-    """Forgets the client in a branch that is not taken, and in a method that nothing calls."""
-
-    def vary(self):
-        if self.fixed:
-            p.getNumBodies()
-
-    def count(self):
-        return p.getNumBodies()
 
 
 class ThroughBulletClient(Clean):

@@ -123,19 +123,15 @@ class StartsProcess(Clean):
         helper.join()
 
 
-def in_worker():
-    return multiprocessing.current_process().daemon
-
-
 class ExitsInWorker(Clean):
     def start(self):
         super().start()
-        if in_worker():
+        if multiprocessing.current_process().daemon:
             os._exit(3)
 
 
 class SlowInWorker(Clean):
     def __init__(self):
         super().__init__()
-        if in_worker():
+        if multiprocessing.current_process().daemon:
             time.sleep(100)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pybullet
 
 from rlctl.check_env import child, families
-from rlctl.check_env.bullet_clients import connected
+from rlctl.check_env.bullet_worlds import connected
 from rlctl.check_env.finding import RULES
 from rlctl.check_env.judge import judge
 from rlctl.check_env.records import Records

@@ -13,11 +13,10 @@ import sarif_pydantic
 
 from rlctl.check_env import families
 from rlctl.check_env.check import Report
-from rlctl.check_env.finding import FAMILIES, RULES
+from rlctl.check_env.finding import FAMILIES, RULES, choose_rules, find_rule
 from rlctl.check_env.formats import FORMATS, choose, github, plain, rules, sarif, structured
 from rlctl.check_env.judge import Verdict, judge
 from rlctl.check_env.records import Records
-from rlctl.check_env.selection import choose_rules, find_rule
 from rlctl.errors import UsageError
 from tests import fork_server
 from tests.check_env.judging import records_of

@@ -1,4 +1,4 @@
-"""Misuse, attributes, pictures, windows, and ends of episodes."""
+"""Attributes, pictures, windows, and ends of episodes."""
 
 from pathlib import Path
 
@@ -10,8 +10,6 @@ from tests.check_env.judging import case, check_case, findings, verdict_of
 
 FILE = "broken_interface.py"
 CASES = [
-    case(f"{FILE}:StepsAtOnce", ("RL212", "info")),
-    case(f"{FILE}:ClosesOnce", ("RL213", "info")),
     case(f"{FILE}:ListMetadata", ("RL214", "info")),
     case(f"{FILE}:OldGenerator", ("RL214", "info")),
     case(f"{FILE}:NewSpaces", ("RL214", "warning")),
@@ -36,12 +34,6 @@ def test_finds_the_mistake_and_only_that(case):
 
 def messages(name, rule):
     return [each.message for each in findings(f"{FILE}:{name}", rule)]
-
-
-def test_second_close_is_told():
-    (message,) = messages("ClosesOnce", "RL213")
-    told = "a second close raises RuntimeError: Not connected to physics server. (broken_interface.py:"
-    assert message.startswith(told)
 
 
 def test_attributes_are_told():
@@ -83,9 +75,9 @@ def test_what_comes_after_the_end_is_placed():
     assert finding.evidence["value"] == -1e6
     assert 0 < finding.evidence["expected"] < 10
     (finding,) = findings(f"{FILE}:FarAfterEnd", "RL505")
-    assert finding.evidence["step"] == 51
-    assert finding.evidence["expected"] == "[-5, 5]"
-    assert finding.message.endswith(" at step 51, after the end at step 50; it should be [-5, 5]")
+    assert finding.evidence["step"] > 50
+    assert finding.evidence["expected"] == [-5.0, 5.0]
+    assert finding.message.startswith("after the end at step 50: observation[")
 
 
 def test_no_limit_is_told_with_what_is_known():
@@ -98,7 +90,6 @@ def test_no_limit_is_told_with_what_is_known():
     [
         ("Gui", "RL216", "error", "in the constructor, for want of a display: 'cannot connect to X server'"),
         ("GuiInReset", "RL216", "error", "in reset, for want of a display: 'cannot connect to X server'"),
-        ("ExitsAtOnce", "RL212", "error", "step before reset ends the process: it ended with exit code 5"),
         (
             "DiesAfterEnd",
             "RL505",
@@ -109,7 +100,7 @@ def test_no_limit_is_told_with_what_is_known():
 )
 def test_what_ends_the_process_is_said_once(name, rule, severity, text, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    wanted = ["RL004", "RL208", "RL212", "RL213", "RL216", "RL403", "RL505"]
+    wanted = ["RL004", "RL208", "RL216", "RL403", "RL505"]
     task = str(Path(__file__).parent / FILE) + f":{name}"
     report = check(EnvSpec(task), env_timeout_s=10, rules=wanted)
     (finding,) = report.verdict.findings
@@ -118,7 +109,7 @@ def test_what_ends_the_process_is_said_once(name, rule, severity, text, monkeypa
 
 
 def test_what_ends_the_process_leaves_nothing_else_unjudged():
-    """Another process does what comes after the step before reset, which exits."""
-    task = str(Path(__file__).parent / FILE) + ":ExitsAtOnce"
-    verdict = check(EnvSpec(task), env_timeout_s=10, rules=["RL212", "RL213", "RL404"]).verdict
-    assert sorted(verdict.judged) == ["RL212", "RL213", "RL404"]
+    """Another process does what comes after the action of NaN, which ends it."""
+    task = str(Path(__file__).parent / "broken_actions.py") + ":DiesOfNan"
+    verdict = check(EnvSpec(task), env_timeout_s=10, rules=["RL404", "RL704", "RL215"]).verdict
+    assert verdict.not_judged == {}

@@ -4,7 +4,7 @@ import pytest
 
 from rlctl.check_env import supervisor
 from rlctl.check_env.check import check
-from rlctl.check_env.families import resources
+from rlctl.check_env.families import isolation
 from rlctl.check_env.finding import NotJudged
 from rlctl.env_spec import EnvSpec
 from tests.check_env.judging import FOLDER, case, check_case, findings
@@ -49,7 +49,7 @@ def test_memory_is_counted():
 
 
 def found_in(**counts):
-    return [finding.message for finding in resources.find_growth(resources.Counts(**counts))]
+    return [finding.message for finding in isolation.find_growth(isolation.Counts(**counts))]
 
 
 def test_what_changes_or_fills_once_is_no_leak():
@@ -74,7 +74,7 @@ def test_too_few_resets_are_not_judged():
         found_in(clients=[1, 2, 3, 4])
 
 
-def test_the_worker_says_what_it_raised():
+def test_a_worker_says_what_it_raised():
     finding = the_finding("StartsProcess", "RL406")
     assert finding.message.startswith("in a daemonic worker build raises TaskError: task ")
     assert "AssertionError: daemonic processes are not allowed to have children" in finding.message

@@ -11,11 +11,11 @@ import time
 import pytest
 
 from rlctl.check_env.families.speed import Speed, format_speed, typical
+from rlctl.check_env.finding import choose_rules
 from rlctl.check_env.judge import judge
 from rlctl.check_env.own_code import kind_of
 from rlctl.check_env.records import Records
 from rlctl.check_env.sampling import Sampler, Samples, Stopwatch, TimedCall
-from rlctl.check_env.selection import choose_rules
 from tests.check_env.judging import case, check_case, records_of
 
 CASES = [

@@ -12,7 +12,7 @@ It decides the rules that it names: they are judged when it comes to its end. `r
 `NotApplicable(why)` says so of all its rules without a finding, `yield Skipped("RL404", why)` of one of them. It calls
 the environment through `Instance.call`, `Instance.reset` and `Episode` only, so that what the environment raises is an
 `EnvironmentRaised`, which need not be caught, and a hang or a crash can be placed. `context.budget` is the time there
-is. One that does what no learner would (`provokes="a second close"`) may crash the environment; that is then an error
+is. One that does what no learner would (`provokes="an action of NaN"`) may crash the environment; that is then an error
 of its first rule, found by nobody else.
 
 **A check** judges one rule in the parent process, from recorded episodes, which many rules share:
@@ -44,22 +44,16 @@ from rlctl.check_env.families import (
     determinism,
     episodes,
     features,
-    hidden_goal,
-    hindsight,
     incentives,
     interface,
     isolation,
     library_checkers,
     loading,
-    models,
     observations,
     physics,
-    resources,
     rewards,
     search,
-    spaces,
     speed,
-    success,
     variants,
 )
 from rlctl.check_env.finding import RULES
@@ -84,10 +78,10 @@ PROCESSES = {
             determinism.compare_generators,
             speed.measure_speed,
             episodes.record_episodes,
-            success.record_starts,
+            incentives.record_starts,
             search.search,
-            hindsight.recompute_rewards,
-            resources.count_after_resets,
+            rewards.recompute_rewards,
+            isolation.count_after_resets,
             episodes.step_after_end,
         )
     ),
@@ -95,20 +89,17 @@ PROCESSES = {
         (
             isolation.compare_instances,
             physics.watch_worlds,
-            models.judge_models,
             actions.compare_actions,
             attributes.read_attributes,
             variants.play_variants,
             actions.exceed_bounds,
-            interface.step_before_reset,
-            interface.close_twice,
-            attributes.render,
             actions.give_nan,
+            attributes.render,
         ),
         hash_seed=1,  # another one, so that hash order shows
     ),
     "checkers": Process(
-        (library_checkers.run_gymnasium_checker, library_checkers.run_sb3_checker, resources.build_in_worker)
+        (library_checkers.run_gymnasium_checker, library_checkers.run_sb3_checker, isolation.build_in_worker)
     ),
 }
 """The child processes; the last one waits until there is a place for it."""
@@ -116,9 +107,8 @@ PROCESSES = {
 CHECKERS = ("gymnasium checker", "sb3 checker")
 
 MODULES = (
-    *(loading, observations, spaces, features, hidden_goal, interface, attributes, determinism, isolation),
-    *(resources, episodes, rewards, incentives, success, hindsight, actions),
-    *(physics, models, speed, variants),
+    *(loading, observations, features, interface, attributes, determinism, isolation, episodes),
+    *(rewards, incentives, actions, physics, speed, variants),
 )
 
 CHECKS = {each.rule: each for module in MODULES for each in vars(module).values() if isinstance(each, Check)}

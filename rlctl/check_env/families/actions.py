@@ -9,25 +9,26 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.check_env.action_trials import (
     REPEATED_STEPS,
+    REWARD,
     Dimension,
     Frame,
     OutOfTime,
     Trials,
     dimensions,
+    find_differences,
     is_float_box,
     observations_differ,
     steps_of_other_rewards,
     to_frame,
 )
-from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
+from rlctl.check_env.instance import Context
 from rlctl.check_env.leaves import Leaf
 from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message
 
@@ -111,7 +112,7 @@ def _lasts(trials: Trials, dimension: Dimension) -> bool:
     return False
 
 
-def _saturates(trials: Trials, dimension: Dimension, copies: NDArray[np.intp]) -> str:
+def _saturates(trials: Trials, dimension: Dimension, copies: Sequence[int]) -> str:
     """Say whether small and large values do the same, in both directions."""
     low, high = dimension.bounds
     middle, half = (low + high) / 2, (high - low) / 2
@@ -200,28 +201,15 @@ def _twice(part: Any, leaf: Leaf) -> Any:
 
 
 def _first_difference(inside: list[Frame], outside: list[Frame]) -> Iterator[Finding]:
-    for step, (a, b) in enumerate(zip(inside, outside, strict=False)):
-        if a.ended != b.ended:
-            what, expected, value = "whether the episode ends", float(any(a.ended)), float(any(b.ended))
-        elif observations_differ([a], [b]):
-            what, (expected, value) = "an observation", _largest_difference(a.observation, b.observation)
-        elif a.reward != b.reward and np.isfinite((a.reward, b.reward)).all():
-            what, expected, value = "the reward", a.reward, b.reward
-        else:
-            continue
+    for step, columns in list(find_differences(inside, outside).items())[:1]:
+        size = np.abs(np.nan_to_num(inside[step][columns]) - np.nan_to_num(outside[step][columns]))
+        column = int(columns[size.argmax()])
+        what = {REWARD: "the reward", -2: "terminated", -1: "truncated"}.get(column, "an observation")
+        expected, value = float(inside[step][column]), float(outside[step][column])
         message = (
             f"with twice the largest actions {what} is {value:.6g} at step {step}; with the largest {expected:.6g}"
         )
         yield Finding("RL703", message, {"seed": FIRST_SEED, "step": step, "value": value, "expected": expected})
-        return
-
-
-def _largest_difference(one: NDArray[Any], two: NDArray[Any]) -> tuple[float, float]:
-    if one.shape != two.shape:
-        return float(one.size), float(two.size)
-    a, b = np.nan_to_num(one.astype(np.float64)), np.nan_to_num(two.astype(np.float64))
-    i = int(np.abs(a - b).argmax())
-    return float(a[i]), float(b[i])
 
 
 @experiment("nan action", "RL704", share=0.3, provokes="an action of NaN")
@@ -242,7 +230,7 @@ def give_nan(context: Context) -> Iterator[Message]:
             frames, is_refused = _play_until_refused(Episode(instance, FIRST_SEED, given=[nan, *good], max_steps=6))
     if is_refused:
         return
-    is_finite = all(np.isfinite(each.reward) and np.isfinite(each.observation).all() for each in frames[1:])
+    is_finite = all(np.isfinite(each).all() for each in frames[1:])
     value = "only finite numbers come back" if is_finite else "NaN comes back"
     evidence = {"seed": FIRST_SEED, "step": 1, "value": value, "expected": "an exception"}
     yield Finding("RL704", f"an action of NaN is accepted, and {value}", evidence)

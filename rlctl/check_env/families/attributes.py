@@ -12,16 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.check_env.bullet_clients import connected
-from rlctl.check_env.context import Context, RenderMode
+from rlctl.check_env.bullet_worlds import connected
 from rlctl.check_env.experiment import RECORDING, check, experiment
-from rlctl.check_env.failures import EnvironmentRaised, describe
+from rlctl.check_env.failures import NO_DISPLAY, EnvironmentRaised, chain, describe, lost_display, missing_file
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
-from rlctl.check_env.instance import Instance
-from rlctl.check_env.leaves import pick
+from rlctl.check_env.instance import Context, RenderMode
+from rlctl.check_env.leaves import type_name
 from rlctl.check_env.messages import FIRST_SEED, Fact, Message, Skipped
-from rlctl.check_env.missing_files import missing_file
-from rlctl.check_env.no_display import NO_DISPLAY, lost_display
 from rlctl.check_env.records import Records
 
 SPACES = ("action_space", "observation_space")
@@ -50,7 +47,7 @@ def read_attributes(context: Context) -> Iterator[Message]:
             return
         yield from _attribute_problems(instance.env)
         with context.fresh() as other:
-            yield from _shared_spaces(instance, other)
+            yield from _shared_spaces(instance.env, other.env)
 
 
 def _inner(env: Any) -> Any:
@@ -69,47 +66,40 @@ def _count_windows() -> int:
 
 
 def _attribute_problems(env: Any) -> Iterator[Finding]:
-    for problem in _problems(env):
-        yield Finding("RL214", problem, {"value": problem})
-    for name in SPACES:
-        if getattr(env, name, None) is not getattr(env, name, None):
-            problem = f"{name} is a new object each time it is read, so that seeding it has no effect"
-            yield Finding("RL214", problem, {"value": problem}, Severity.WARNING)
-
-
-def _problems(env: Any) -> Iterator[str]:
     for name in ("unwrapped", "metadata", "render_mode", *SPACES):
         try:
-            getattr(env, name)
+            is_new = getattr(env, name) is not getattr(env, name)
         except Exception as error:
-            yield f"{name} raises {describe(error)}"
-    inner = _inner(env)
-    if inner is None:
-        yield "unwrapped is None"
-        return
-    metadata = getattr(inner, "metadata", {})
+            yield _problem(f"{name} raises {describe(error)}")
+        else:
+            if is_new and name in SPACES:
+                problem = f"{name} is a new object each time it is read, so that seeding it has no effect"
+                yield _problem(problem, Severity.WARNING)
+    metadata = getattr(_inner(env), "metadata", {})
     if not isinstance(metadata, dict):
-        yield f"metadata is a {type(metadata).__name__}, not a dict"
+        yield _problem(f"metadata is a {type(metadata).__name__}, not a dict")
     try:
-        generator = getattr(inner, "np_random", None)
+        generator = getattr(_inner(env), "np_random", None)
     except Exception as error:
-        yield f"np_random raises {describe(error)}"
+        yield _problem(f"np_random raises {describe(error)}")
         return
     # Gymnasium's own older environments hand out a subclass of the Generator.
     if generator is not None and not isinstance(generator, np.random.Generator):
-        kind = type(generator)
-        yield f"np_random is a {kind.__module__}.{kind.__name__}, not a numpy.random.Generator"
+        yield _problem(f"np_random is a {type_name(generator)}, not a numpy.random.Generator")
 
 
-def _shared_spaces(one: Instance, other: Instance) -> Iterator[Finding]:
+def _problem(text: str, severity: Severity | None = None) -> Finding:
+    return Finding("RL214", text, {"value": text}, severity)
+
+
+def _shared_spaces(one: Any, other: Any) -> Iterator[Finding]:
     objects, generators = [], []
     for name in SPACES:
-        a, b = getattr(one.env, name, None), getattr(other.env, name, None)
-        if a is None or b is None:
-            continue
-        if a is b:
+        a, b = getattr(one, name, None), getattr(other, name, None)
+        pairs = zip(_parts(a), _parts(b), strict=False)
+        if a is not None and a is b:
             objects.append(name)
-        elif any(_generator(part) is _generator(twin) is not None for part, twin in _parts(one, name, a, b)):
+        elif any(_generator(x) is _generator(y) is not None for x, y in pairs):
             generators.append(name)
     if objects:
         yield _shared(objects, f"two instances have one object as {' and '.join(objects)}")
@@ -118,24 +108,22 @@ def _shared_spaces(one: Instance, other: Instance) -> Iterator[Finding]:
         yield _shared(generators, f"two instances share {named}")
 
 
+def _generator(space: Any) -> Any:
+    return getattr(space, "np_random", None)
+
+
+def _parts(space: Any) -> Iterator[Any]:
+    """Yield a space and the spaces inside it."""
+    yield space
+    inner = getattr(space, "spaces", ())
+    for each in inner.values() if isinstance(inner, dict) else inner:
+        yield from _parts(each)
+
+
 def _shared(names: list[str], message: str) -> Finding:
     # Nobody samples observations.
     severity = Severity.WARNING if "action_space" in names else Severity.INFO
     return Finding("RL404", message, {"value": names, "expected": []}, severity)
-
-
-def _parts(one: Instance, name: str, a: Any, b: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield the two spaces, and the spaces inside them, in pairs."""
-    yield a, b
-    for leaf in one.action_leaves if name == "action_space" else one.leaves:
-        try:
-            yield pick(a, leaf.path), pick(b, leaf.path)
-        except (LookupError, TypeError):
-            continue
-
-
-def _generator(space: Any) -> Any:
-    return getattr(space, "np_random", None)
 
 
 def read_truncation(env: Any) -> str:
@@ -192,7 +180,7 @@ def _render_in(context: Context, mode: RenderMode) -> Iterator[Finding]:
         cause = error.__cause__ or error
         if missing_file(cause) is not None:
             raise NotJudged("a file that the environment loads is missing (RL007)") from None
-        if _is_missing(cause):
+        if _lacks_library(cause):
             raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
         call = "the constructor" if error.call == "build" else error.call
         yield _of_mode(mode, f"{call} raises {describe(cause)}", describe(cause))
@@ -212,13 +200,9 @@ def _of_mode(mode: RenderMode, what: str, value: str, severity: Severity | None 
     return Finding("RL215", message, evidence, severity)
 
 
-def _is_missing(error: BaseException | None) -> bool:
+def _lacks_library(error: BaseException) -> bool:
     """Say whether a library is missing: that is this machine's fault, not the environment's."""
-    while error is not None:
-        if isinstance(error, ImportError) or type(error).__name__ == "DependencyNotInstalled":
-            return True
-        error = error.__cause__
-    return False
+    return any(isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in chain(error))
 
 
 def _describe_wrong_picture(mode: RenderMode, picture: Any) -> str:
@@ -233,7 +217,7 @@ def _describe_wrong_picture(mode: RenderMode, picture: Any) -> str:
 
 
 @check("RL216", *RECORDING)
-def find_lost_display(records: Records) -> Iterator[Finding]:
+def _find_lost_display(records: Records) -> Iterator[Finding]:
     for failure in records.failures:
         if lost_display(failure):
             line = next(line for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)).strip()

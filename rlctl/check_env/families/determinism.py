@@ -6,19 +6,20 @@ simplest cause to the farthest; where a nearer one explains a difference, the fa
 
 from __future__ import annotations
 
+import dataclasses
 import random
 import sys
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rlctl.check_env.comparison import Difference, find_difference
-from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.finding import Finding, NotJudged, Severity
-from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message, Skipped, Trajectory
+from rlctl.check_env.instance import Context
+from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Built, Message, Skipped, Trajectory
 from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 
@@ -85,56 +86,71 @@ def require_independent(records: Records) -> None:
         raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
 
 
-def _report(
+def report(
     rule: str, records: Records, trajectory: Trajectory, difference: Difference, what: str, *, is_mild: bool = False
 ) -> Finding:
+    """Return the finding that two recordings differ; an info where the environment's registration says they may."""
     severity = Severity.WARNING if difference.is_small or is_mild else None
     if records.require_built().nondeterministic:
-        severity = Severity.INFO  # its registration says so
+        severity = Severity.INFO
     return Finding(rule, f"{what}: {difference.text()}", difference.evidence(trajectory), severity)
 
 
 @check("RL301", "comparisons")
 def compare_starts(records: Records) -> Iterator[Finding]:
+    """Compare the resets of an episode and its repetition."""
     trajectory, difference = compare(records, "alone", "reused")
     if difference is not None and difference.step == 0:
-        yield _report("RL301", records, trajectory, difference, "reset twice with one seed")
+        yield report("RL301", records, trajectory, difference, "reset twice with one seed")
 
 
 @check("RL302", "comparisons")
 def compare_trajectories(records: Records) -> Iterator[Finding]:
+    """Compare the steps of an episode and its repetition."""
     trajectory, difference = compare(records, "alone", "reused")
     if difference is not None and difference.step > 0:
-        yield _report("RL302", records, trajectory, difference, "played twice by one instance")
+        yield report("RL302", records, trajectory, difference, "played twice by one instance")
 
 
 @check("RL303", "comparisons")
 def compare_after_other_episode(records: Records) -> Iterator[Finding]:
+    """Compare an episode with its repetition after an unfinished other one."""
     require_repeatable(records)
     trajectory, difference = compare(records, "alone", "dirty")
     if difference is not None:
         what = "played again after an unfinished other episode"
-        yield _report("RL303", records, trajectory, difference, what, is_mild=difference.step > LATE)
+        yield report("RL303", records, trajectory, difference, what, is_mild=difference.step > LATE)
 
 
 @check("RL304", "comparisons", "instances")
 def compare_instances(records: Records) -> Iterator[Finding]:
+    """Compare the first and a second instance of one process."""
     trajectory, difference = compare(records, "fresh process", "fresh instance")
     if difference is not None:
         require_repeatable(records)
-        yield _report("RL304", records, trajectory, difference, "played by a second instance in one process")
+        yield report("RL304", records, trajectory, difference, "played by a second instance in one process")
 
 
 @check("RL305", "comparisons", "instances")
 def compare_processes(records: Records) -> Iterator[Finding]:
+    """Compare two processes."""
     trajectory, difference = compare(records, "alone", "fresh process")
     if difference is not None:
         require_repeatable(records)
-        yield _report("RL305", records, trajectory, difference, "played by a new process")
+        yield report("RL305", records, trajectory, difference, "played by a new process")
+
+
+@check("RL308", "comparisons")
+def compare_unseeded(records: Records) -> Iterator[Finding]:
+    """Compare episodes whose reset had no seed, after a reset with one."""
+    trajectory, difference = compare(records, "unseeded", "unseeded again")
+    if difference is not None:
+        require_independent(records)
+        yield report("RL308", records, trajectory, difference, "reset with a seed and then without one, twice")
 
 
 @check("RL306", "comparisons", "episodes")
-def compare_seeds(records: Records) -> Iterator[Finding]:
+def _compare_seeds(records: Records) -> Iterator[Finding]:
     built = records.require_built()
     trajectory, difference = compare(records, "alone", "seeds")
     if difference is not None:
@@ -149,15 +165,6 @@ def compare_seeds(records: Records) -> Iterator[Finding]:
             return
     message = f"{seeds} seeds give one start, and with the same actions one trajectory of {trajectory.steps} steps"
     yield Finding("RL306", message, {"seeds": seeds, "value": 1, "expected": seeds})
-
-
-@check("RL308", "comparisons")
-def compare_unseeded(records: Records) -> Iterator[Finding]:
-    trajectory, difference = compare(records, "unseeded", "unseeded again")
-    if difference is not None:
-        require_independent(records)
-        what = "reset with a seed and then without one, twice"
-        yield _report("RL308", records, trajectory, difference, what)
 
 
 @experiment("global random", "RL309", share=0.5)
@@ -183,3 +190,93 @@ def _generator_states() -> dict[str, Any]:
     if "torch" in sys.modules:
         states["torch"] = sys.modules["torch"].random.get_rng_state().numpy().tobytes()
     return states
+
+
+NEARLY = 1e-5
+"""Up to this a first difference is a numerical residue, such as a simulation's that was not reset in full; chaos may
+make it large later. Relative to the larger value or to 1; it is also what Gymnasium's checker tolerates."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """Where two trajectories begin to differ."""
+
+    step: int
+    """0 is the observation of reset."""
+    element: str
+    """What differs most at that step: an element of the observation, the reward, a flag, or the length."""
+    first: float
+    second: float
+    size: float
+    """The largest difference at that step, relative to the larger value or to 1."""
+    largest: float
+    """The same over all steps that were compared."""
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the two differ by a numerical residue only."""
+        return self.size <= NEARLY
+
+    def text(self) -> str:
+        """Return it as a message."""
+        size = f" (a residue of {self.size:.0e}, later up to {self.largest:.0e})" if self.is_small else ""
+        at = "at reset" if self.step == 0 else f"at step {self.step}"
+        return f"first difference {at}: {self.element} is {self.first:.9g}, then {self.second:.9g}{size}"
+
+    def evidence(self, trajectory: Trajectory) -> dict[str, Any]:
+        """Return it with the trajectory's seed, as a finding's evidence."""
+        return {
+            "seed": trajectory.seed,
+            "step": self.step,
+            "element": self.element,
+            "value": _plain(self.second),
+            "expected": _plain(self.first),
+            "relative_difference": _plain(self.size),
+            "largest_relative_difference": _plain(self.largest),
+        }
+
+
+def _plain(value: float) -> float | str:
+    return value if np.isfinite(value) else str(value)
+
+
+def find_difference(built: Built, one: Trajectory, two: Trajectory) -> Difference | None:
+    """Compare two trajectories bit for bit as far as both go; NaN equals NaN."""
+    found = []
+    for index, _ in enumerate(built.leaves):
+        a, b = one.observations.get(index), two.observations.get(index)
+        if a is None or b is None:
+            continue
+        rows = min(len(a.values), len(b.values))
+        found.append(_compare(a.values[:rows], b.values[:rows], a.steps[:rows], built, index))
+    steps = min(one.steps, two.steps)
+    after = np.arange(1, steps + 1)
+    for name in ("rewards", "terminated", "truncated"):
+        a_, b_ = getattr(one, name)[:steps], getattr(two, name)[:steps]
+        found.append(_compare(a_, b_, after, None, 0, "reward" if name == "rewards" else name))
+    if one.has_ended and two.has_ended and one.steps != two.steps:
+        found.append(Difference(steps, "length", one.steps, two.steps, 1.0, 1.0))
+    differences = [each for each in found if each is not None]
+    if not differences:
+        return None
+    earliest = min(differences, key=lambda each: (each.step, -each.size))
+    return dataclasses.replace(earliest, largest=max(each.largest for each in differences))
+
+
+def _compare(
+    a: NDArray[Any], b: NDArray[Any], steps: NDArray[np.int64], built: Built | None, leaf: int, name: str = ""
+) -> Difference | None:
+    if not a.size:
+        return None
+    a, b = a.reshape(len(a), -1).astype(np.float64), b.reshape(len(b), -1).astype(np.float64)
+    unequal = (a != b) & ~(np.isnan(a) & np.isnan(b))
+    if not unequal.any():
+        return None
+    row = int(unequal.any(axis=1).argmax())
+    with np.errstate(invalid="ignore", over="ignore"):
+        relative = np.where(unequal, np.abs(a - b), 0.0) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 1.0)
+    relative = np.nan_to_num(relative, nan=np.inf, posinf=np.inf)
+    flat = int(np.where(unequal[row], relative[row], -1.0).argmax())
+    size, largest = float(relative[row, flat]), float(relative.max())
+    element = built.element(leaf, flat) if built else name
+    return Difference(int(steps[row]), element, float(a[row, flat]), float(b[row, flat]), size, largest)

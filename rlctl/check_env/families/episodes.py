@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import RECORDING, check, experiment
+from rlctl.check_env.families import observations, rewards
 from rlctl.check_env.finding import Finding, NotJudged, Severity
-from rlctl.check_env.leaves import Leaf, leaf_name
+from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import ENDS, FIRST_SEED, Fact, Message, Trajectory
 from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
@@ -79,7 +79,7 @@ def _require_two_flags(episodes: Sequence[Trajectory]) -> None:
 
 
 @check("RL501", "episodes", "search")
-def find_time_limit_as_terminated(records: Records) -> Iterator[Finding]:
+def _find_time_limit_as_terminated(records: Records) -> Iterator[Finding]:
     episodes = _require_episodes(records)
     _require_two_flags(episodes)
     if any(each.ended in ("truncated", "both") for each in episodes):
@@ -112,7 +112,7 @@ def _ends_with_odd_reward(episode: Trajectory) -> bool:
 
 
 @check("RL502", "episodes")
-def find_both_flags(records: Records) -> Iterator[Finding]:
+def _find_both_flags(records: Records) -> Iterator[Finding]:
     episodes = _require_episodes(records)
     both = [each for each in episodes if each.ended == "both"]
     if len(both) >= 2 and not any(each.ended == "truncated" for each in episodes):
@@ -122,7 +122,7 @@ def find_both_flags(records: Records) -> Iterator[Finding]:
 
 
 @check("RL503", "episodes")
-def find_endless(records: Records) -> Iterator[Finding]:
+def _find_endless(records: Records) -> Iterator[Finding]:
     limit, episodes = records.require_built().max_steps, _require_episodes(records)
     if any(each.ended == "truncated" for each in episodes):
         return
@@ -140,7 +140,7 @@ def find_endless(records: Records) -> Iterator[Finding]:
 
 
 @check("RL504", "episodes")
-def find_end_at_once(records: Records) -> Iterator[Finding]:
+def _find_end_at_once(records: Records) -> Iterator[Finding]:
     episodes = _require_episodes(records)
     if len(episodes) >= FEWEST_EPISODES and all(each.has_ended and each.steps == 1 for each in episodes):
         message = f"all {len(episodes)} episodes end on step 1"
@@ -148,7 +148,7 @@ def find_end_at_once(records: Records) -> Iterator[Finding]:
 
 
 @check("RL506", "episodes", "search", "attributes")
-def find_no_time_limit(records: Records) -> Iterator[Finding]:
+def _find_no_time_limit(records: Records) -> Iterator[Finding]:
     built, episodes = records.require_built(), _require_episodes(records)
     if built.max_steps is not None or any(each.ended != "terminated" for each in episodes):
         return  # those that did not end are RL503's
@@ -157,7 +157,7 @@ def find_no_time_limit(records: Records) -> Iterator[Finding]:
     if len(set(lengths)) == 1 or (max(lengths) < SHORTEST_TIE and not is_continuous):
         return  # a bandit, or a game of a few moves
     _require_two_flags(episodes)
-    if list(find_time_limit_as_terminated.run(records)):
+    if list(_find_time_limit_as_terminated.run(records)):
         raise NotJudged("a time limit seems to be flagged as terminated (RL501)")
     truncation = records.require_fact("truncation", "attributes")
     if truncation == "computed":
@@ -174,71 +174,41 @@ def step_after_end(context: Context) -> Iterator[Message]:
     """Play an episode to its end, and step on."""
     instance, budget = context.instance, context.budget
     episode = Episode(instance, FIRST_SEED, max_steps=LONGEST_EPISODE, deadline=budget.deadline)
-    for _ in episode:
-        pass
+    recording = Recording("after the end", episode, budget)
+    recording.run()
     if episode.ended not in ENDS:
         raise NotJudged("the episode did not come to an end")
-    end, recording = episode.steps, Recording("after the end", episode, budget)
+    end = episode.steps
     while episode.steps < end + STEPS_AFTER and recording.failure is None:  # to refuse is what it should do
         recording.step()
     yield Fact("end", end)
     yield recording.trajectory
 
 
-@dataclasses.dataclass(frozen=True)
-class _Problem:
-    """A number that is not an observation or a reward."""
-
-    kind: str
-    """`shape`, `not finite` or `outside`."""
-    text: str
-    step: int
-    value: str
-    expected: str
-
-
 @check("RL505", *RECORDING, "after the end")
 def find_nonsense_after_end(records: Records) -> Iterator[Finding]:
-    end, leaves = records.require_fact("end", "after the end"), records.require_built().leaves
-    after, alone = records.require_role("after the end"), records.require_alone()
-    # RL101, RL103, RL104 and RL601 have what whole episodes have already.
-    known = {problem.kind for each in alone for problem in _problems(each, leaves, widths=0.0)}
-    problems = [each for each in _problems(after, leaves, widths=1.0, first=end + 1) if each.kind not in known]
-    if problems:
-        worst = min(problems, key=lambda each: each.step)
-        message = f"{worst.text} at step {worst.step}, after the end at step {end}; it should be {worst.expected}"
-        evidence = {"seed": after.seed, "step": worst.step, "value": worst.value, "expected": worst.expected}
-        yield Finding("RL505", message, evidence)
-        return
-    finite = np.where(np.isfinite(after.rewards), after.rewards, 0.0)
-    largest = max((float(np.nanmax(np.abs(each.rewards), initial=0.0)) for each in alone), default=0.0)
-    if finite.size and np.abs(finite).max() > MUCH_LARGER * max(largest, 1.0):
-        at = int(np.abs(finite).argmax())
+    """Judge the steps after the end by the rules on observations and rewards that no other episode breaks."""
+    end, after = records.require_fact("end", "after the end"), records.require_role("after the end")
+    only = dataclasses.replace(records, trajectories=[dataclasses.replace(after, role="episodes")])
+    for each in (observations.find_wrong_shape, observations.find_not_finite, rewards.find_not_finite):
+        found = [] if list(each.run(records)) else list(each.run(only))
+        if found:
+            yield Finding("RL505", f"after the end at step {end}: {found[0].message}", found[0].evidence)
+            return
+    for finding in (
+        () if list(observations.find_out_of_range.run(records)) else observations.find_out_of_range.run(only)
+    ):
+        low, high = finding.evidence["expected"]
+        if not low - (high - low) <= finding.evidence["value"] <= high + (high - low):
+            yield Finding("RL505", f"after the end at step {end}: {finding.message}", finding.evidence)
+            return
+    largest = max(float(np.abs(np.nan_to_num(each.rewards)).max(initial=0.0)) for each in records.require_alone())
+    late = np.nan_to_num(after.rewards[end:])
+    if late.size and np.abs(late).max() > MUCH_LARGER * max(largest, 1.0):
+        at = int(np.abs(late).argmax())
         message = (
-            f"a step after the episode's end is rewarded with {finite[at]:.6g}; no step before was with more than "
+            f"a step after the episode's end is rewarded with {late[at]:.6g}; no step before was with more than "
             f"{largest:.6g}"
         )
-        evidence = {"seed": after.seed, "step": end + 1 + at, "value": float(finite[at]), "expected": largest}
+        evidence = {"seed": after.seed, "step": end + 1 + at, "value": float(late[at]), "expected": largest}
         yield Finding("RL505", message, evidence)
-
-
-def _problems(trajectory: Trajectory, leaves: Sequence[Leaf], *, widths: float, first: int = 1) -> Iterator[_Problem]:
-    """Yield the first place of each problem. A value is outside if it is by so many times the width of its bounds;
-    `first` is the trajectory's first step."""
-    for step in (np.flatnonzero(trajectory.reward_is_number & ~np.isfinite(trajectory.rewards)) + first)[:1]:
-        value = str(trajectory.rewards[step - first])
-        yield _Problem("not finite", f"the reward is {value}", int(step), value, "a finite number")
-    for form in trajectory.forms:
-        if form.what == "observation" and form.leaf is not None and form.shape != leaves[form.leaf].shape:
-            leaf, shape = leaves[form.leaf], str(form.shape)
-            yield _Problem("shape", f"{leaf_name(leaf)} has shape {shape}", form.step, shape, str(leaf.shape))
-    for index, series in trajectory.observations.items():
-        leaf, values = leaves[index], series.values.astype(np.float64)
-        low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
-        with np.errstate(invalid="ignore"):
-            outside = np.maximum(low - values, values - high) > (widths * (high - low) if widths else 0.0)
-        for kind, wrong in (("not finite", ~np.isfinite(values)), ("outside", outside)):
-            for row, *at in np.argwhere(wrong)[:1].tolist():
-                value, place = values[(row, *at)], tuple(at)
-                bounds = f"[{low[place]:g}, {high[place]:g}]" if kind == "outside" else "a finite number"
-                yield _Problem(kind, f"{leaf_name(leaf)} is {value:g}", int(series.steps[row]), f"{value:g}", bounds)

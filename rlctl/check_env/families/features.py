@@ -1,4 +1,4 @@
-"""RL110 to RL112: numbers in an observation that say nothing, say the same, or are of quite different size."""
+"""RL110, RL112 and RL114: numbers in an observation that say nothing, are of quite different size, or are left out."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.experiment import check
-from rlctl.check_env.finding import Finding, NotJudged, Severity, list_names
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
 from rlctl.check_env.leaves import Leaf
-from rlctl.check_env.messages import Built
+from rlctl.check_env.messages import Trajectory
 from rlctl.check_env.records import Records
-from rlctl.check_env.rewarded import WITH_SEARCH
+from rlctl.check_env.rewarded import WITH_SEARCH, require_rewarded
 
 Numbers = NDArray[np.float64]
-Copy = tuple[int, int, float, float]
-"""An element, an earlier one, and factor and offset of the line through it."""
 
 FEWEST_ROWS = 50
 FEWEST_SEEDS = 3
@@ -25,12 +23,6 @@ MOST_ROWS = 1_000
 MOST_ELEMENTS = 1_500
 """A larger array is not a list of measurements, and its correlations would take seconds."""
 MOST_NAMED = 8
-CORRELATED = 1e-9
-"""A copy's correlation is nearer to 1 than this; which of them really are copies is checked number by number."""
-ROUNDINGS = 8
-"""Float roundings by which a copy may be off, each of the number type's precision."""
-FEWEST_VALUES = 10
-"""An element with fewer values (a flag, a counter) may equal another by chance."""
 APART = 1_000.0
 """Ratio of scales from which the smaller elements are invisible to a network of usual initial weights."""
 STILL = 1e-6
@@ -63,7 +55,7 @@ def _is_image(leaf: Leaf) -> bool:
 
 
 @check("RL110", *WITH_SEARCH)
-def find_constant_elements(records: Records) -> Iterator[Finding]:
+def _find_constant_elements(records: Records) -> Iterator[Finding]:
     built = records.require_built()
     names: list[str] = []
     total = 0
@@ -94,69 +86,8 @@ def _constant(rows: Numbers, leaf: Leaf) -> NDArray[np.intp]:
     return np.flatnonzero(still & (low < high))
 
 
-@check("RL111", *WITH_SEARCH)
-def find_copies(records: Records) -> Iterator[Finding]:
-    built = records.require_built()
-    for index, leaf, rows in _vectors(records):
-        if copies := copies_in(rows, float(np.finfo(leaf.dtype).eps)):
-            texts = [_equation(built, index, each) for each in copies]
-            elements = [built.element(index, each[0]) for each in copies[:MOST_NAMED]]
-            yield Finding(
-                "RL111", list_names(texts, MOST_NAMED), {"value": len(copies), "expected": 0, "elements": elements}
-            )
-
-
-def _equation(built: Built, index: int, copy: Copy) -> str:
-    factor, offset = copy[2:]
-    text = f"{built.element(index, copy[0])} = "
-    text += f"{factor:.6g} * " if factor != 1 else ""
-    return text + built.element(index, copy[1]) + (f" {offset:+.6g}" if offset else "")
-
-
-def copies_in(rows: Numbers, precision: float) -> list[Copy]:
-    """Return the elements (columns) that are a linear function of an earlier one, to the precision of the numbers."""
-    elements = _varied(rows, precision)
-    if len(elements) < 2:
-        return []
-    values = rows[:, elements]
-    centred = values - values.mean(axis=0)
-    unit = centred / np.sqrt((centred**2).sum(axis=0))
-    close = np.triu(np.abs(unit.T @ unit) > 1 - CORRELATED, 1)
-    found = []
-    for j in np.flatnonzero(close.any(axis=0)):
-        i = int(close[:, j].argmax())
-        line = _line(values[:, i], values[:, j], precision)
-        if line is not None:
-            found.append((int(elements[j]), int(elements[i]), *line))
-    return found
-
-
-def _varied(rows: Numbers, precision: float) -> NDArray[np.intp]:
-    """Return the elements that can be compared: finite, of several values, and more than rounding apart."""
-    sizes = np.abs(rows).max(axis=0)
-    with np.errstate(invalid="ignore"):
-        varied = np.isfinite(sizes) & (rows.std(axis=0) > max(STILL, 1e3 * precision) * sizes)
-    elements = np.flatnonzero(varied)
-    values = np.sort(rows[:, elements], axis=0)
-    distinct: NDArray[np.intp] = elements[1 + (np.diff(values, axis=0) != 0).sum(axis=0) >= FEWEST_VALUES]
-    return distinct
-
-
-def _line(x: Numbers, y: Numbers, precision: float) -> tuple[float, float] | None:
-    """Return a and b of y = a x + b, if that holds for all to the precision of the numbers."""
-    if np.array_equal(x, y):
-        return 1.0, 0.0
-    centred = x - x.mean()
-    factor = float(centred @ (y - y.mean()) / (centred @ centred))
-    offset = float(y.mean() - factor * x.mean())
-    tolerance = ROUNDINGS * precision * (abs(factor) * np.abs(x).max() + np.abs(y).max() + abs(offset))
-    if np.abs(factor * x + offset - y).max() > tolerance:
-        return None
-    return factor, 0.0 if abs(offset) <= tolerance else offset
-
-
 @check("RL112", *WITH_SEARCH)
-def find_unequal_scales(records: Records) -> Iterator[Finding]:
+def _find_unequal_scales(records: Records) -> Iterator[Finding]:
     built = records.require_built()
     for index, _, rows in _vectors(records):
         rows = rows[np.isfinite(rows).all(axis=1)]
@@ -177,3 +108,106 @@ def find_unequal_scales(records: Records) -> Iterator[Finding]:
             {"value": ratio, "expected": f"up to {APART:g}", "elements": names},
             Severity.INFO if normalizes is None else Severity.WARNING,
         )
+
+
+_Steps = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+"""Of n steps: the seed and the number in its episode of each, its features (observation before, observation after,
+action; shape (n, elements)), and its reward."""
+
+NEAR, NEAR_ACTION = 0.05, 0.25
+"""Two steps are alike where each number of both observations is as near as this, and each of the actions (much of which
+the observations show already), in units of its standard deviation over everything that was recorded."""
+MOST_STEPS = 2_000
+"""Steps that are compared, each with each."""
+MOST_PAIRS = 20_000
+FEWEST_PAIRS = 30
+FEWEST_ALIKE_SEEDS = 4
+"""Seeds among which alike steps are found: with fewer it may be something special of one episode."""
+LARGE_PART = 0.25
+"""How different the rewards of alike steps of different episodes have to be, against those of all steps (standard
+deviation): half of the pairs at least."""
+TIMES = 10.0
+"""How much larger that has to be than between alike steps of one episode, where a goal is the same but noise is not."""
+
+
+@check("RL114", *WITH_SEARCH)
+def find_hidden_goal(records: Records) -> Iterator[Finding]:
+    """Compare the rewards of steps that look alike, of different episodes and of one."""
+    seeds, numbers, features, rewards = _steps(records, require_rewarded(records))
+    one, two = _alike(features)
+    differences = np.abs(rewards[one] - rewards[two])
+    across = seeds[one] != seeds[two]
+    # Of one episode, recorded twice perhaps, but at different times: chance in the reward would show.
+    within = ~across & (numbers[one] != numbers[two])
+    different_seeds = len(np.unique(seeds[np.concatenate([one[across], two[across]])]))
+    if across.sum() < FEWEST_PAIRS or within.sum() < FEWEST_PAIRS or different_seeds < FEWEST_ALIKE_SEEDS:
+        return  # no two episodes came to the same state
+    different, same = float(np.median(differences[across])), float(np.median(differences[within]))
+    if different > LARGE_PART * float(rewards.std()) and different > TIMES * same:
+        pair = np.flatnonzero(across)[int(differences[across].argmax())]
+        first, second = int(one[pair]), int(two[pair])
+        yield Finding(
+            "RL114",
+            f"with {different_seeds} seeds, steps that look alike have rewards {different:.3g} apart (median of "
+            f"{across.sum():,} pairs), within one episode {same:.2g}: {rewards[first]:.4g} and "
+            f"{rewards[second]:.4g}, say",
+            {
+                "seed": int(seeds[second]),
+                "step": int(numbers[second]),
+                "value": float(rewards[second]),
+                "expected": float(rewards[first]),
+                "other_seed": int(seeds[first]),
+                "other_step": int(numbers[first]),
+            },
+        )
+
+
+def _steps(records: Records, episodes: list[Trajectory]) -> _Steps:
+    """Return some steps of all kinds of episodes; their features are in units of what is near."""
+    leaves = records.require_built().leaves
+    if not leaves or any(not leaf.supported for leaf in leaves):
+        raise NotApplicable("a part of the observation cannot be compared")
+    if any(len(leaf.shape) == 3 for leaf in leaves):
+        raise NotApplicable("images are not compared")
+    parts = [part for each in episodes for part in _steps_of(each, len(leaves))]
+    if not parts:
+        raise NotApplicable("no whole observation was recorded")
+    seeds, numbers, features, rewards = (np.concatenate(each) for each in zip(*parts, strict=True))
+    # Some, evenly, of the beginnings of episodes, where they are most alike, and as many of all others.
+    halves = [np.flatnonzero(numbers <= 3), np.flatnonzero(numbers > 3)]
+    chosen = np.concatenate([each[:: max(1, -(-len(each) * 2 // MOST_STEPS))] for each in halves])
+    near = NEAR * features.std(axis=0)
+    near[features.shape[1] - episodes[0].action_values.shape[1] :] *= NEAR_ACTION / NEAR
+    # Whole numbers, of places and kinds, are alike only if they are equal.
+    whole = (features == np.round(features)).all(axis=0)
+    near[whole] = np.minimum(near[whole], 0.5)
+    scaled = features[chosen] / np.where(near > 0, near, 1.0)
+    return seeds[chosen], numbers[chosen], scaled, rewards[chosen]
+
+
+def _steps_of(episode: Trajectory, leaves: int) -> Iterator[_Steps]:
+    """Yield the steps of an episode whose observations are all known and finite; a last one that ends is left out."""
+    steps = episode.steps - (episode.ended in ("terminated", "both", "raised"))
+    series = [episode.observations.get(index) for index in range(leaves)]
+    flat = [each.values.reshape(len(each.values), -1).astype(np.float64) for each in series if each is not None]
+    if steps < 1 or [len(each) for each in flat] != [episode.steps + 1] * leaves:
+        return
+    observations = np.concatenate(flat, axis=1)
+    if np.isfinite(observations).all():
+        parts = [observations[:steps], observations[1 : steps + 1], episode.action_values[:steps]]
+        features = np.concatenate(parts, axis=1)
+        yield np.full(steps, episode.seed), np.arange(1, steps + 1), features, episode.rewards[:steps]
+
+
+def _alike(features: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the pairs of steps that are alike, in no number farther apart than 1: first of each, second of each."""
+    features = features - features.mean(axis=0)
+    squares = (features**2).sum(axis=1)
+    distances = squares[:, None] + squares[None, :] - 2 * features @ features.T
+    # Rounding aside, no pair that is alike is farther apart than this.
+    most = features.shape[1] + 1e-9 * squares.max(initial=0.0)
+    one, two = np.nonzero(np.triu(distances <= most, 1))
+    step = max(1, -(-len(one) // MOST_PAIRS))
+    one, two = one[::step], two[::step]
+    alike = (np.abs(features[one] - features[two]) <= 1.0).all(axis=1)
+    return one[alike], two[alike]

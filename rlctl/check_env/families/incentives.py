@@ -1,4 +1,4 @@
-"""RL604 to RL606: what the reward pays for, found by comparing recorded episodes."""
+"""RL604 to RL606 and RL609 to RL611: what the reward pays for, and success, as `info["is_success"]` reports it."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.experiment import check
+from rlctl.check_env.episode import Episode
+from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.families.determinism import compare
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
-from rlctl.check_env.messages import Trajectory
+from rlctl.check_env.instance import Context
+from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
+from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 from rlctl.check_env.rewarded import (
     DISCOUNT,
+    SUCCESS,
     WITH_SEARCH,
     at_step,
     constant_terms,
@@ -25,7 +29,9 @@ from rlctl.check_env.rewarded import (
     has_terms,
     longest_episode,
     reports_success,
+    require_readable,
     require_rewarded,
+    summarize,
     terms_of,
 )
 
@@ -49,7 +55,7 @@ MOST_OF = 0.5
 
 
 @check("RL604", *WITH_SEARCH)
-def find_paid_ends(records: Records) -> Iterator[Finding]:
+def _find_paid_ends(records: Records) -> Iterator[Finding]:
     episodes = require_rewarded(records)
     if not any(each.terminated.any() for each in episodes):
         raise NotApplicable("nothing ended an episode early")
@@ -104,7 +110,7 @@ class Pair:
 
 
 @check("RL605", *WITH_SEARCH)
-def find_paid_hovering(records: Records) -> Iterator[Finding]:
+def _find_paid_hovering(records: Records) -> Iterator[Finding]:
     episodes = require_rewarded(records)
     is_reported = reports_success(episodes)
     finished = [each for each in episodes if _finishes(each, is_reported)]
@@ -162,7 +168,7 @@ def pair_up(one: Trajectory, two: Trajectory, longest: int) -> Pair | None:
 
 
 @check("RL606", *WITH_SEARCH)
-def find_paid_idleness(records: Records) -> Iterator[Finding]:
+def _find_paid_idleness(records: Records) -> Iterator[Finding]:
     compared = [each for each in require_rewarded(records) if each.role in ("episodes", "search")]
     idle = [each for each in compared if each.actions == "zero"]
     others = [each for each in compared if each.actions != "zero"]
@@ -198,3 +204,82 @@ def _bonus(idle: Sequence[Trajectory]) -> tuple[str | None, float]:
     shares = {name: value * steps / total for name, value in constant_terms(idle).items() if value > 0}
     largest = max(shares, key=lambda name: shares[name], default=None)
     return (largest, shares[largest]) if largest is not None and shares[largest] >= MOST_OF else (None, 0.0)
+
+
+STARTS = 30
+START_STEPS = 3
+"""More than one, to tell what belongs to the episode from chance in each step."""
+FIRST = FIRST_SEED + 100
+"""The first of their seeds; none of the whole episodes has them."""
+MAX_FAILURES = 3
+MANY_AT_START = 0.2
+"""Part of the starts that may be successes by chance: a goal that is drawn near the robot now and then."""
+FEWEST_STARTS = 10
+FEWEST_EPISODES = 20
+"""Fewer episodes say little about whether one can succeed."""
+FEWEST_STEPS = 500
+"""Steps of them: less is what raises, or ends, at once."""
+OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
+
+
+@experiment("starts", share=1.0)
+def record_starts(context: Context) -> Iterator[Message]:
+    """Reset with many seeds, and take the same few steps with the zero action after each."""
+    failures = 0
+    for number in range(STARTS):
+        if context.budget.seconds_left < 0 or context.budget.bytes_left < 0 or failures >= MAX_FAILURES:
+            yield Skipped("starts", f"only {number} of {STARTS} starts could be made")
+            return
+        episode = Episode(context.instance, FIRST + number, "zero", number=number, max_steps=START_STEPS)
+        recording = Recording("starts", episode, context.budget)
+        yield from recording.run()
+        failures += recording.failure is not None
+
+
+@check("RL609", *WITH_SEARCH)
+def _find_unreported_success(records: Records) -> Iterator[Finding]:
+    episodes = require_readable(records)
+    if reports_success(episodes):
+        return
+    if not any(each.has_ended for each in episodes):
+        raise NotJudged("no episode ended, and success may be reported at the end only")
+    names = dict.fromkeys(name for each in episodes for name in each.infos if name.split("/")[-1] in OTHER_NAMES)
+    instead = f"; {', '.join(map(repr, names))} in info is read by nobody" if names else ""
+    message = f"is_success is not in info: rlctl eval cannot report a success rate{instead}"
+    yield Finding("RL609", message, {"value": list(names), "expected": SUCCESS})
+
+
+@check("RL610", "starts")
+def _find_success_at_start(records: Records) -> Iterator[Finding]:
+    starts = [each for each in records.role("starts") if each.steps]
+    if len(starts) < FEWEST_STARTS:
+        raise NotJudged(records.why_missing("starts"))
+    reported = [(each, each.infos[SUCCESS]) for each in starts if SUCCESS in each.infos]
+    if not reported:
+        raise NotApplicable("is_success is not reported at the first step")
+    at_once = [each for each, success in reported if (success.values[success.steps <= 1] > 0).any()]
+    share = len(at_once) / len(starts)
+    if share > MANY_AT_START:
+        message = f"{len(at_once)} of {len(starts)} episodes are a success after one step with the zero action"
+        yield Finding("RL610", message, at_step(at_once[0], 1, value=share, expected=f"up to {MANY_AT_START}"))
+
+
+@check("RL611", *WITH_SEARCH)
+def _find_no_success(records: Records) -> Iterator[Finding]:
+    episodes = require_readable(records)
+    if not reports_success(episodes):
+        raise NotApplicable("is_success is not in info")
+    if any(has_succeeded(each) for each in episodes):
+        return
+    steps = sum(each.steps for each in episodes)
+    if len(episodes) < FEWEST_EPISODES or steps < FEWEST_STEPS or not records.role("search"):
+        reason = f"only {len(episodes)} episodes with {steps} steps were recorded"
+        raise NotJudged(records.skipped.get("search", reason))
+    best = max(episodes, key=lambda each: float(np.nan_to_num(each.rewards, nan=-np.inf).max()))
+    step = int(np.nan_to_num(best.rewards, nan=-np.inf).argmax())
+    reward = float(best.rewards[step])
+    yield Finding(
+        "RL611",
+        f"is_success was not true once in {summarize(episodes)}; the best reward was {reward:.4g}, at step {step + 1}",
+        at_step(best, step + 1, value=reward, episodes=len(episodes)),
+    )

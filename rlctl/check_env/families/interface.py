@@ -1,16 +1,13 @@
-"""RL2: the interface: what reset and step take and return, that they come back, and how misuse is refused."""
+"""RL2: the interface: what reset and step take and return, and that they come back."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rlctl.check_env.context import Context
-from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import PROVOKING, RECORDING, check, experiment
-from rlctl.check_env.failures import EnvironmentRaised, describe
-from rlctl.check_env.finding import Finding, NotJudged, Severity
-from rlctl.check_env.messages import FIRST_SEED, Failure, Form, Message, Trajectory
-from rlctl.check_env.no_display import lost_display
+from rlctl.check_env.experiment import PROVOKING, RECORDING, check
+from rlctl.check_env.failures import lost_display
+from rlctl.check_env.finding import Finding, Severity
+from rlctl.check_env.messages import Failure, Form, Trajectory
 from rlctl.check_env.records import Records
 
 NUMBERS = ("float", "int", "numpy.float64")
@@ -23,7 +20,7 @@ BESIDE_OTHERS = ("interleaved", "after close")
 
 
 @check("RL201")
-def find_other_number_of_values(records: Records) -> Iterator[Finding]:
+def _find_other_number_of_values(records: Records) -> Iterator[Finding]:
     for trajectory, form in _first_forms(records, "reset"):
         yield _of_form("RL201", f"reset returns {form.type}", trajectory, form, "tuple of 2")
     for trajectory, form in _first_forms(records, "step"):
@@ -31,13 +28,13 @@ def find_other_number_of_values(records: Records) -> Iterator[Finding]:
 
 
 @check("RL202", "build")
-def find_reset_without_seed(records: Records) -> Iterator[Finding]:
+def _find_reset_without_seed(records: Records) -> Iterator[Finding]:
     if not records.require_built().accepts_seed:
         yield Finding("RL202", "reset has no parameter `seed`")
 
 
 @check("RL204")
-def find_wrong_types(records: Records) -> Iterator[Finding]:
+def _find_wrong_types(records: Records) -> Iterator[Finding]:
     for what in ("terminated", "truncated"):
         for trajectory, form in _first_forms(records, what, "bool"):
             message = f"{what} is {_a(form.type)} at step {form.step}"
@@ -86,57 +83,30 @@ def select_failures(records: Records, kind: str) -> Iterator[Failure]:
 
 
 @check("RL207")
-def find_exceptions(records: Records) -> Iterator[Finding]:
+def _find_exceptions(records: Records) -> Iterator[Finding]:
     raised = [each for each in select_failures(records, "raised") if each.file is None]  # the others are RL007's
     for failure in raised[:MOST_FAILURES]:
         yield Finding("RL207", f"{failure.in_call} raised {failure.error}", failure.place)
 
 
 @check("RL208")
-def find_ends_of_process(records: Records) -> Iterator[Finding]:
+def _find_ends_of_process(records: Records) -> Iterator[Finding]:
     for failure in select_failures(records, "died"):
         if not lost_display(failure):  # RL216 says why
             yield Finding("RL208", f"the process {failure.error} in {failure.in_call}", failure.place)
 
 
 @check("RL209")
-def find_hangs(records: Records) -> Iterator[Finding]:
+def _find_hangs(records: Records) -> Iterator[Finding]:
     for failure in list(select_failures(records, "hung"))[:1]:
         yield Finding("RL209", f"{failure.in_call} {failure.error}", failure.place)
 
 
 @check("RL211", *RECORDING)
-def find_prints(records: Records) -> Iterator[Finding]:
+def _find_prints(records: Records) -> Iterator[Finding]:
     lines = records.printed_lines
     if lines:
         steps = max(1, sum(each.steps for each in records.trajectories))
         message = f"{lines} lines on stdout in {steps} steps, the first: {records.printed_first[:80]!r}"
         severity = Severity.WARNING if lines > MANY_LINES * steps and lines > 20 else None
         yield Finding("RL211", message, {"value": lines, "expected": 0}, severity)
-
-
-@experiment("step before reset", "RL212", share=0.3, provokes="step before reset")
-def step_before_reset(context: Context) -> Iterator[Message]:
-    """Step an instance that was never reset."""
-    with context.fresh() as instance:
-        if not instance.is_env:
-            raise NotJudged("it is not a gymnasium.Env (RL003)")
-        try:
-            Episode(instance, FIRST_SEED).step()
-        except EnvironmentRaised:
-            return
-        yield Finding("RL212", "step before reset is accepted without an exception")
-
-
-@experiment("close twice", "RL213", share=0.3, provokes="a second close")
-def close_twice(context: Context) -> Iterator[Message]:
-    """Close an instance, and close it again."""
-    instance = context.build()
-    if not hasattr(instance.env, "close"):
-        raise NotJudged("it has no close")
-    instance.reset(FIRST_SEED)
-    instance.close()
-    try:
-        instance.close()
-    except EnvironmentRaised as error:
-        yield Finding("RL213", f"a second close raises {describe(error.__cause__ or error)}", {"call": "close"})

@@ -1,18 +1,25 @@
-"""RL4: instances do not touch each other. Training steps dozens of them in one process."""
+"""RL4: instances do not touch each other, give back what they take, and can be built where training builds them."""
 
 from __future__ import annotations
 
+import ctypes
+import dataclasses
+import gc
+import multiprocessing
+import os
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
-from rlctl.check_env.comparison import find_difference
-from rlctl.check_env.context import Context
+from rlctl.check_env.bullet_worlds import connected
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
-from rlctl.check_env.families.determinism import COMPARED_STEPS, compare, require_independent
+from rlctl.check_env.failures import EnvironmentRaised, describe_failure
+from rlctl.check_env.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.check_env.families.interface import select_failures
 from rlctl.check_env.finding import Finding, NotJudged, Severity
-from rlctl.check_env.instance import Instance
-from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Failure, Message, Skipped, Trajectory
+from rlctl.check_env.instance import Context, Instance
+from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Failure, Message, Skipped
 from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 
@@ -41,7 +48,7 @@ def compare_instances(context: Context) -> Iterator[Message]:
     neighbour = context.build()
     yield from begin(neighbour, "fresh instance", FIRST_SEED).run()
     if budget.seconds_left < 0:
-        for role in ("interleaved", "after close"):
+        for role in ("interleaved", "interleaved second", "after close"):
             yield Skipped(role, "building and stepping the first two instances took all the time there is for them")
         yield from context.close(neighbour)
         return
@@ -49,7 +56,8 @@ def compare_instances(context: Context) -> Iterator[Message]:
     # From here on each instance has played the same episodes, in the same order, as `first` had.
     progress.phase("interleaved")
     survivor = context.build()
-    pair = begin(survivor, "interleaved", FIRST_SEED), begin(neighbour, "interleaved", SECOND_SEED)
+    pair = begin(survivor, "interleaved", FIRST_SEED), begin(neighbour, "interleaved second", SECOND_SEED)
+    progress.phase("interleaved")
     for recording in pair:
         recording.reset()
     while any(recording.running for recording in pair):
@@ -98,47 +106,186 @@ def _describe(failure: Failure) -> str:
     return f"{failure.in_call} {'ended' if failure.kind == 'died' else 'hangs'}: the process {failure.error}"
 
 
-def _difference(records: Records, rule: str, beside: Trajectory, doing: str) -> Finding | None:
-    alone = records.require_role("fresh process")
-    if beside.seed != alone.seed:
-        alone = records.require_role("second alone")
-    if alone.ended == "raised":
-        raise NotJudged("the episode raised when alone, too (RL207)")
-    difference = find_difference(records.require_built(), alone, beside)
-    if difference is None:
-        return None
-    severity = Severity.WARNING if difference.is_small else None
-    return Finding(rule, f"{doing}, against one alone: {difference.text()}", difference.evidence(beside), severity)
-
-
 @check("RL401", "comparisons", "instances")
 def find_shared_world(records: Records) -> Iterator[Finding]:
+    """Compare instances that were stepped in turns with such that were alone."""
     _require_same_alone(records)
-    found = _failure(records, "RL401", "interleaved", IN_TURNS)
-    if found is None:
-        records.require_role("interleaved")
-        differences = (_difference(records, "RL401", each, IN_TURNS) for each in records.role("interleaved"))
-        found = next((each for each in differences if each is not None), None)
-    if found is not None:
+    if found := _failure(records, "RL401", "interleaved", IN_TURNS):
         yield found
+        return
+    for alone, beside in (("fresh process", "interleaved"), ("second alone", "interleaved second")):
+        trajectory, difference = compare(records, alone, beside)
+        if difference is not None:
+            yield report("RL401", records, trajectory, difference, f"{IN_TURNS}, against one alone")
+            return
 
 
 @check("RL402", "comparisons", "instances")
 def find_effect_of_closing(records: Records) -> Iterator[Finding]:
+    """Compare an instance beside which another one was closed with one that was alone."""
     _require_same_alone(records)
-    found = _failure(records, "RL402", "after close", AFTER_CLOSE)
-    if found is None:
-        if list(find_shared_world.run(records)):
-            raise NotJudged("the instances already disturb each other while both are open (RL401)")
-        found = _difference(records, "RL402", records.require_role("after close"), AFTER_CLOSE)
-    if found is not None:
+    if found := _failure(records, "RL402", "after close", AFTER_CLOSE):
         yield found
+        return
+    if list(find_shared_world.run(records)):
+        raise NotJudged("the instances already disturb each other while both are open (RL401)")
+    trajectory, difference = compare(records, "second alone", "after close")
+    if difference is not None:
+        yield report("RL402", records, trajectory, difference, f"{AFTER_CLOSE}, against one alone")
 
 
 @check("RL403", "instances")
-def find_single_instance(records: Records) -> Iterator[Finding]:
+def _find_single_instance(records: Records) -> Iterator[Finding]:
     for failure in records.failures:
         if failure.call in ("load", "build") and failure.process != "probe":
             where = "in one process" if failure.phase in ("fresh instance", "interleaved") else "in a second process"
             yield Finding("RL403", f"a second instance {where} cannot be built: {failure.error}", failure.place)
             return
+
+
+MOST_RESETS = 100
+WARM_UP = 10
+"""Resets after which caches and allocators are filled; memory is measured from there on."""
+TRIAL_RESETS = 3
+"""So many are timed to see how many there is time for."""
+MARGIN = 0.7
+"""The part of the time that is planned with, since a leak makes resets slower."""
+FEWEST_RESETS = 8
+"""With fewer, growth cannot be distinguished from a slow start."""
+SETTLING_RESETS = 2
+"""The first resets load what later ones keep."""
+LEAST_GROWTH = 3
+"""In each half of the resets, so that one late object is not a leak."""
+FEWEST_RESETS_FOR_MEMORY = 30
+MEMORY_GROWTH = 8 * 2**20
+"""Over the resets after the warm-up [bytes]. Allocators of clean environments move by 1 to 2 MiB; 0.1 MB per reset
+fills the memory of 16 workers in a day."""
+LATER_SHARE = 0.4
+"""Of the growth, so much must be in the second half: what fills once slows down, a leak does not."""
+_PROCESS = Path("/proc/self")
+
+
+@dataclasses.dataclass
+class Counts:
+    """What an instance holds after each of many resets."""
+
+    clients: list[int] = dataclasses.field(default_factory=list)
+    """PyBullet clients of the process."""
+    bodies: list[int] = dataclasses.field(default_factory=list)
+    """Bodies in the worlds of all clients."""
+    descriptors: list[int] = dataclasses.field(default_factory=list)
+    threads: list[int] = dataclasses.field(default_factory=list)
+    memory: list[int] = dataclasses.field(default_factory=list)
+    """Resident memory [bytes] once the warm-up is over, half way, and at the end; empty where it is not known."""
+    measured: list[int] = dataclasses.field(default_factory=list)
+    """After how many resets each of these was measured."""
+
+    def count(self) -> None:
+        """Count what is there now."""
+        clients = connected()
+        self.clients.append(len(clients))
+        pybullet = sys.modules.get("pybullet")
+        self.bodies.append(sum(pybullet.getNumBodies(physicsClientId=each) for each in clients) if pybullet else 0)
+        if _PROCESS.exists():
+            self.descriptors.append(len(os.listdir(_PROCESS / "fd")))
+            self.threads.append(len(os.listdir(_PROCESS / "task")))
+
+    def measure_memory(self) -> None:
+        """Note the resident memory, without what only waits to be collected."""
+        if not _PROCESS.exists():
+            return
+        gc.collect()
+        # What was freed before would otherwise be used again, and hide what is kept.
+        if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+            trim(0)
+        pages = int((_PROCESS / "statm").read_text().split()[1])
+        self.memory.append(pages * os.sysconf("SC_PAGE_SIZE"))
+        self.measured.append(len(self.clients))
+
+
+@experiment("leaks", "RL405", share=3.0)
+def count_after_resets(context: Context) -> Iterator[Message]:
+    """Reset the process's instance many times, with one step each, and count what it holds."""
+    counts = Counts()
+    instance, budget = context.instance, context.budget
+    gc.freeze()  # what there is already need not be looked through again and again
+    try:
+        begun, planned = budget.seconds_left, MOST_RESETS
+        while (done := len(counts.clients)) < planned and budget.seconds_left > 0:
+            for _ in Episode(instance, FIRST_SEED + done, number=done, max_steps=1):
+                pass
+            counts.count()
+            done += 1
+            if done == TRIAL_RESETS:
+                affordable = done * MARGIN * begun / max(1e-9, begun - budget.seconds_left)
+                planned = max(done, min(MOST_RESETS, int(affordable)))
+            if done in (WARM_UP, (WARM_UP + planned) // 2, planned):
+                counts.measure_memory()
+    except EnvironmentRaised as error:
+        yield describe_failure(error, context.progress)
+    finally:
+        gc.unfreeze()
+    yield from find_growth(counts)
+
+
+def find_growth(counts: Counts) -> Iterator[Finding]:
+    """Yield what grows with every reset; raises `NotJudged` where there were too few of them."""
+    resets = len(counts.clients)
+    if resets < FEWEST_RESETS:
+        raise NotJudged(f"there was time for only {resets} resets")
+    for what, series, severity in (
+        ("PyBullet clients", counts.clients, Severity.ERROR),
+        ("bodies in the PyBullet world", counts.bodies, Severity.ERROR),
+        ("open file descriptors", counts.descriptors, Severity.WARNING),
+        ("threads", counts.threads, Severity.WARNING),
+    ):
+        if len(series) == resets and (growth := _growth(series)):
+            first, after = series[SETTLING_RESETS], resets - SETTLING_RESETS - 1
+            message = f"{what} grow with every reset: from {first} to {series[-1]} in {after} resets"
+            yield _report(message, what, series[-1], first, after, growth / after, severity)
+            return  # a client brings its own bodies, files, threads and memory
+    if len(counts.memory) == 3 and counts.measured[-1] >= FEWEST_RESETS_FOR_MEMORY:
+        start, middle, end = counts.memory
+        resets = counts.measured[-1] - counts.measured[0]
+        if end - start > MEMORY_GROWTH and end - middle > LATER_SHARE * (end - start):
+            message = (
+                f"memory grows with every reset: by {(end - start) / 2**20:.1f} MiB in {resets} resets, of which "
+                f"{(end - middle) / 2**20:.1f} MiB in the second half"
+            )
+            yield _report(message, "memory", end, start, resets, (end - start) / resets)
+
+
+def _growth(series: list[int]) -> int:
+    """Return by how much a count grows, if it does so all the time; else 0."""
+    series = series[SETTLING_RESETS:]
+    first, second = series[: len(series) // 2], series[len(series) // 2 :]
+    grows = all(half[-1] - half[0] >= LEAST_GROWTH for half in (first, second)) and min(second) >= max(first)
+    return series[-1] - series[0] if grows else 0
+
+
+def _report(
+    message: str, what: str, value: int, first: int, resets: int, per_reset: float, severity: Severity | None = None
+) -> Finding:
+    evidence = {"element": what, "value": value, "expected": first, "resets": resets, "per_reset": per_reset}
+    return Finding("RL405", message, evidence, severity)
+
+
+@experiment("worker build", "RL406", provokes="use in a daemonic worker")
+def build_in_worker(context: Context) -> Iterator[Message]:
+    """Build, reset and step in a daemonic process, as the workers of Stable-Baselines3's SubprocVecEnv are."""
+    process = multiprocessing.current_process()
+    process.daemon = True  # nothing else is different there: each process of a check is a fresh interpreter
+    try:
+        _build_and_step(context)
+    except EnvironmentRaised as error:
+        failed, process.daemon = describe_failure(error, context.progress), False
+        _build_and_step(context)  # what raises here, too, is another rule's
+        yield Finding("RL406", f"in a daemonic worker {failed.call} raises {failed.error}", failed.place)
+    finally:
+        process.daemon = False
+
+
+def _build_and_step(context: Context) -> None:
+    with context.fresh() as instance:
+        for _ in Episode(instance, FIRST_SEED, max_steps=1):
+            pass

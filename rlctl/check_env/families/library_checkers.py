@@ -15,11 +15,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from rlctl.check_env.context import Context
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import describe
-from rlctl.check_env.families.hindsight import GOALS
-from rlctl.check_env.messages import GYMNASIUM, RAISED, SB3, Checked, Complaint, Message
+from rlctl.check_env.families.rewards import GOALS
+from rlctl.check_env.instance import Context
+from rlctl.check_env.messages import GYMNASIUM, RAISED, SB3, Complaint, Message
 
 _LIBRARIES = re.compile(r"[/\\](gymnasium|stable_baselines3|rlctl[/\\]check_env)[/\\](?!envs[/\\])")
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
@@ -29,39 +29,38 @@ _LONGEST = 400  # characters
 @experiment("gymnasium checker", share=10.0)
 def run_gymnasium_checker(context: Context) -> Iterator[Message]:
     """Run Gymnasium's checker on an instance of its own."""
-    yield _run(GYMNASIUM, context, _load_gymnasiums)
-
-
-@experiment("sb3 checker", share=10.0)
-def run_sb3_checker(context: Context) -> Iterator[Message]:
-    """Run Stable-Baselines3's checker on an instance of its own."""
-    yield _run(SB3, context, _load_sb3s)
-
-
-def _load_gymnasiums() -> Callable[[Any], None]:
     from gymnasium.utils.env_checker import check_env
 
     def check(env: Any) -> None:
-        env = _without_gymnasiums_wrappers(env)
         spec = getattr(env, "spec", None)
         wrappers = getattr(spec, "additional_wrappers", ())
         # The check of `close` makes a second environment from the registration, wrappers included.
         again = spec is not None and all(wrapper.kwargs is not None for wrapper in wrappers)
         check_env(env, skip_render_check=True, skip_close_check=not again)
 
-    return check
+    yield from _run(GYMNASIUM, context, check)
 
 
-def _load_sb3s() -> Callable[[Any], None]:
+@experiment("sb3 checker", share=10.0)
+def run_sb3_checker(context: Context) -> Iterator[Message]:
+    """Run Stable-Baselines3's checker on an instance of its own."""
     from rlctl.check_env.sb3_checker import load_sb3_checker
 
     check_env = load_sb3_checker()
 
     def check(env: Any) -> None:
-        env = _without_gymnasiums_wrappers(env)
         check_env(_without_goals(env) if _has_other_compute_reward(env) else env)
 
-    return check
+    yield from _run(SB3, context, check)
+
+
+def _run(name: str, context: Context, checker: Callable[[Any], None]) -> Iterator[Message]:
+    env = context.build().env
+    context.progress.enter("check")
+    complaints = collect_complaints(lambda env: checker(_without_gymnasiums_wrappers(env)), env)
+    context.progress.leave()
+    for kind, text in complaints:
+        yield Complaint(name, kind, text)
 
 
 def _has_other_compute_reward(env: Any) -> bool:
@@ -101,33 +100,17 @@ def _without_gymnasiums_wrappers(env: Any) -> Any:
     return env
 
 
-def _run(name: str, context: Context, load: Callable[[], Callable[[Any], None]]) -> Message:
-    problem = None
-    complaints: list[tuple[str, str]] = []
-    try:
-        checker = load()
-    except Exception as error:
-        problem = f"importing it failed: {describe(error)}"
-    else:
-        env = context.build().env
-        context.progress.enter("check")
-        complaints = collect_complaints(checker, env)
-        context.progress.leave()
-    return Checked(name, problem, [Complaint(name, *each) for each in complaints])
-
-
 def collect_complaints(checker: Callable[[Any], None], env: Any) -> list[tuple[str, str]]:
     """Run a checker on an environment and return what it said: kind and text; warnings of other code are left out."""
     complaints: list[tuple[str, str]] = []
     home = _find_home(env)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        try:
-            checker(env)
-        except BaseException as error:  # an environment may raise anything, SystemExit too
-            complaints.append(("error", _describe(error, home)))
-        finally:
-            _close(env, complaints, home)
+        for call in (lambda: checker(env), getattr(env, "close", lambda: None)):
+            try:
+                call()
+            except BaseException as error:  # an environment may raise anything, SystemExit too
+                complaints.append(("error", _describe(error, home)))
     texts = [str(each.message) for each in caught if _LIBRARIES.search(each.filename)]
     return [("warning", _clean(text)) for text in dict.fromkeys(texts)] + complaints
 
@@ -140,15 +123,6 @@ def _find_home(env: Any) -> str:
         return ""
     packages = [folder for folder in file.parents if (folder / "__init__.py").is_file()]
     return f"{packages[-1]}{os.sep}" if packages else str(file)
-
-
-def _close(env: Any, complaints: list[tuple[str, str]], home: str) -> None:
-    if not hasattr(env, "close"):
-        return
-    try:
-        env.close()
-    except BaseException as error:
-        complaints.append(("error", _describe(error, home)))
 
 
 def _describe(error: BaseException, home: str) -> str:

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rlctl import registry
-from rlctl.check_env.built import describe_built
-from rlctl.check_env.context import Context
+from rlctl.check_env.bullet_worlds import connected
 from rlctl.check_env.experiment import RECORDING, check, experiment
+from rlctl.check_env.failures import chain, lost_display, missing_file
 from rlctl.check_env.finding import Finding
+from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.messages import Built, Failure, Message
-from rlctl.check_env.missing_files import missing_file
-from rlctl.check_env.no_display import lost_display
+from rlctl.check_env.own_code import find_author, is_task
 from rlctl.check_env.records import Records
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
 
@@ -30,18 +30,14 @@ def build(context: Context) -> Iterator[Message]:
     """Build the first instance, which the process keeps. Raises `UsageError` for a name that does not exist."""
     try:
         instance = context.build_first()
-    except (NoSuchClassError, OldGymError) as error:
-        yield _explain(context, error)
-        return
-    except UsageError:
-        raise
     except RlctlError as error:
+        if isinstance(error, UsageError) and not isinstance(error, NoSuchClassError | OldGymError):
+            raise
         yield _explain(context, error)
         return
-    built = describe_built(instance)
-    yield built
-    yield from _base_class(built)
-    yield from _metadata(built.metadata)
+    yield describe_built(instance)
+    yield from _base_class(instance)
+    yield from _judge_metadata(getattr(instance.env, "metadata", None))
 
 
 def _explain(context: Context, error: RlctlError) -> Finding:
@@ -61,18 +57,13 @@ def _explain(context: Context, error: RlctlError) -> Finding:
         fix = f"Give them ({settings}), or give them default values."
         return Finding("RL006", str(error), details, fix=fix)
     if isinstance(error, TaskError) and error.details is None and not _is_task(context.spec.task):
-        return Finding(
-            "RL003", str(error)
-        )  # what a constructor raises comes with its traceback; this is the registry's
+        return Finding("RL003", str(error))  # the registry's; what a constructor raises comes with its traceback
     return Finding("RL002", str(error), details)
 
 
 def _imports_old_gym(error: BaseException | None) -> bool:
-    while error is not None:
-        if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "gym":
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+    missing = [str(each.name) for each in chain(error) if isinstance(each, ModuleNotFoundError)]
+    return any(name.partition(".")[0] == "gym" for name in missing)
 
 
 def _is_task(name: str) -> bool:
@@ -84,28 +75,30 @@ def _missing_arguments(message: str) -> list[str]:
     return re.findall(r"'(\w+)'", found.group(1)) if found else []
 
 
-def _base_class(built: Built) -> Iterator[Finding]:
-    if built.is_old_gym:
+def _base_class(instance: Instance) -> Iterator[Finding]:
+    bases = type(getattr(instance.env, "unwrapped", instance.env)).__mro__
+    if any(base.__module__.partition(".")[0] == "gym" for base in bases):
         yield Finding("RL008", "the class inherits from gym.Env, not from gymnasium.Env")
-    elif not built.is_env:
+    elif not instance.is_env:
         yield Finding("RL003", "the class does not inherit from gymnasium.Env")
-    for name, leaves in (("observation", built.leaves), ("action", built.action_leaves)):
+    for name, leaves in (("observation", instance.leaves), ("action", instance.action_leaves)):
         if "NoneType" in {leaf.kind for leaf in leaves}:
             yield Finding("RL003", f"there is no {name}_space")
 
 
-def _metadata(metadata: Mapping[str, Any]) -> Iterator[Finding]:
-    for key in metadata:
+def _judge_metadata(metadata: Any) -> Iterator[Finding]:
+    keys = [str(key) for key in metadata] if isinstance(metadata, dict) else []
+    for key in keys:
         if key in OLD_KEYS:
             message = f"metadata has {key!r}, which is now {OLD_KEYS[key]!r}"
             yield Finding("RL009", message, {"value": key, "expected": OLD_KEYS[key]})
-    if metadata.get("render_modes") and not any("fps" in key or "frames_per_sec" in key for key in metadata):
+    if keys and metadata.get("render_modes") and not any("fps" in key or "frames_per_sec" in key for key in keys):
         message = f"metadata has render_modes {metadata['render_modes']} and no render_fps"
         yield Finding("RL009", message, {"expected": "render_fps"})
 
 
 @check("RL004", "build")
-def find_end_while_loading(records: Records) -> Iterator[Finding]:
+def _find_end_while_loading(records: Records) -> Iterator[Finding]:
     if records.built is None:
         for failure in records.failures:
             if failure.process == "probe" and failure.call in ("load", "build") and not lost_display(failure):
@@ -119,7 +112,7 @@ def _while_loading(failure: Failure) -> str:
 
 
 @check("RL007", "build", *RECORDING)
-def find_missing_files(records: Records) -> Iterator[Finding]:
+def _find_missing_files(records: Records) -> Iterator[Finding]:
     files = set()
     for failure in records.failures if records.built is not None else ():
         if failure.file is not None and failure.file["file"] not in files:
@@ -132,3 +125,55 @@ def _not_found(call: str, file: Mapping[str, Any], details: str | None) -> Findi
     similar = f"; there is {file['similar']}" if file["similar"] else ""
     evidence = {**file, "traceback": details} if details else dict(file)
     return Finding("RL007", f"{call} does not find {file['file']!r}{where}{similar}", evidence)
+
+
+WAIVERS = "rlctl_ignore"
+"""The class attribute that waives rules: rule id -> reason."""
+
+
+def describe_built(instance: Instance) -> Built:
+    """Return what is known of an environment before it is used."""
+    env = instance.env
+    inner = getattr(env, "unwrapped", env)
+    spec = getattr(env, "spec", None)
+    author = type(find_author(env))
+    file, line = _place(author)
+    return Built(
+        leaves=instance.leaves,
+        action_leaves=instance.action_leaves,
+        observation_space=_short(getattr(env, "observation_space", None)),
+        action_space=_short(env.action_space),
+        names=dict(inner.observation_sizes) if is_task(env) else {},
+        events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
+        max_steps=inner.max_steps if is_task(env) else getattr(spec, "max_episode_steps", None),
+        nondeterministic=bool(getattr(spec, "nondeterministic", False)),
+        accepts_seed=instance.accepts_seed,
+        uses_pybullet=bool(connected()),
+        waivers=_waivers(author),
+        file=file,
+        line=line,
+    )
+
+
+def _waivers(author: type) -> Any:
+    """Return the waivers as they are written; whether they are good is judged where they are used."""
+    waivers = getattr(author, WAIVERS, {})
+    if isinstance(waivers, dict):
+        return {str(rule): reason if isinstance(reason, str) else "" for rule, reason in waivers.items()}
+    return {repr(waivers)[:40]: ""}
+
+
+def _place(author: type) -> tuple[str | None, int | None]:
+    """Return file and line of the class that somebody wrote."""
+    try:
+        return inspect.getsourcefile(author), inspect.getsourcelines(author)[1]
+    except (OSError, TypeError):
+        return None, None
+
+
+def _short(space: Any) -> str:
+    text = " ".join(str(space).split())
+    if len(text) <= 100:
+        return text
+    shape = getattr(space, "shape", None)
+    return f"{type(space).__name__}{shape or ''}"

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
+import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.bullet_clients import connected
-from rlctl.check_env.bullet_worlds import Joint, Pair
-from rlctl.check_env.client_calls import find_left_out, record_calls
-from rlctl.check_env.context import Context
+from rlctl.check_env.bullet_calls import BulletCall, BulletCalls, record_calls
+from rlctl.check_env.bullet_worlds import ANGULAR, JOINTS, POSITION, VELOCITY, Joint, Jump, Pair, connected
 from rlctl.check_env.experiment import experiment
-from rlctl.check_env.failures import EnvironmentRaised, failure
+from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
-from rlctl.check_env.messages import Message, Skipped
+from rlctl.check_env.instance import Context
+from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
 from rlctl.check_env.world_logs import Log, LoggedWorld, Place, WorldLogger
-from rlctl.check_env.world_tests import Jump
 
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))
 """The actions of each episode, and how many of its steps are logged."""
@@ -38,19 +37,24 @@ NONSENSE = 5_000.0
 FASTEST_JUMP = 1.0
 """So much faster than by falling a body may be a tenth of a second after a reset [m/s]: ten times gravity."""
 HIGHEST_DROP = 0.1  # [m]
-SAME = 1e-9
-"""Relative difference up to which masses and frictions are equal."""
-FEWEST_LINKS = 2
-LIGHTEST_BASE = 0.05
-"""A base does not matter where it has less than this part of the mass."""
 MOST_NAMES = 3
+MOST_CALLS, MOST_LINKS = 20, 5
+"""Calls and links that a finding's evidence has."""
 
 
-@experiment("worlds", *(f"RL80{i}" for i in range(1, 9)), share=4.0)
+@experiment("worlds", *(f"RL80{i}" for i in (1, 3, 4, 5, 7, 8, 9)), share=4.0)
 def watch_worlds(context: Context) -> Iterator[Message]:
-    """Log the worlds of an instance through a few episodes. What changes them (falling alone, boxes) comes after."""
+    """Log the worlds of an instance through a few episodes; let them fall alone, which changes them, after that."""
+    if "pybullet" not in sys.modules:
+        with context.fresh():
+            pass  # what it imports is imported now
+    if "pybullet" not in sys.modules:
+        raise NotApplicable("no PyBullet world")
     older = set(connected())
     with record_calls() as calls, context.fresh() as instance:
+        with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
+            instance.reset(FIRST_SEED)
+        yield from _models(calls)
         logger = WorldLogger(instance, older)
         for number, (kind, steps) in enumerate(EPISODES):
             if number and (context.budget.seconds_left < 0 or not logger.worlds):
@@ -58,25 +62,56 @@ def watch_worlds(context: Context) -> Iterator[Message]:
             try:
                 logger.play(number, kind, steps, context.budget.deadline)
             except EnvironmentRaised as error:
-                yield failure(error, context.progress)
+                yield describe_failure(error, context.progress)
         if logger.worlds and context.budget.seconds_left > 0:
             with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
                 logger.let_go(len(EPISODES), context.budget.deadline)
-        worlds = logger.finish()
-        if not logger.resets:
-            raise NotJudged("no episode could be logged")
-        if not worlds:
-            raise NotApplicable("no PyBullet world")
-        yield from find_left_out(instance.env, dict(calls))
-    for world in worlds:
+    if not logger.resets:
+        raise NotJudged("no episode could be logged")
+    if not logger.worlds:
+        raise NotApplicable("no PyBullet world")
+    yield from _left_out_clients(sorted(calls.without_client))
+    for world in logger.worlds:
         yield from _judge(world)
-    if logger.resets < 2:
-        yield Skipped("RL806", "fewer than 2 resets were logged")
+
+
+def _left_out_clients(calls: Sequence[BulletCall]) -> Iterator[Finding]:
+    if calls:
+        count = f"{len(calls)} calls" if len(calls) > 1 else "a call"
+        shown = list_names([f"{each.place} {each.name}" for each in calls], MOST_NAMES)
+        evidence = {"file": calls[0].file, "line": calls[0].line, "places": [each.place for each in calls[:MOST_CALLS]]}
+        yield Finding("RL808", f"{count} of PyBullet without physicsClientId: {shown}", evidence)
+
+
+def _models(calls: BulletCalls) -> Iterator[Message]:
+    if not calls.models:
+        yield Skipped("RL809", "no URDF is loaded", applies=False)
+    faults = [fault for key, model in calls.models.items() for fault in _model_faults(*key, *model)]
+    faults = list(dict.fromkeys(faults))
+    if faults:
+        more = f"; {len(faults) - 1} more links" if len(faults) > 1 else ""
+        yield Finding("RL809", f"{faults[0].rstrip('.')}{more}", {"value": len(faults), "links": faults[:MOST_LINKS]})
+
+
+def _model_faults(client: int, number: int, file: str, flags: int) -> list[str]:
+    from rlctl.task.body import Body
+    from rlctl.task.bullet import pybullet, pybullet_data
+    from rlctl.task.inertia import find_inertia_faults
+
+    path = next((each for each in (Path(file), Path(pybullet_data.getDataPath()) / file) if each.is_file()), None)
+    if path is None:
+        return []
+    try:
+        held = pybullet.getDynamicsInfo(number, -1, physicsClientId=client)[0] == 0
+        body = Body(client, 1, path.stem, number, path, fixed=held)
+    except pybullet.error:  # it was removed since
+        return []
+    body.inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
+    return find_inertia_faults(body)
 
 
 def _judge(world: LoggedWorld) -> Iterator[Message]:
     yield from _gravity(world)
-    yield from _collisions(world)
     explosions = list(_explosion(world))
     yield from explosions
     if explosions:
@@ -86,9 +121,6 @@ def _judge(world: LoggedWorld) -> Iterator[Message]:
         yield from _penetration(world)
         yield from _joint_limits(world)
     yield from _unrest(world)
-    for i in range(len(world.world.bodies)):
-        yield from _friction(world, i)
-        yield from _base_mass(world, i)
 
 
 def _when(place: Place) -> str:
@@ -96,27 +128,10 @@ def _when(place: Place) -> str:
 
 
 def _gravity(world: LoggedWorld) -> Iterator[Finding]:
-    masses = [each.masses for each in world.dynamics[0]]
-    bodies = zip(world.world.bodies, masses, strict=True)
-    heavy = [body.name for body, mass in bodies if body.is_free or (body.joints and sum(mass[1:]) > 0)]
+    heavy = [body.name for body in world.world.bodies if body.is_free or body.has_heavy_links]
     if heavy and not any(world.gravity) and world.weight_matters is not False:
         evidence = {"value": world.gravity, "expected": [0.0, 0.0, -9.81], "bodies": heavy}
         yield Finding("RL801", f"gravity is (0, 0, 0), and {list_names(heavy, MOST_NAMES)} can move", evidence)
-
-
-def _collisions(world: LoggedWorld) -> Iterator[Finding]:
-    bodies = world.world.bodies
-    robots = [(body, touch) for body, touch in zip(bodies, world.touches, strict=True) if body.joints]
-    # One that collides is the robot; what else has joints may be a marker of the goal.
-    if len(robots) == len(bodies) or not all(touch for _, touch in robots):
-        return
-    if any(link.collides for _, touch in robots for link in touch.values()):
-        return
-    for body, touch in robots:
-        shapes = sum(link.has_shape for link in touch.values())
-        why = f"collisions are off for all {shapes} links that have a shape" if shapes else "no link has a shape"
-        evidence = {"body": body.name, "value": 0, "links": len(body.links), "shapes": shapes}
-        yield Finding("RL802", f"{body.name} passes through everything: {why}", evidence)
 
 
 def _penetration(world: LoggedWorld) -> Iterator[Finding]:
@@ -158,7 +173,7 @@ def _joint_limits(world: LoggedWorld) -> Iterator[Finding]:
     worst: dict[str, dict[str, tuple[float, int, Place, float, Joint]]] = {}
     for log in world.logs:
         for i, body in enumerate(log.world.bodies) if log.states else ():
-            found, positions = worst.setdefault(body.name, {}), log.series(i, "joints")[:, 0]
+            found, positions = worst.setdefault(body.name, {}), log.series(i)[:, JOINTS:]
             for j, joint in enumerate(body.joints):
                 outside = _outside(joint, positions[:, j])
                 steps, row = int((outside > 0).sum()), int(outside.argmax())
@@ -189,58 +204,35 @@ def _outside(joint: Joint, values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isfinite(outside) & (outside > allowed), outside / width, 0.0)
 
 
-@dataclasses.dataclass(frozen=True)
-class _TopSpeed:
-    """The highest speed of something that lasted."""
-
-    part: str
-    unit: str
-    speed: float
-    """Infinite where its state has a number that is not finite."""
-    limit: float
-    place: Place
-    value: float | str
-
-    @property
-    def explodes(self) -> bool:
-        """Whether it is beyond what robots do."""
-        if math.isinf(self.speed):
-            return True
-        is_meant = self.unit == "rad/s" and FASTEST_MEANT < self.speed < NONSENSE
-        return self.speed > self.limit and not is_meant and self.place["actions"] != "extreme"
-
-
 def _explosion(world: LoggedWorld) -> Iterator[Finding]:
     """Yield the worst of what is faster than any robot, or is not a number."""
-    speeds = [each for log in world.logs for each in _speeds(log) if each.explodes]
-    speeds.sort(key=lambda each: -each.speed)
-    parts = {(each.part, each.unit) for each in speeds}
-    for each in speeds[:1]:
+    found = [each for log in world.logs if log.states for i in range(len(log.world.bodies)) for each in _fast(log, i)]
+    found.sort(key=lambda each: -each[0])
+    parts = {part for _, part, *_ in found}
+    for _, _, message, evidence in found[:1]:
         more = f", and {len(parts) - 1} more" if len(parts) > 1 else ""  # its consequences
-        if isinstance(each.value, str):
-            message, expected = f"the state of {each.part} is {each.value} {_when(each.place)}", "finite"
-        else:
-            message = f"{each.part} moves at {each.value:.4g} {each.unit} {_when(each.place)}"
-            expected = f"up to {each.limit:g}"
-        yield Finding("RL805", message + more, {**each.place, "value": each.value, "expected": expected})
+        yield Finding("RL805", message + more, evidence)
 
 
-def _speeds(log: Log) -> Iterator[_TopSpeed]:
-    for i, body in enumerate(log.world.bodies) if log.states else ():
-        wrong = np.argwhere(~np.isfinite(log.series(i, "numbers")))
-        if wrong.size:
-            row, column = wrong[0].tolist()
-            value = str(log.states[row][i].numbers[column])
-            yield _TopSpeed(body.name, "", math.inf, 0.0, log.places[row], value)
-            continue
-        linear, angular = (np.linalg.norm(log.series(i, name), axis=1) for name in ("velocity", "angular"))
-        parts = [(body.name, "m/s", FASTEST_BASE, linear), (body.name, "rad/s", FASTEST_JOINT, angular)]
-        for joint, speeds in zip(body.joints, np.abs(log.series(i, "joints")[:, 1]).T, strict=True):
-            unit, limit = ("rad/s", FASTEST_JOINT) if joint.is_angle else ("m/s", FASTEST_SLIDE)
-            parts.append((f"{joint.name} of {body.name}", unit, limit, speeds))
-        for part, unit, limit, speeds in parts:
-            row = int(np.argsort(speeds)[-min(LASTING_STEPS, len(speeds))])
-            yield _TopSpeed(part, unit, float(speeds[row]), limit, log.places[row], float(speeds[row]))
+def _fast(log: Log, i: int) -> Iterator[tuple[float, str, str, Place]]:
+    """Yield what of a body is too fast for several looks: speed, what it is, message, evidence."""
+    body, states = log.world.bodies[i], log.series(i)
+    for row, column in np.argwhere(~np.isfinite(states))[:1].tolist():
+        value, place = str(states[row, column]), log.places[row]
+        message = f"the state of {body.name} is {value} {_when(place)}"
+        yield math.inf, body.name, message, {**place, "value": value, "expected": "finite"}
+        return
+    linear, angular = (np.linalg.norm(states[:, part], axis=1) for part in (VELOCITY, ANGULAR))
+    parts = [(body.name, "m/s", FASTEST_BASE, linear), (body.name, "rad/s", FASTEST_JOINT, angular)]
+    for joint, speeds in zip(body.joints, np.abs(states[:, JOINTS + len(body.joints) :]).T, strict=True):
+        unit, limit = ("rad/s", FASTEST_JOINT) if joint.is_angle else ("m/s", FASTEST_SLIDE)
+        parts.append((f"{joint.name} of {body.name}", unit, limit, speeds))
+    for part, unit, limit, speeds in parts if log.actions != "extreme" else ():
+        row = int(np.argsort(speeds)[-min(LASTING_STEPS, len(speeds))])
+        speed, place = float(speeds[row]), log.places[row]
+        if speed > limit and not (unit == "rad/s" and FASTEST_MEANT < speed < NONSENSE):
+            message = f"{part} moves at {speed:.4g} {unit} {_when(place)}"
+            yield speed, f"{part} {unit}", message, {**place, "value": speed, "expected": f"up to {limit:g}"}
 
 
 def _thrown(world: LoggedWorld) -> dict[str, Jump]:
@@ -260,45 +252,9 @@ def _unrest(world: LoggedWorld) -> Iterator[Finding]:
     for log in world.logs:
         for i, body in enumerate(log.world.bodies) if log.actions == "zero" else ():
             first = next((row for row, touching in enumerate(log.touching) if body.id in touching), 0)
-            heights = np.nan_to_num(log.series(i, "position")[:, 2])
+            heights = np.nan_to_num(log.series(i)[:, POSITION][:, 2])
             height = float(heights[0] - heights[first])
             if body.is_free and height > HIGHEST_DROP and body.name not in thrown:
                 message = f"{body.name} drops {100 * height:.0f} cm after reset before it touches anything"
                 evidence = {**log.places[0], "value": height, "expected": HIGHEST_DROP}
                 yield Finding("RL807", message, evidence, Severity.INFO)
-
-
-def _friction(world: LoggedWorld, i: int) -> Iterator[Finding]:
-    body, touches = world.world.bodies[i], world.touches[i]
-    frictions = np.array([each[i].frictions for each in world.dynamics])
-    changed = [j for j in range(len(body.links)) if _varies(frictions[:, j])]
-    if changed and touches and all(not touches[j - 1].collides for j in changed):
-        names = [body.links[j] for j in changed]
-        low, high = float(frictions[:, changed].min()), float(frictions[:, changed].max())
-        what = f"the friction of {list_names(names, MOST_NAMES)} of {body.name} varies from {low:.3g} to {high:.3g}"
-        evidence = {"body": body.name, "links": names, "value": [low, high]}
-        yield Finding("RL806", f"{what}, and touches nothing", evidence)
-
-
-def _base_mass(world: LoggedWorld, i: int) -> Iterator[Finding]:
-    body, masses = world.world.bodies[i], np.array([each[i].masses for each in world.dynamics])
-    first = masses[0]
-    if world.built is not None and world.built[i].masses[0] == 0 and masses[:, 0].any():
-        mass = float(masses[:, 0].max())
-        message = f"the base of {body.name} was fixed (mass 0) and got a mass of {mass:.3g} kg: it can fall"
-        yield Finding("RL806", message, {"body": body.name, "value": mass, "expected": 0.0})
-        return
-    others = [j for j in range(1, len(first)) if first[j] > 0]
-    if len(others) < FEWEST_LINKS or not all(_varies(masses[:, j]) for j in others) or _varies(masses[:, 0]):
-        return
-    if body.is_free and first[0] > LIGHTEST_BASE * first.sum():
-        yield Finding(
-            "RL806",
-            f"the masses of all {len(others)} links of {body.name} vary, but not that of the base, {first[0]:.3g} kg "
-            f"and {first[0] / first.sum():.0%} of all",
-            {"body": body.name, "link": body.links[0], "value": float(first[0]), "links": len(others)},
-        )
-
-
-def _varies(values: NDArray[np.float64]) -> bool:
-    return bool(np.ptp(values) > SAME * np.abs(values).max())

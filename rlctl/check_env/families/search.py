@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.actions import action_at, zero_action
-from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
+from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
 from rlctl.check_env.recording import Recording
 from rlctl.check_env.rewarded import has_succeeded

@@ -8,11 +8,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rlctl.check_env.clock import read_clock
-from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.finding import Finding, NotJudged, Severity
-from rlctl.check_env.instance import Instance
+from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.messages import Fact, Message
 from rlctl.check_env.own_code import find_own_code, kind_of, rebuilds_world
 from rlctl.check_env.records import Records
@@ -134,7 +133,7 @@ def typical(seconds: Sequence[float], batch: int) -> float | None:
 
 
 @check("RL901", "speed")
-def find_slow_step(records: Records) -> Iterator[Finding]:
+def _find_slow_step(records: Records) -> Iterator[Finding]:
     speed = _require_speed(records)
     if speed.step_s is None:
         raise NotJudged("no step could be timed")
@@ -151,7 +150,7 @@ def find_slow_step(records: Records) -> Iterator[Finding]:
 
 
 @check("RL902", "speed", "episodes")
-def find_slow_reset(records: Records) -> Iterator[Finding]:
+def _find_slow_reset(records: Records) -> Iterator[Finding]:
     speed, step_s, reset_s, steps = _require_times(records)
     left = reset_s * (1 - _share(_explained(records, speed, "reset")))
     if left <= SLOW_RESET_S or left / (left + steps * step_s) <= MOST_RESET:
@@ -168,7 +167,7 @@ def find_slow_reset(records: Records) -> Iterator[Finding]:
 
 
 @check("RL903", "speed")
-def find_drawing_and_waiting(records: Records) -> Iterator[Finding]:
+def _find_drawing_and_waiting(records: Records) -> Iterator[Finding]:
     speed = _require_speed(records)
     for call, seconds in (("step", speed.step_s), ("reset", speed.reset_s)):
         for each in _idle(records, speed, call):
@@ -182,7 +181,7 @@ def find_drawing_and_waiting(records: Records) -> Iterator[Finding]:
 
 
 @check("RL904", "speed", "episodes")
-def find_loading(records: Records) -> Iterator[Finding]:
+def _find_loading(records: Records) -> Iterator[Finding]:
     speed, step_s, reset_s, steps = _require_times(records)
     for call, call_s, part, whole_s in (
         ("reset", reset_s, "an episode", reset_s + steps * step_s),

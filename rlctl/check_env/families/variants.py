@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl import registry
-from rlctl.check_env.context import Context
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
-from rlctl.check_env.instance import Instance
+from rlctl.check_env.instance import Context, Instance
+from rlctl.check_env.leaves import flat_numbers
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
@@ -112,14 +112,9 @@ def _describe(context: Context, spec: EnvSpec) -> EnvInfo:
 
 def _record(context: Context, instance: Instance) -> NDArray[np.float64]:
     episode = Episode(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
-    return np.concatenate([_flatten(moment.observation) for moment in episode])
+    return np.concatenate([flat_numbers(moment.observation) for moment in episode])
 
 
 def _explain(error: EnvironmentRaised) -> str:
     cause = error.__cause__ or error
     return str(cause) if isinstance(cause, RlctlError) else describe(cause)
-
-
-def _flatten(observation: Any) -> NDArray[np.float64]:
-    parts = observation.values() if isinstance(observation, dict) else [observation]
-    return np.concatenate([np.asarray(part, np.float64).ravel() for part in parts])

@@ -43,7 +43,7 @@ def observation_rows(records: Records) -> list[Row]:
 def action_rows(records: Records) -> list[Row]:
     """Return the parts of the action, in order, without the values that were played: a learner plays others."""
     leaves = records.built.action_leaves if records.built else []
-    named = [(leaf_name(leaf).replace("observation", "action"), leaf) for leaf in leaves if leaf.supported]
+    named = [(leaf_name(leaf, "action"), leaf) for leaf in leaves if leaf.supported]
     return [_row(name, leaf, slice(None), []) for name, leaf in named]
 
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 import textwrap
 
 from rlctl import output
-from rlctl.check_env.finding import FAMILIES, RULES, Severity
+from rlctl.check_env.finding import FAMILIES, RULES, Severity, find_rule
 from rlctl.check_env.formats.plain import STYLES
-from rlctl.check_env.selection import find_rule
 
 
 def show_list() -> None:

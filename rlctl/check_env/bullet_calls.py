@@ -1,0 +1,122 @@
+"""Records how an environment calls PyBullet: which calls leave physicsClientId out, and which models are loaded."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import inspect
+import linecache
+import re
+import sys
+import types
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+LIBRARIES = ("gymnasium", "numpy", "torch", "pybullet", "pybullet_utils", "rlctl", "builtins", "stable_baselines3")
+"""Packages that are not part of an environment; rlctl's own tasks are in packages of their own."""
+NO_CLIENT = re.compile(
+    r"connect|error|getAPIVersion|isNumpyEnabled|submitProfileTiming|rotateVector|calculateVelocityQuaternion"
+    r"|(multiply|invert)Transforms?|compute(View|Projection)Matrix\w*|get\w*Quaternion\w*|getEuler\w*|getMatrix\w*"
+)
+"""Functions that are the same for every client: mathematics, and what makes one."""
+FIRST_IS_CLIENT = {
+    "disconnect", "getConnectionInfo", "getNumBodies", "getNumConstraints", "isConnected", "performCollisionDetection",
+    "getKeyboardEvents", "getMouseEvents", "getPhysicsEngineParameters", "removeAllUserDebugItems", "saveState",
+    "stepSimulation",
+}  # fmt: skip
+"""Functions whose only positional argument is the client."""
+CLIENT_WORDS = re.compile(r"client|\bcid\b|_cid\b|server", re.IGNORECASE)
+"""Names of a client that is passed by position."""
+
+
+@dataclasses.dataclass(frozen=True, order=True)
+class BulletCall:
+    """A call of a function of PyBullet in the environment's code."""
+
+    file: str
+    line: int
+    name: str
+
+    @property
+    def place(self) -> str:
+        """`file.py:12`."""
+        return f"{Path(self.file).name}:{self.line}"
+
+
+class BulletCalls:
+    """What was recorded."""
+
+    def __init__(self) -> None:
+        self.without_client: set[BulletCall] = set()
+        self.models: dict[tuple[int, int], tuple[str, int]] = {}
+        """Per client and body that was loaded from a URDF: its file and the flags."""
+        self._known: set[tuple[CodeType, int]] = set()
+
+    def add(self, name: str, value: Any, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
+        """Record a call: what it was given, what it returned, and the frame that made it."""
+        client = int(keywords.get("physicsClientId", 0))
+        if name == "loadURDF":
+            file = str(arguments[0] if arguments else keywords.get("fileName", ""))
+            self.models[client, int(value)] = file, int(keywords.get("flags", 0))
+        elif name == "resetSimulation":
+            self.models = {key: model for key, model in self.models.items() if key[0] != client}
+        where = frame.f_code, frame.f_lasti
+        if "physicsClientId" not in keywords and where not in self._known:
+            self._known.add(where)
+            is_library = str(frame.f_globals.get("__name__", "")).partition(".")[0] in LIBRARIES
+            has_client = bool(arguments) if name in FIRST_IS_CLIENT else CLIENT_WORDS.search(_read_arguments(frame))
+            if not is_library and not has_client:
+                self.without_client.add(BulletCall(frame.f_code.co_filename, frame.f_lineno, name))
+
+
+def _read_arguments(frame: FrameType) -> str:
+    """Return how the arguments of the call that a frame is making are written."""
+    positions = inspect.getframeinfo(frame).positions
+    if positions is None or positions.lineno is None:
+        return ""
+    lines = linecache.getlines(frame.f_code.co_filename)[positions.lineno - 1 : positions.end_lineno]
+    if lines:
+        lines[-1] = lines[-1][: positions.end_col_offset]
+        lines[0] = lines[0][positions.col_offset :]
+    return "".join(lines).partition("(")[2]
+
+
+class _RecordedFunction:
+    """A function of PyBullet whose calls are recorded."""
+
+    def __init__(self, name: str, function: Any, calls: BulletCalls) -> None:
+        self._name, self._function, self._calls = name, function, calls
+
+    @property
+    def __class__(self) -> type:  # BulletClient adds the client to builtins only
+        return types.BuiltinFunctionType
+
+    @__class__.setter
+    def __class__(self, value: type) -> None:
+        raise AttributeError("__class__")
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        value = self._function(*arguments, **keywords)
+        self._calls.add(self._name, value, sys._getframe(1), arguments, keywords)
+        return value
+
+
+@contextlib.contextmanager
+def record_calls() -> Iterator[BulletCalls]:
+    """Record the calls of PyBullet, which is loaded, inside the `with` block."""
+    pybullet = sys.modules["pybullet"]
+    functions = {
+        name: function
+        for name, function in vars(pybullet).items()
+        if inspect.isbuiltin(function) and not NO_CLIENT.fullmatch(name)
+    }
+    calls = BulletCalls()
+    for name, function in functions.items():
+        setattr(pybullet, name, _RecordedFunction(name, function, calls))
+    try:
+        yield calls
+    finally:
+        for name, function in functions.items():
+            setattr(pybullet, name, function)
