@@ -24,6 +24,7 @@ class Quadruped(Legged):
 
     slowest: float = 0.3  # [m/s], of the commanded speeds
     fastest: float = 0.7  # [m/s]
+    tolerance: float = 0.1  # [m/s], by which the mean speed of an episode may differ from the commanded one
     episode_s: float = 10.0  # [s], 500 steps
 
     robot = "Unitree A1"
@@ -125,6 +126,6 @@ class Quadruped(Legged):
         }
 
     def is_success(self) -> bool:
-        """It has walked at 70 % to 130 % of the commanded speed, on average, and is up."""
+        """It has walked at the commanded speed, on average within `tolerance`, and is up."""
         mean_speed = self.trunk.position[0] / max(self.steps * self.control_dt, self.control_dt)
-        return not self.is_fallen() and abs(mean_speed - self.command) <= 0.3 * self.command
+        return not self.is_fallen() and abs(mean_speed - self.command) <= self.tolerance

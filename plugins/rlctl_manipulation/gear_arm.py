@@ -50,6 +50,7 @@ class GearArm(Task):
     stage: Literal["reach", "grasp", "lift"] = "reach"
     goal_range: float = 0.3  # [m], of the goal's x and y around the base
     tolerance: float = NEAR  # [m]
+    start_noise: float = HOME_NOISE  # [rad], of JOINTS, to each side of the home pose
     episode_s: float = 10.0  # [s], 500 steps
 
     robot = "gear arm"
@@ -127,7 +128,7 @@ class GearArm(Task):
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start near the home pose, a goal on the table."""
-        self.arm.set_joints(self.pose(HOME + rng.uniform(-HOME_NOISE, HOME_NOISE, 3), OPEN / 2))
+        self.arm.set_joints(self.pose(HOME + rng.uniform(-self.start_noise, self.start_noise, 3), OPEN / 2))
         self.goal = np.array([*rng.uniform(-self.goal_range, self.goal_range, 2), GOAL_HEIGHT])
         if self.stage != "reach":
             # One side faces the base: the gripper turns with the arm, and not by itself. A box, and let fall, because

@@ -74,7 +74,7 @@ def test_a_collapse_ends_the_episode(env):
 def test_success_is_a_mean_speed(env):
     task = env.task
     task.command, task.steps = 0.5, 100  # 2 s
-    for walked, good in ((0.69, False), (0.71, True), (1.29, True), (1.31, False)):
+    for walked, good in ((0.79, False), (0.81, True), (1.19, True), (1.21, False)):
         task.trunk = task.trunk._replace(position=(walked, 0.0, 0.27))
         assert task.is_success() is good
 
