@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -32,8 +33,8 @@ def evaluate(
     policy: Annotated[
         str | None,
         typer.Option(
-            metavar="zero|random|FUNCTION",
-            help="Play a baseline on a TASK: zero, random, MODULE:FUNCTION or PATH.py:FUNCTION.",
+            metavar="zero|random|FUNCTION|ws://HOST:PORT",
+            help="Play on a TASK: zero, random, MODULE:FUNCTION, PATH.py:FUNCTION, or a policy server.",
             show_default=False,
         ),
     ] = None,
@@ -59,6 +60,12 @@ def evaluate(
     min_return: Annotated[
         float | None,
         typer.Option(metavar="RETURN", help="Gate: exit 1 below this mean return.", show_default=False),
+    ] = None,
+    limits: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Say what these safety limits (YAML) cost, and how often they act.", show_default=False
+        ),
     ] = None,
     vary: Annotated[
         list[str],
@@ -91,10 +98,12 @@ def evaluate(
         deterministic=not stochastic,
         n_envs=n_envs,
         env_timeout_s=env_timeout,
+        limits=limits,
     )
     if vary or push:
-        if policy is not None:
-            raise UsageError("--policy plays a task as it is: leave out --vary and --push")
+        if policy is not None or limits is not None:
+            given = "--limits" if policy is None else "--policy"
+            raise UsageError(f"{given} plays a task as it is: leave out --vary and --push")
         from rlctl.eval.robustness_report import show
         from rlctl.eval.vary import RobustnessRequest, check_gates, measure_robustness
 

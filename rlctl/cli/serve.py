@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli.arguments import Checkpoint, Run, claim_stdout
+from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Run, choose_checkpoint, claim_stdout
 
 
 def serve(
     run: Run = None,
     checkpoint: Checkpoint = "best",
+    pretrained: Pretrained = False,
     host: Annotated[str, typer.Option(help="Address to listen on; others than loopback need a key.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; 0: any that is free.", min=0, max=65535)] = 8000,
     limits: Annotated[
@@ -27,6 +28,12 @@ def serve(
         typer.Option(metavar="FILE", help="Key that clients must send; or RLCTL_API_KEY.", show_default=False),
     ] = None,
     max_clients: Annotated[int, typer.Option(help="Clients that may be connected at once.", min=1)] = 64,
+    self_test: Annotated[
+        bool,
+        typer.Option("--self-test", help="Play the task through the server in simulation, and say how good it is."),
+    ] = False,
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes of the self-test.", min=1)] = 100,
+    json: Json = None,
 ) -> None:
     """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""
     claim_stdout()
@@ -34,15 +41,31 @@ def serve(
     from rlctl.deploy.serve import make_server, run_server
     from rlctl.run.lookup import find_policy
 
-    found = find_policy(run, checkpoint)
+    chosen = choose_checkpoint(checkpoint, pretrained)
+    found = find_policy(run, chosen)
     output.print_notes(found.notes)
     server = make_server(
-        found.file, host=host, port=port, limits=limits, log=log, key_file=key_file, max_clients=max_clients
+        found.file,
+        host=host,
+        port=0 if self_test else port,
+        limits=limits,
+        log=log,
+        key_file=key_file,
+        max_clients=max_clients,
+        watchdog=not self_test,  # a simulation does not keep real time
     )
+    if self_test:
+        from rlctl.eval.evaluate import EvalRequest
+        from rlctl.eval.self_test import run_self_test
+        from rlctl.eval.self_test import show as show_test
+
+        result = run_self_test(server, EvalRequest(run, checkpoint=chosen, episodes=episodes, limits=limits))
+        show_test(result, json)
+        return result.check()
 
     def show(address: str) -> None:
         out = output.out()
         out.print(f"{found.file}: serving at ws://{address}, live page at http://{address}/", markup=False)
         out.file.flush()
 
-    run_server(server, show)
+    return run_server(server, show)

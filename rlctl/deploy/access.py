@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from urllib.parse import urlsplit
 
 from aiohttp import web
+from aiohttp.typedefs import Middleware
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _OPEN = ("/healthz",)
@@ -23,7 +24,7 @@ class Access:
         self._on_refused = on_refused
 
     @property
-    def check(self) -> Callable[[web.Request, Handler], Awaitable[web.StreamResponse]]:
+    def check(self) -> Middleware:
         """The middleware."""
 
         @web.middleware

@@ -108,7 +108,7 @@ class Bounds:
         end = x if self.change is None else x * (np.abs(x) * self._per_square + self._per_step)
         end = end + reference
         inside = np.minimum(np.maximum(end, self._quick_low), self._quick_high)
-        return inside.tobytes() == end.tobytes()
+        return bool(inside.tobytes() == end.tobytes())
 
     def _bound_in_turn(self, x: Array, before: Array, reference: Array | None, report: Report) -> Array:
         """Apply one limit after the other: what is stricter first, what is more important last."""

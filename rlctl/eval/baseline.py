@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.rollout.baselines import BASELINES, load_function
+from rlctl.rollout.baselines import BASELINES, SERVER, load_function
 from rlctl.rollout.workers import Workers
 from rlctl.run.recipe import resolve_packaged
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Baseline:
-    """Zero or random actions, or a user's function; its name is what `rollout.baselines.make_player` takes."""
+    """Zero or random actions, a policy server, or a user's function, by the name that `make_player` takes."""
 
     name: str
     info: None = None
@@ -38,9 +38,21 @@ def load_baseline(request: EvalRequest) -> Baseline:
         )
     if name in BASELINES:
         return Baseline(name)
+    if name.startswith(SERVER):
+        _ask_server(name)
+        return Baseline(name)
     load_function(name)  # here too, so that what is wrong with it is known before environments are built
     place, _, function = name.rpartition(":")
     return Baseline(f"{Path(place).expanduser().resolve()}:{function}" if place.endswith(".py") else name)
+
+
+def _ask_server(address: str) -> None:
+    """Raise `UsageError` if no policy server answers, before environments are built."""
+    try:
+        from rlctl.deploy.client import PolicyClient
+    except ModuleNotFoundError as error:
+        raise UsageError(f"--policy {address} needs {error.name}: pip install 'rlctl[serve]'") from None
+    PolicyClient(address).close()
 
 
 def choose_task(request: EvalRequest) -> EnvSpec:

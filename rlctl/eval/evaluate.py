@@ -42,6 +42,8 @@ class EvalRequest:
     """What to play instead of a trained policy: `zero`, `random`, `module:function` or `file.py:function`."""
     spec: EnvSpec | None = None
     """What the baseline plays in, where it is not what the task's recipe would train."""
+    limits: Path | None = None
+    """Limits that the policy acts within; it is evaluated without them too."""
     measure_actions: bool = False
     """Whether to measure how much actions change, for which episodes are kept in memory."""
 
@@ -68,6 +70,9 @@ class Evaluation:
     """Mean over episodes of each weighted term's sum."""
     final_distance: Spread | None
     max_steps: int | None
+    limited_by: Path | None = None
+    unlimited: Evaluation | None = None
+    """The same episodes without limits."""
     action_change: float | None = None
     """Mean of |action - action before|, over elements and steps; None if it was not measured."""
 
@@ -196,13 +201,28 @@ def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
 
 def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
     with start_workers(spec, request) as workers:
+        limits = None if request.limits is None else _read_limits(request.limits, workers.info)
         actor.give_to(workers)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
         episodes, info = _play(workers, request), workers.info
-    evaluation = _summarize(actor, spec, info, request, episodes)
+        evaluation = _summarize(actor, spec, info, request, episodes)
+        if limits is not None:
+            workers.limit_actions(limits)
+            limited = _summarize(actor, spec, info, request, _play(workers, request))
+            evaluation = dataclasses.replace(limited, limited_by=request.limits, unlimited=evaluation)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
+
+
+def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:
+    """Return limits as plain data; raises `RecipeError` for those that an environment's actions cannot have."""
+    from rlctl.deploy.fitting import fit_limits
+    from rlctl.deploy.limits import read_limits
+
+    limits = read_limits(file)
+    fit_limits(limits, info)
+    return limits.model_dump(mode="json", exclude_unset=True)
 
 
 def _play(workers: Workers, request: EvalRequest) -> list[Episode]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -85,6 +86,36 @@ def show(result: Evaluation, json: str | None) -> None:
     for name, mean in result.terms.items():
         table.add_row(f"term {name}", f"{mean:.4g}")
     out.print(table)
+    if result.unlimited is not None:
+        _show_limits(result, result.unlimited)
+
+
+def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
+    """Print what the limits cost, and how often each stepped in."""
+    from rich.table import Table
+
+    out = output.out()
+    without, now = unlimited.success_rate, result.success_rate
+    success = ""
+    if without is not None and now is not None:
+        success = f"success rate {without:.1%} without them, {now:.1%} with them; "
+    returns = f"return {unlimited.returns.mean:.4g} without them, {result.returns.mean:.4g} with them"
+    out.print(f"limits of {result.limited_by}: {success}{returns}", markup=False)
+    steps = sum(episode.result.length for episode in result.episodes)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("stepped in")
+    table.add_column("per 1,000 steps", justify="right")
+    for name, count in count_interventions(result).most_common():
+        table.add_row(name, f"{1000 * count / steps:.4g}")
+    out.print(table if table.row_count else "they never stepped in")
+
+
+def count_interventions(result: Evaluation) -> collections.Counter[str]:
+    """Return how often each limit stepped in and each fault occurred, over all episodes."""
+    counts: collections.Counter[str] = collections.Counter()
+    for episode in result.episodes:
+        counts.update(episode.result.report.get("interventions", {}))
+    return counts
 
 
 def _show_head(result: Evaluation) -> None:
@@ -130,6 +161,18 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         "length": dataclasses.asdict(result.lengths),
         "terms": result.terms,
         "final_distance": dataclasses.asdict(result.final_distance) if result.final_distance else None,
+        **(
+            {
+                "limits": {
+                    "file": str(result.limited_by),
+                    "success_rate_without": unlimited.success_rate,
+                    "return_without": dataclasses.asdict(unlimited.returns),
+                    "interventions": dict(count_interventions(result)),
+                }
+            }
+            if (unlimited := result.unlimited) is not None
+            else {}
+        ),
         "episodes": [
             {
                 "index": episode.index,

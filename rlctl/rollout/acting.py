@@ -77,6 +77,13 @@ class Player(abc.ABC):
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
         """Return the action that is stored and the one that the environment takes, for a step of an episode, from 0."""
 
+    def explore(self, exploration: Exploration) -> None:  # noqa: B027 (most players cannot)
+        """Differ from the deterministic actions so from now on."""
+
+    def report(self) -> dict[str, Any]:
+        """Return what there is to say of the episode that ended, as plain data."""
+        return {}
+
     def begin_segment(self, seed: int, step: int) -> None:  # noqa: B027 (most players have nothing to do)
         """Begin to play on at a step of an episode."""
 
@@ -106,6 +113,9 @@ class PolicyPlayer(Player):
     @property
     def state(self) -> Array | None:
         return None if self._network.lstm is None else self._network.lstm.state
+
+    def explore(self, exploration: Exploration) -> None:
+        self.exploration = exploration
 
     def begin_segment(self, seed: int, step: int) -> None:
         if self._uses_sde and self.exploration.stochastic:

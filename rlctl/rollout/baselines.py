@@ -24,10 +24,16 @@ from rlctl.errors import (
 from rlctl.rollout.acting import ExportedPlayer, Player, make_generator
 
 BASELINES = ("zero", "random")
+SERVER = ("ws://", "wss://")
+"""How the address of a policy server begins."""
 
 
-def make_player(name: str, space: spaces.Space[Any]) -> Player:
-    """Return what plays `zero`, `random`, an exported file, or a function as `load_function` takes it."""
+def make_player(name: str, space: spaces.Space[Any], observation_space: spaces.Space[Any]) -> Player:
+    """Return what plays `zero`, `random`, an exported file, a server (`ws://`), or a function for `load_function`."""
+    if name.startswith(SERVER):
+        from rlctl.deploy.remote_player import RemotePlayer  # only here: it imports aiohttp
+
+        return RemotePlayer(name, observation_space, space)
     if name == "zero":
         return ZeroPlayer(space)
     if name == "random":

@@ -67,6 +67,14 @@ class LoadPolicy:
 
 
 @dataclasses.dataclass(frozen=True)
+class LimitActions:
+    """Send the actions of the policy that was loaded through a safety filter."""
+
+    limits: dict[str, Any]
+    """A `deploy.Limits`."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Play:
     """Play up to `steps` steps in some environments, one after the other."""
 
@@ -84,10 +92,10 @@ class Play:
     """Per environment the number of the training episode that begins where one ends; empty: none begins."""
 
 
-Message = Build | SetEvents | Attach | Reset | Step | ReplayActions | ComputeRewards | LoadPolicy | Play
+Message = Build | SetEvents | Attach | Reset | Step | ReplayActions | ComputeRewards | LoadPolicy | LimitActions | Play
 _TYPES: dict[str, type[Message]] = {
     each.__name__: each
-    for each in (Build, SetEvents, Attach, Reset, Step, ReplayActions, ComputeRewards, LoadPolicy, Play)
+    for each in (Build, SetEvents, Attach, Reset, Step, ReplayActions, ComputeRewards, LoadPolicy, LimitActions, Play)
 }
 
 

@@ -145,12 +145,19 @@ class Worker:
         """Act with another policy from now on."""
         self._states = None
         if message.info is None:
-            self.player = make_player(message.other, self.action_space)
+            self.player = make_player(message.other, self.action_space, self.space)
         else:
             layout = {name: (tuple(shape), np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self.job.numbers, layout)
             self._states = tensors.pop("state", None)
             self.player = PolicyPlayer(PolicyInfo.model_validate(message.info), tensors)
+
+    def limit_actions(self, message: messages.LimitActions) -> None:
+        """Let the policy act within limits from now on."""
+        from rlctl.deploy.limited_player import LimitedPlayer  # few evaluations need it
+        from rlctl.deploy.limits import Limits
+
+        self.player = LimitedPlayer(self.player, self.info, Limits.model_validate(message.limits))
 
     def store(self, target: dict[str, Any], index: int, episode: _Episode, observation: Any) -> None:
         """Write an observation into row `index` of the arrays of `target`, and check it."""
@@ -224,8 +231,7 @@ class Worker:
     def play(self, message: messages.Play) -> list[dict[str, Any]]:
         """Play a segment in some environments, one after the other; return the episodes that ended."""
         ended: list[dict[str, Any]] = []
-        if isinstance(self.player, PolicyPlayer):
-            self.player.exploration = Exploration(**message.exploration)
+        self.player.explore(Exploration(**message.exploration))
         started = message.episodes_started or [0] * len(message.envs)
         for index, seed, number in zip(message.envs, message.begin, started, strict=True):
             next_seeds = _training_seeds(message.run_seed, index, number)
@@ -274,7 +280,7 @@ class Worker:
             if not (terminated or truncated):
                 self.store(now, row, episode, observation)
                 continue
-            ended.append({**episode.summary(info), "row": row - 1})
+            ended.append({**episode.summary(info), "row": row - 1, "report": player.report()})
             if message.until_end and not message.episodes_started:
                 self.store(now, row, episode, observation)
                 episode.active = False
@@ -406,6 +412,8 @@ def _serve(connection: Connection, job: Job, spec: dict[str, Any]) -> None:
                 worker.attach(message)
             case messages.LoadPolicy():
                 worker.load_policy(message)
+            case messages.LimitActions():
+                worker.limit_actions(message)
             case messages.Reset():
                 worker.reset(message)
         return {}

@@ -57,6 +57,8 @@ class EpisodeResult:
     final_distance: float | None
     row: int = dataclasses.field(default=-1, compare=False)
     """The row of the segment in which it ended."""
+    report: dict[str, Any] = dataclasses.field(default_factory=dict, compare=False)
+    """What the player has to say of it; see `acting.Player.report`."""
 
 
 class Workers:
@@ -250,6 +252,10 @@ class Workers:
         self._wait_until_built()
         self._policy_layout = ()
         self._ask_all(messages.LoadPolicy(other=name), "loading the policy")
+
+    def limit_actions(self, limits: Mapping[str, Any]) -> None:
+        """Send the policy's actions through a safety filter, until another policy is set; `limits` are a `Limits`."""
+        self._ask_all(messages.LimitActions(dict(limits)), "applying limits")
 
     @property
     def recurrent_state(self) -> NDArray[np.float32] | None:
@@ -469,6 +475,7 @@ def _results(answers: Mapping[int, Any]) -> list[EpisodeResult]:
             each["terms"],
             each["final_distance"],
             each.get("row", -1),
+            each.get("report", {}),
         )
         for _, answer in sorted(answers.items())
         for each in answer["ended"]
