@@ -28,6 +28,7 @@ LAYERS = [
     {"plugin_code"},
     {"task"},
     {"output"},
+    {"joints"},
     {"errors", "__init__"},
 ]
 # Beside the order above.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlctl.task import Box, Event, Sim, TaskError, events, rewards
+from rlctl.task import Box, Event, Joints, Sim, TaskError, events, rewards
 from rlctl_locomotion.legged import Legged
 
 MODELS = Path(__file__).parent / "models"
@@ -145,6 +145,10 @@ class Biped(Legged):
     def is_success(self) -> bool:
         """It has walked far enough, or was only asked to stand, and is up."""
         return not self.is_fallen() and (self.least_distance == 0 or self.trunk.position[0] >= self.least_distance)
+
+    def describe_joints(self) -> Joints:
+        """The legs', whose angles are measured from straight legs."""
+        return self.body.describe_joints(JOINTS, default_positions=[0.0] * 4, action_scale=[ANGLE] * 4)
 
 
 @dataclass

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rlctl.task import Event, Sim, Task, events
+from rlctl.task import Event, Joints, Sim, Task, events
 
 TARGET_X, TARGET_Y = 1000.0, 0.0  # [m], world frame: a direction rather than a place
 START_NOISE = 0.1  # [rad]
@@ -161,6 +161,10 @@ class Locomotion(Task):
             "joints": np.minimum(np.maximum(self.joint_states, -OBSERVED), OBSERVED).T,
             "feet_contact": self.last_feet_contact,
         }
+
+    def describe_joints(self) -> Joints:
+        """Those with a motor; actions are torques."""
+        return self.body.describe_joints(list(self.motors))
 
 
 def cut_off(value: float) -> float:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.task import Box, Event, Sim, TaskError, events, rewards
+from rlctl.task import Box, Event, Joints, Sim, TaskError, events, rewards
 from rlctl_locomotion.legged import Legged
 
 LEGS = ("FR", "FL", "RR", "RL")  # front right and so on, as in the model
@@ -129,3 +129,7 @@ class Quadruped(Legged):
         """It has walked at the commanded speed, on average within `tolerance`, and is up."""
         mean_speed = self.trunk.position[0] / max(self.steps * self.control_dt, self.control_dt)
         return not self.is_fallen() and abs(mean_speed - self.command) <= self.tolerance
+
+    def describe_joints(self) -> Joints:
+        """The legs', leg by leg."""
+        return self.body.describe_joints(JOINTS, default_positions=STANCE.tolist(), action_scale=ANGLES.tolist())

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from rlctl.task import Attachment, Box, Event, Sim, Task, TaskError, events, rewards
+from rlctl.task import Attachment, Box, Event, Joints, Sim, Task, TaskError, events, rewards
 
 MODEL = Path(__file__).parent / "models" / "gear_arm.urdf"
 JOINTS = ["turn", "shoulder", "crank"]
@@ -203,6 +203,10 @@ class GearArm(Task):
     def markers(self) -> dict[str, np.ndarray]:
         """The goal."""
         return {"goal": self.goal}
+
+    def describe_joints(self) -> Joints:
+        """The motors', which get torques, and a finger's, which gets a speed."""
+        return self.arm.describe_joints([*MOTORS, FINGERS[0]])
 
 
 def stop_torque(angle: float, low: float, high: float) -> float:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.task import Box, Event, Sim, Task, TaskError, events, rewards
+from rlctl.task import Box, Event, Joints, Sim, Task, TaskError, events, rewards
 
 HOME = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])  # [rad], elbow bent
 SPEED_LIMIT = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
@@ -111,3 +111,7 @@ def check_goals(low: np.ndarray, high: np.ndarray) -> None:
             f"goal_low, goal_high: a corner of the box is {furthest:.2f} m from the shoulder, and the arm gets to "
             f"{ARM_LENGTH:g} m. Use a smaller box."
         )
+
+    def describe_joints(self) -> Joints:
+        """The arm's. Actions are steps from where a joint is, so they have no scale about the home position."""
+        return self.arm.describe_joints(self.arm.joint_names, default_positions=HOME.tolist())

@@ -163,9 +163,12 @@ class _Layout:
             return [f"  {meaning}: {' '.join(str(space).split())}, counted from 0"]
         bounds = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)
         ranges = [f"from {low:.6g} to {high:.6g}" for low, high in bounds]
-        if len(set(ranges)) == 1:
+        joints = self.info.env.joints
+        if joints and len(joints.names) == len(ranges):
+            ranges = [f"{name}, {each}" for name, each in zip(joints.names, ranges, strict=True)]
+        elif len(set(ranges)) == 1:
             return [f"  {meaning}; each {ranges[0]}"]
-        return [f"  {meaning}", *(f"  [{index}] {bound}" for index, bound in enumerate(ranges))]
+        return [f"  {meaning}", *(f"  [{index}] {each}" for index, each in enumerate(ranges))]
 
 
 def _write_header(name: str, info: PolicyInfo, layout: _Layout, members: list[str], prototype: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from gymnasium import spaces
 
+from rlctl.joints import Joints
 from rlctl.run.onnx_file import METADATA_KEY
 from rlctl.run.policy import PolicyInfo
 
@@ -25,12 +26,31 @@ def metadata(info: PolicyInfo) -> dict[str, str]:
         "frame_stack": str(info.spec.frame_stack),
         "action_meaning": env.action_meaning,
         **_format_bounds(info),
+        **_format_joints(info.env.joints),
         "control_dt": "" if env.control_dt is None else f"{env.control_dt!r} s",
         "robot": env.robot,
         "state": "state_h and state_c: zeros when an episode begins" if info.algo == "recurrent_ppo" else "",
         "versions": ", ".join(f"{name} {version}" for name, version in info.versions.items()),
     }
     return {METADATA_KEY: info.model_dump_json(), **{key: value for key, value in plain.items() if value.strip(",")}}
+
+
+def _format_joints(joints: Joints | None) -> dict[str, str]:
+    """Return the keys that the controllers of mjlab and BeyondMimic read, and in that form: values and commas."""
+    if joints is None:
+        return {}
+    numbers = {
+        "default_joint_pos": joints.default_positions,
+        "action_scale": joints.action_scale,
+        "joint_stiffness": joints.stiffness,
+        "joint_damping": joints.damping,
+        "joint_pos_lower": joints.low,
+        "joint_pos_upper": joints.high,
+        "joint_max_velocity": joints.max_speed,
+        "joint_max_effort": joints.max_torque,
+    }
+    names = {"joint_names": ",".join(joints.names)}
+    return names | {key: ",".join(f"{value:.9g}" for value in values) for key, values in numbers.items()}
 
 
 def _format_bounds(info: PolicyInfo) -> dict[str, str]:

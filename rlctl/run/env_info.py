@@ -13,6 +13,7 @@ from gymnasium import spaces
 
 from rlctl.env_spec import LARGEST_SPACE
 from rlctl.errors import ArtifactError, UsageError, short_repr
+from rlctl.joints import Joints
 
 _ONE_HOT = 10
 """How many elements of a Box an alternative of a discrete space counts for."""
@@ -38,6 +39,8 @@ class EnvInfo(pydantic.BaseModel):
     """Whether it can say what a step would have been worth, had another goal been wanted."""
     max_steps: int | None = None
     robot: str = ""
+    joints: Joints | None = None
+    """What the action moves, where the task says so."""
 
     def spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         """Return the observation and the action space."""
@@ -81,6 +84,7 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
             has_success=inner.has_success,
             max_steps=inner.max_steps,
             robot=task.robot,
+            joints=task.describe_joints(),
         )
     return EnvInfo(**common, max_steps=env.spec.max_episode_steps if env.spec else None)
 

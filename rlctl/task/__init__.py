@@ -1,8 +1,9 @@
-"""What a plugin author needs: `Task`, `Sim`, `Body`, `Event`, `TaskError`, reward terms and spaces."""
+"""What a plugin author needs: `Task`, `Sim`, `Body`, `Joints`, `Event`, `TaskError`, reward terms and spaces."""
 
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from rlctl.errors import TaskError
+from rlctl.joints import Joints
 from rlctl.task import events, rewards
 from rlctl.task.body import Body
 from rlctl.task.constraints import Attachment
@@ -17,6 +18,7 @@ __all__ = [
     "Box",
     "Discrete",
     "Event",
+    "Joints",
     "MultiBinary",
     "MultiDiscrete",
     "Sim",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
+from rlctl.joints import Joints
 from rlctl.task.bullet import pybullet
 from rlctl.task.properties import Properties
 
@@ -31,6 +32,8 @@ class Motors(Properties):
     are in [N m], of sliding joints in [N]; speeds in [rad/s], of sliding joints in [m/s].
     """
 
+    joint_low: Array
+    joint_high: Array
     joint_max_force: Array
     joint_max_speed: Array
     _substeps: int
@@ -154,3 +157,28 @@ class Motors(Properties):
         if speed <= 0:
             raise TaskError(f"cap_joint_speed: {speed:g} is not above 0")
         pybullet.changeDynamics(self.id, -1, maxJointVelocity=speed, physicsClientId=self.client)
+
+    def describe_joints(
+        self, joints: Sequence[str], *, default_positions: Sequence[float] = (), action_scale: Sequence[float] = ()
+    ) -> Joints:
+        """Return joints with the limits that the model file has for them, for `Task.describe_joints`.
+
+        A kind of limit that the file leaves out for one of them, 0 or without an end, is left out for all.
+        """
+        chosen = self._find_joints(joints)
+        low, high = self.joint_low[chosen], self.joint_high[chosen]
+        speed, torque = self.joint_max_speed[chosen], self.joint_max_force[chosen]
+        bounded = bool((low < high).all() and np.isfinite([low, high]).all())
+        return Joints(
+            names=[self.joint_names[joint] for joint in chosen],
+            default_positions=default_positions,
+            action_scale=action_scale,
+            low=low.tolist() if bounded else (),
+            high=high.tolist() if bounded else (),
+            max_speed=speed.tolist() if _are_limits(speed) else (),
+            max_torque=torque.tolist() if _are_limits(torque) else (),
+        )
+
+
+def _are_limits(values: Array) -> bool:
+    return bool((values > 0).all() and np.isfinite(values).all())

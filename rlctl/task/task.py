@@ -11,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
+from rlctl.joints import Joints
 from rlctl.task.events import Event
 from rlctl.task.sim import Sim
 
@@ -99,6 +100,13 @@ class Task:
     def markers(self) -> dict[str, NDArray[np.float64]]:
         """Return points worth drawing, such as the goal: name -> world position of shape (3,) [m]. Optional."""
         return {}
+
+    def describe_joints(self) -> Joints | None:
+        """Return the joints that the action moves, in its order, for controllers of the real robot. Optional.
+
+        Asked once, after `build`. Say what the task knows and nothing else; `Body.describe_joints` reads limits.
+        """
+        return None
 
     @classmethod
     def parameters(cls) -> dict[str, dataclasses.Field[Any]]:

@@ -1,0 +1,66 @@
+"""What a task says of its joints reaches policies and exports, and nothing that it does not know does."""
+
+import json
+
+import numpy as np
+import pytest
+
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import TaskError
+from rlctl.export.metadata import metadata
+from rlctl.joints import Joints
+from rlctl.run.env_info import EnvInfo, describe
+from rlctl.run.policy import PolicyInfo
+
+
+def describe_task(task):
+    env = EnvSpec(task).make()
+    try:
+        return describe(env), env.unwrapped
+    finally:
+        env.close()
+
+
+def write_metadata(task):
+    env = describe_task(task)[0]
+    info = PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec(task).__dict__)
+    return metadata(PolicyInfo.model_validate_json(info.model_dump_json()))
+
+
+def test_position_targets_have_the_keys_of_controllers():
+    keys = write_metadata("quadruped")
+    assert keys["joint_names"].split(",")[:3] == ["FR_hip_joint", "FR_upper_joint", "FR_lower_joint"]
+    assert keys["default_joint_pos"].split(",")[:3] == ["0", "0.9", "-1.8"]
+    assert keys["action_scale"].split(",")[:3] == ["0.2", "0.4", "0.4"]
+    assert {len(value.split(",")) for key, value in keys.items() if "joint" in key or key == "action_scale"} == {12}
+    # Bullet's motors remove a part of the error in every step: they have no stiffness in N m/rad.
+    assert not {"joint_stiffness", "joint_damping"} & keys.keys()
+
+
+def test_steps_and_torques_have_no_scale():
+    keys = write_metadata("reach")
+    assert keys["joint_names"].split(",")[0] == "lbr_iiwa_joint_1"
+    assert [float(value) for value in keys["joint_pos_upper"].split(",")[:2]] == pytest.approx(
+        [2.9671, 2.0944], abs=1e-3
+    )
+    assert "action_scale" not in keys
+    assert "default_joint_pos" not in write_metadata("hopper")
+
+
+def test_a_task_without_joints_says_nothing():
+    assert describe_task("kuka-grasp")[0].joints is None
+    assert "joint_names" not in write_metadata("kuka-grasp")
+    assert describe_task("Pendulum-v1")[0].joints is None
+
+
+@pytest.mark.parametrize("task", ["biped", "gear-arm", "ant"])
+def test_joints_are_those_of_the_action(task):
+    env, made = describe_task(task)
+    assert len(env.joints.names) == made.action_space.shape[0]
+    assert EnvInfo.model_validate(json.loads(env.model_dump_json())) == env
+
+
+@pytest.mark.parametrize("values", [[1.0], [1.0, np.inf]])
+def test_values_must_fit_the_names(values):
+    with pytest.raises(TaskError, match="leave out what is not known"):
+        Joints(["hip", "knee"], action_scale=values)
