@@ -100,6 +100,10 @@ class Reach(Task):
         """The goal."""
         return {"goal": self.goal}
 
+    def describe_joints(self) -> Joints:
+        """The arm's. Actions are steps from where a joint is, so they have no scale about the home position."""
+        return self.arm.describe_joints(self.arm.joint_names, default_positions=HOME.tolist())
+
 
 def check_goals(low: np.ndarray, high: np.ndarray) -> None:
     """Raise `TaskError` for a box of goals from `low` to `high` [m] that is empty, under the floor or out of reach."""
@@ -111,7 +115,3 @@ def check_goals(low: np.ndarray, high: np.ndarray) -> None:
             f"goal_low, goal_high: a corner of the box is {furthest:.2f} m from the shoulder, and the arm gets to "
             f"{ARM_LENGTH:g} m. Use a smaller box."
         )
-
-    def describe_joints(self) -> Joints:
-        """The arm's. Actions are steps from where a joint is, so they have no scale about the home position."""
-        return self.arm.describe_joints(self.arm.joint_names, default_positions=HOME.tolist())
