@@ -123,6 +123,7 @@ def test_noisy_return_with_rising_evaluations_has_no_finding(write_training):
         ("Q2", {"success": 0.0, "distance": np.linspace(0.2, 0.9, UPDATES)}, {}),
         ("Q2", {"success": 0.0}, {"episodes": [make_episode(SHAKING, terms=np.eye(100, 2))]}),
         ("Q3", {"return": np.tile([0.0, 90.0, 10.0], 10), "approx_kl": 0.6, "clip_fraction": 0.7}, {}),
+        ("Q3", {"approx_kl": 3.0, "clip_fraction": 0.85, "success": 0.1}, {}),
         ("Q3", {}, {"status": "diverged", "error": "training diverged: loss is not finite at step 900."}),
         ("Q5", {}, {"status": "failed", "error": "task 'arm': Cannot load URDF file arm.urdf"}),
         ("Q7", {}, {"episodes": [make_episode(SHAKING, terms=np.tile([1.0, 0.0], (100, 1)))]}),

@@ -111,6 +111,14 @@ def policy_jumps(run: History) -> str | None:
     return f"approx_kl {median_kl:.2g}, clip fraction {median_clipped:.0%} (medians)"
 
 
+def policy_is_replaced(run: History) -> str | None:
+    """Each update makes another policy of it, and none of them is good."""
+    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
+    if len(kl) < _LEAST_ROWS or _is_good(run) or np.median(kl.values) < 1 or np.median(clipped.values) < 0.7:
+        return None
+    return f"approx_kl {np.median(kl.values):.2g}, clip fraction {np.median(clipped.values):.0%} (medians)"
+
+
 def swings(run: History) -> str | None:
     """The return falls again and again by a large part of its range."""
     curve = run.curve("return") if len(run.curve("return")) >= _LEAST_ROWS else run.evaluation_curve("return")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SIZE = (4.4, 2.7)  # [inches]: the width of a phone, so that text is readable there
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text: smaller, and can be searched
     "font.size": 9,
     "font.family": "sans-serif",
@@ -75,7 +75,7 @@ def plot_robustness(result: RobustnessMap) -> str:
     rows, columns = result.axes
     shape = (len(rows.values), len(columns.values))
     values = np.array([_value(cell, quantity) for cell in result.cells]).reshape(shape)
-    limits = {"vmin": 0, "vmax": 1} if quantity == "success" else {}
+    limits: dict[str, Any] = {"vmin": 0, "vmax": 1} if quantity == "success" else {}
     figure, axes = _make_figure()
     axes.grid(False)
     image = axes.imshow(values, origin="lower", aspect="auto", cmap="viridis", **limits)
