@@ -114,6 +114,13 @@ def test_noisy_return_with_rising_evaluations_has_no_finding(write_training):
     assert diagnose(write_training({"return": noisy}, {"return": [130, 132, 140, 150, 176]})) == []
 
 
+def test_rare_success_at_the_beginning_has_no_finding(write_training):
+    # As of reach-sparse: -1 in every step until the goal is reached, by chance at first.
+    lucky = np.full(UPDATES, -120.0)
+    lucky[2:6] = [-119, -115, -118, -119]
+    assert diagnose(write_training({"return": lucky, "success": None, "explained_variance": None})) == []
+
+
 @pytest.mark.parametrize(
     ("id", "metrics", "more"),
     [

@@ -106,9 +106,9 @@ def _check(text: dict[str, Any], look: Callable[[str], str | None], history: His
         id=text["id"],
         name=text["name"],
         grade=Grade(text["grade"]),
-        evidence=[evidence for name in names if (evidence := look(name)) is not None],
+        evidence=list(dict.fromkeys(evidence for name in names if (evidence := look(name)) is not None)),
         meaning=text["meaning"],
-        advice=list(text["try"]),
+        advice=[history.name_run(each) for each in text["try"]],
         settings=list(_settings(text["settings"], history)),
     )
 

@@ -70,6 +70,10 @@ class History:
         except (RlctlError, OSError):
             return {}
 
+    def name_run(self, text: str) -> str:
+        """Put the run and its task into a command."""
+        return text.replace("RUN", str(self._run.path)).replace("TASK", str(self.status.get("task", "TASK")))
+
     @functools.cached_property
     def recipe(self) -> Mapping[str, Any]:
         try:

@@ -145,14 +145,14 @@ def _count_drops(curve: Curve, least: float) -> int:
 
 
 def collapsed(run: History) -> str | None:
-    """The return rose and has fallen for good, in training and, where there are enough, in evaluations."""
+    """The return rose and has fallen for good, in training and in evaluations."""
     parts = []
     for curve, what, least in (
         (run.curve("return"), "training return", _LEAST_ROWS),
         (run.evaluation_curve("return"), "evaluations", _LEAST_EVALUATIONS),
     ):
-        if len(curve) >= least:
-            if (fall := _find_fall(curve)) is None:
+        if len(curve):
+            if len(curve) < least or (fall := _find_fall(curve)) is None:
                 return None
             parts.append(f"{what} from {fall[0]:.4g} up to {fall[1]:.4g} at step {fall[3]:,.0f}, then {fall[2]:.4g}")
     return "; ".join(parts) or None
@@ -166,7 +166,11 @@ def _find_fall(curve: Curve) -> tuple[float, float, float, float] | None:
     end = float(curve.values[-max(2, window) :].max() if len(curve) < _LEAST_ROWS else curve.values[-window:].mean())
     gained, lost = float(smooth[at] - smooth[0]), float(smooth[at]) - end
     noise = curve.noise() / window**0.5 if len(curve) >= _LEAST_ROWS else 0.0
-    if gained <= 3 * noise or lost <= max(0.5 * gained, 3 * noise) or at + window > 0.85 * len(curve):
+    if (
+        gained <= max(3 * noise, 0.1 * float(np.abs(curve.values).max()))
+        or lost <= max(0.5 * gained, 3 * noise)
+        or at + window > 0.85 * len(curve)
+    ):
         return None
     return float(smooth[0]), float(smooth[at]), end, float(curve.steps[min(at + window - 1, len(curve) - 1)])
 
