@@ -137,6 +137,11 @@ def load(task: str) -> Callable[..., Any]:
         classes = _list_classes(file)
         forms = " or ".join(f"{task}:{name}" for name in classes) or f"{task}:CLASS; it defines no class"
         raise UsageError(f"{task}: name the class in it: {forms}")
+    if Path(task).is_dir():
+        raise UsageError(
+            f"{task} is a folder, not a task: pip install -e {task} installs a plugin; or name a class: "
+            f"{task}/FILE.py:CLASS"
+        )
     names = [entry.name for entry in list_installed()]
     raise UsageError(
         f"no task {task!r}.{did_you_mean(task, names)} Installed: {', '.join(dict.fromkeys(names)) or 'none'}. "

@@ -119,6 +119,12 @@ def test_an_unknown_name_gives_the_closest():
     assert UsageError("").exit_code == 2
 
 
+def test_a_folder_is_named_as_one(my_env, tmp_path):
+    (tmp_path / "my-arm").mkdir()
+    with pytest.raises(UsageError, match=r"^my-arm is a folder, not a task: pip install -e my-arm"):
+        registry.load("my-arm")
+
+
 def test_places_that_are_not_there(my_env, tmp_path):
     assert error(UsageError, "my_env.py:MyEnvs") == (
         "my_env.py has no 'MyEnvs'. Did you mean 'MyEnv'? It defines: MyEnv, NoEnv."
