@@ -18,13 +18,14 @@ def train(
     device: str = "cpu",
     root: str | Path = "runs",
     check: bool = True,
+    initial_policy: str | Path | None = None,
     **recipe: Any,
 ) -> TrainResult:
     """Train as `rlctl train` does, and return the run with what it reached.
 
     Keywords are the keys of a recipe, `docs/recipe.md`: `train("reach", seed=1, algo_kwargs={"gamma": 0.97})`. They go
-    over `config`, a recipe file. Call it from a script's `if __name__ == "__main__":`, which processes may import.
-    Raises what `rlctl.errors` has.
+    over `config`, a recipe file. `initial_policy` is a run, a policy file or a task's name, as `--from` takes it. Call
+    it from a script's `if __name__ == "__main__":`, which processes may import. Raises what `rlctl.errors` has.
     """
     from rlctl.train.request import TrainRequest, run_training
 
@@ -35,6 +36,7 @@ def train(
         device=device,
         root=Path(root),
         check=check,
+        initial_policy=None if initial_policy is None else str(initial_policy),
     )
     return run_training(request)
 

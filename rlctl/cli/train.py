@@ -22,6 +22,16 @@ def train(
             autocompletion=completion.complete_run,
         ),
     ] = None,
+    initial_policy: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="POLICY",
+            help="Begin with a policy: a run, a .safetensors file, or the name of a task that ships one.",
+            show_default=False,
+            autocompletion=completion.complete_run,
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Go on with a run even if its task has changed.")] = False,
     config: Annotated[
         Path | None,
@@ -78,5 +88,6 @@ def train(
         root=output,
         check=not no_check,
         force=force,
+        initial_policy=initial_policy,
     )
     show(run_training(request), json)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
+from typing import Any
 
 from rlctl import output
 from rlctl.run.directory import RunDirectory
@@ -32,6 +33,8 @@ class RunDescription:
     warnings: list[str]
     findings: list[Finding]
     """What its records show."""
+    source: dict[str, Any] | None
+    """The policy that it began with, as `run.json` has it."""
     sizes: dict[str, int]
     """Bytes per file or folder of the run."""
 
@@ -44,6 +47,7 @@ def describe(text: str | None) -> RunDescription:
         metrics=read_table(run.metrics_file),
         evaluations=evaluations(run),
         warnings=_warnings(run),
+        source=source if isinstance(source := run.status().get("from"), dict) else None,
         findings=diagnose(run),
         sizes={entry.name: _bytes(entry) for entry in sorted(run.path.iterdir()) if not entry.name.startswith(".")},
     )
@@ -81,6 +85,8 @@ def show(run: RunDescription, json: str | None) -> None:
     if summary.best_return is not None:
         success = "" if summary.best_success is None else f"success {summary.best_success:.1%}, "
         out.print(f"best evaluation at step {summary.best_step:,}: {success}return {summary.best_return:.4g}")
+    if run.source is not None:
+        out.print(f"began with {run.source.get('policy')}, step {run.source.get('training_steps')}", markup=False)
     for key, value in summary.changes.items():
         out.print(f"differs from the task's recipe: {key} = {value}", markup=False)
     for warning in run.warnings:

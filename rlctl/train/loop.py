@@ -110,6 +110,8 @@ class TrainingLoop(BaseCallback):
         elif self.saver.saved_step is None:
             # The first update may be minutes away: better to know now what cannot be saved.
             self._take_ended()
+            if self.progress.next_eval == 0:
+                self.evaluate()
             self.save_checkpoint()
 
     def boundary(self) -> None:

@@ -34,6 +34,8 @@ class ChunkRollouts(OffPolicyAlgorithm):
     algorithm_name = ""
     overlap = True
     action_noise_scale = 0.0
+    policy_plays_warmup = False
+    """Whether the steps before the first update are played by the policy, which is a trained one, and not at random."""
     steps_to_learn = 0
     """Environment steps that are in the replay buffer and that no update is done for yet."""
 
@@ -70,10 +72,10 @@ class ChunkRollouts(OffPolicyAlgorithm):
         env.start(steps, self._exploration(), until_end=bool(self._episodes_left))
 
     def _exploration(self) -> Exploration:
-        sde_at_warmup = self.use_sde and self.use_sde_at_warmup
+        plays = self.policy_plays_warmup or (self.use_sde and self.use_sde_at_warmup)
         return Exploration(
             stochastic=True,
-            warmup=self.num_timesteps < self.learning_starts and not sde_at_warmup,
+            warmup=self.num_timesteps < self.learning_starts and not plays,
             epsilon=float(getattr(self, "exploration_rate", 0.0)),
             action_noise=self.action_noise_scale,
             sde_every=max(self.sde_sample_freq, 0) if self.use_sde else 0,

@@ -25,6 +25,7 @@ from rlctl.train.precheck import Precheck
 from rlctl.train.process_state import preserve_process_state
 from rlctl.train.resume import Start, check_stop_success, load_start, prepare
 from rlctl.train.signals import StopSignals
+from rlctl.train.warm_start import find_source, load_source
 
 if TYPE_CHECKING:
     from rlctl.train.checkpoint import Checkpoint, Checkpoints
@@ -51,6 +52,8 @@ class TrainRequest:
     """Whether to check the environment first, and to refuse one that has errors."""
     force: bool = False
     """Whether to go on with a run even if its task has changed."""
+    initial_policy: str | None = None
+    """A run, a policy file, or the name of a task that ships a policy: what the training begins with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,12 +100,15 @@ def _new(request: TrainRequest) -> Start:
     stages = constructor.stages if registry.is_task(constructor) else ()
     recipe = resolve(task, request.config, request.settings, stages)
     note = describe_rounding(recipe)
-    return Start(task, recipe, notes=(note,) if note else ())
+    source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
+    return Start(task, recipe, notes=(note,) if note else (), source=source)
 
 
 def _load_start(request: TrainRequest) -> Start:
     if request.config is not None:
         raise UsageError("--resume goes on with the run's own recipe: leave out --config")
+    if request.initial_policy is not None:
+        raise UsageError("--from begins a new run, and --resume goes on with one: give one of the two")
     return load_start(request.resume, request.settings, request.root, force=request.force)
 
 
@@ -199,11 +205,16 @@ def _learner(request: TrainRequest, start: Start, specs: list[EnvSpec], workers:
     recipe = start.recipe
     goal = _goal(specs, workers, request, display)
     check_stop_success(recipe, start.task, _may_succeed(workers))
-    progress = Progress(next_eval=recipe.eval.every_steps or recipe.total_timesteps)
+    # What a training begins with is evaluated: it may be better than all that follows.
+    progress = Progress(next_eval=0 if start.source else recipe.eval.every_steps or recipe.total_timesteps)
     if start.checkpoint is not None:
         progress = start.checkpoint.progress
     env = WorkerVecEnv(workers, recipe.seed)
     model = build_model(recipe, env, request.device)
+    if start.source is not None:
+        vars(model)["policy_plays_warmup"] = True
+        if start.checkpoint is None:
+            display.message(load_source(start.source, model, goal))
     return Learner(model, env, Curriculum(recipe.stages, specs, goal, progress), progress)
 
 
@@ -223,7 +234,7 @@ def _saver(
 
     def write_start() -> None:
         lock.renew()
-        status.write_start(run, start.task, start.recipe, request.device, resumed_at)
+        status.write_start(run, start.task, start.recipe, request.device, resumed_at, start.source)
 
     write_start()
     saver = Saver(run, checkpoints, display.message, write_start)

@@ -32,6 +32,8 @@ class Start:
     checkpoint: Checkpoint | None = None
     notes: tuple[str, ...] = ()
     """Messages for the user, before the first step."""
+    source: Mapping[str, Any] | None = None
+    """The policy that it began with; see `warm_start.find_source`."""
     inexact: tuple[str, ...] = ()
     """Why the run cannot go on as if it had never stopped, as far as is known before it goes on."""
     began: float = dataclasses.field(default_factory=time.monotonic)
@@ -67,7 +69,7 @@ def load_start(word: str | None, settings: Mapping[str, Any], root: Path, *, for
             )
         run.recover()
         found, damage = checkpoint.read_newest(run)
-        start = Start(task, recipe, run, lock, found, _notes(found, damage), tuple(changes))
+        start = Start(task, recipe, run, lock, found, _notes(found, damage), before_status.get("from"), tuple(changes))
         return _reopen(start, before) if settings else start
     except BaseException:
         lock.release()

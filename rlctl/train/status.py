@@ -21,8 +21,13 @@ if TYPE_CHECKING:
 _STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
 
 
-def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resumed_at: int | None) -> None:
-    """Write the recipe, and that a training runs; `resumed_at` is the step it goes on from."""
+def write_start(
+    run: RunDirectory, task: str, recipe: Recipe, device: str, resumed_at: int | None, source: Any = None
+) -> None:
+    """Write the recipe, and that a training runs.
+
+    `resumed_at` is the step it goes on from, `source` what `warm_start.find_source` says of the policy it began with.
+    """
     run.write_recipe(recipe)
     changes: dict[str, Any] = {
         "status": "running",
@@ -44,6 +49,8 @@ def write_start(run: RunDirectory, task: str, recipe: Recipe, device: str, resum
         changes["resumed_at_step"] = resumed_at
     else:
         changes["started"] = _now()
+        if source is not None:
+            changes["from"] = source
         changes["folder"] = os.getcwd()  # what a task's path may be relative to
     run.write_status(changes)
 
