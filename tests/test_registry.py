@@ -170,7 +170,8 @@ def test_parameters_that_are_not_there(my_env):
         "task.gian: my_env.py:MyEnv has no parameter 'gian'. Did you mean 'gain'? It has: gain."
     )
     assert error(RecipeError, "reach", {"tolerence": 0.1}) == (
-        "task.tolerence: Reach has no parameter 'tolerence'. Did you mean 'tolerance'? It has: tolerance."
+        "task.tolerence: Reach has no parameter 'tolerence'. Did you mean 'tolerance'? "
+        "It has: tolerance, goal_low, goal_high, start_noise."
     )
     assert error(RecipeError, "Pendulum-v1", {"gg": 1}).startswith(
         "task.gg: Pendulum-v1 has no parameter 'gg'. Did you mean 'g'?"
