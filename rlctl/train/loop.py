@@ -8,14 +8,12 @@ when to write a checkpoint, which changes nothing: so a run that was resumed is 
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 
-import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from rlctl.errors import ArtifactError, DivergedError, Interrupted, RlctlError, TaskError, UsageError
+from rlctl.errors import ArtifactError, Interrupted, RlctlError, TaskError, UsageError
 from rlctl.eval.statistics import mean_return, success_rate
 from rlctl.rollout.collect import Episode
 from rlctl.run.directory import RunDirectory
@@ -28,13 +26,12 @@ from rlctl.train.display import Display
 from rlctl.train.episodes import EpisodeKeeper
 from rlctl.train.evaluation import Evaluator
 from rlctl.train.findings import FindingReporter
+from rlctl.train.finite import check_finite
 from rlctl.train.pack import pack
 from rlctl.train.progress import Progress
 from rlctl.train.saving import Packed, Saver
 from rlctl.train.vec_env import WorkerVecEnv
 
-# Explained variance, for one, is not a number where rewards are constant, and nothing is wrong.
-_MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", "actor_loss", "critic_loss")
 _OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
 
 
@@ -182,27 +179,10 @@ class TrainingLoop(BaseCallback):
                 f"{self.run_directory.path}: the training is done, but could not be saved: {self.saver.problem}"
             )
 
-    def check_finite(self) -> None:
-        """Raise `DivergedError` if a weight or a loss is not finite."""
-        for name, parameter in self.model.policy.named_parameters():
-            if not bool(torch.isfinite(parameter).all()):
-                raise self._diverged(f"weights {name} are")
-        losses = self.logger.name_to_value
-        for name in _MUST_BE_FINITE:
-            if not math.isfinite(losses.get(f"train/{name}", 0.0)):
-                raise self._diverged(f"{name} is")
-
-    def _diverged(self, what: str) -> DivergedError:
-        return DivergedError(
-            f"training diverged: {what} not finite at step {self.model.num_timesteps:,}. A smaller "
-            "algo_kwargs.learning_rate or a smaller reward helps most often.\n"
-            f"What was saved before is in {self.run_directory.path}"
-        )
-
     def _write_metrics_if_due(self, steps: int, anyway: bool) -> None:
         due = anyway or self.recipe.algo in ON_POLICY or steps >= self.progress.next_row
         if due and steps > self.progress.last_row:
-            self.check_finite()
+            check_finite(self.model, self.run_directory.path)
             self._write_metrics(steps)
             self.progress.last_row = steps
             self.progress.next_row = steps + max(1, self.recipe.total_timesteps // _OFF_POLICY_ROWS)
@@ -313,6 +293,6 @@ class TrainingLoop(BaseCallback):
 
     def save_checkpoint(self, *, at_end: bool = False) -> bool:
         """Write a checkpoint of the present boundary; False, with a warning, if the disk does not take it."""
-        self.check_finite()
+        check_finite(self.model, self.run_directory.path)
         self.progress.seconds = time.monotonic() - self._started
         return self.saver.checkpoint(self._pack, self.progress, at_end=at_end)

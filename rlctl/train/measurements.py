@@ -49,13 +49,16 @@ def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timest
     """Return columns for the environment steps since the last row; log them, and now and then distributions."""
     steps = model.num_timesteps
     play = _read_last_steps(model, env, steps - last_row)
-    row = _columns(play, model)
+    row = {
+        **summarize_play(play, model.action_space, model.logger.name_to_value),
+        "gradient_norm": _gradient_norm(model),
+    }
     for name, value in row.items():
         if value is not None:
             model.logger.record(f"rollout/{name}", value)
     part = max(1, total_timesteps // HISTOGRAMS)
     if play is not None and steps // part > last_row // part:
-        for name, values in _collect_histograms(play, env.workers.info).items():
+        for name, values in collect_histograms(play, env.workers.info).items():
             model.logger.record(name, values)
     return row
 
@@ -97,8 +100,8 @@ def _scale(space: spaces.Space[Any], action: NDArray[Any]) -> NDArray[Any]:
     return action
 
 
-def _columns(play: Play | None, model: BaseAlgorithm) -> dict[str, float | None]:
-    space, log = model.action_space, model.logger.name_to_value
+def summarize_play(play: Play | None, space: spaces.Space[Any], log: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return what can be said of steps with actions of a space; `log` is what SB3 logged of the update."""
     limited = isinstance(space, spaces.Box) and bool(np.isfinite(space.low).all() and np.isfinite(space.high).all())
     actions = None if play is None or not isinstance(space, spaces.Box) else play.action.astype(np.float32)
     return {
@@ -107,7 +110,6 @@ def _columns(play: Play | None, model: BaseAlgorithm) -> dict[str, float | None]
         "action_change": None if actions is None or play is None else _mean_change(actions, play),
         "exploration": _exploration(space, log.get("train/entropy_loss")),
         "value": None if play is None or play.values is None else float(play.values.mean()),
-        "gradient_norm": _gradient_norm(model),
     }
 
 
@@ -147,7 +149,7 @@ def _gradient_norm(model: BaseAlgorithm) -> float | None:
     return float(torch.nn.utils.get_total_norm(gradients)) if gradients else None
 
 
-def _collect_histograms(play: Play, info: EnvInfo) -> dict[str, torch.Tensor]:
+def collect_histograms(play: Play, info: EnvInfo) -> dict[str, torch.Tensor]:
     """Return what TensorBoard draws distributions of: actions, values, and observed angles."""
     found = {"actions": play.action, **_angles(play.observation, info)}
     if play.values is not None:

@@ -288,6 +288,7 @@ def _restore_run(start: Start, run: RunDirectory, checkpoints: Checkpoints, lear
 
 
 def _learn(loop: TrainingLoop) -> None:
+    from rlctl.train.finite import check_finite
     from rlctl.train.loop import TrainingStopped
 
     missing = loop.recipe.total_timesteps - loop.model.num_timesteps
@@ -300,7 +301,7 @@ def _learn(loop: TrainingLoop) -> None:
     except TaskError as error:
         raise loop.explain_fault(error) from None
     except ValueError:
-        loop.check_finite()  # SB3 notices NaN weights by a distribution's complaint
+        check_finite(loop.model, loop.run_directory.path)  # SB3 notices NaN weights by a distribution's complaint
         raise
 
 

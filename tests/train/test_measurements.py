@@ -1,0 +1,57 @@
+"""What rows of metrics say of actions, by hand."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from rlctl.run.env_info import EnvInfo, space_to_json
+from rlctl.train.measurements import Play, collect_histograms, summarize_play
+
+
+def play(actions, done=(), terminated=()):
+    """Make steps of one environment; `done` and `terminated` are numbers of steps."""
+    actions = np.array(actions, np.float64).reshape(1, -1, 1)
+    ended, by_task = (np.isin(np.arange(actions.shape[1]), each).reshape(1, -1) for each in (done, terminated))
+    return Play({"": np.zeros((*actions.shape[:2], 3))}, actions, by_task, ended & ~by_task, None)
+
+
+LINE = spaces.Box(-2.0, 2.0, (1,))
+
+
+def test_actions():
+    row = summarize_play(play([1.0, -1.0, 0.5, 0.5], done=[1]), LINE, {})
+    assert row["action_saturation"] == 0.5  # in half ranges; two of four are at a limit
+    # Changes of 2 and 0; that from -1 to 0.5 is from one episode to the next.
+    assert row["action_change"] == 1.0
+    assert row["terminated"] == 0.0
+    assert row["value"] is None
+
+
+def test_share_of_terminated_episodes():
+    row = summarize_play(play([0.0] * 4, done=[0, 1, 3], terminated=[1]), LINE, {})
+    assert row["terminated"] == pytest.approx(1 / 3)
+    assert summarize_play(play([0.0] * 4), LINE, {})["terminated"] is None
+
+
+def test_exploration_is_the_deviation_that_has_the_entropy():
+    # The entropy of a normal distribution with deviation 0.3 is ln(0.3 sqrt(2 pi e)); the half range is 2.
+    entropy = np.log(0.3 * np.sqrt(2 * np.pi * np.e))
+    assert summarize_play(None, LINE, {"train/entropy_loss": -entropy})["exploration"] == pytest.approx(0.15)
+    # Of four actions, two are as likely as each other: ln 2.
+    row = summarize_play(None, spaces.Discrete(4), {"train/entropy_loss": -np.log(2)})
+    assert row["exploration"] == pytest.approx(0.5)
+    assert summarize_play(None, LINE, {})["exploration"] is None
+
+
+def test_angles_have_histograms_by_name():
+    info = EnvInfo(
+        observation_space=space_to_json(spaces.Box(-9.0, 9.0, (3,))),
+        action_space=space_to_json(LINE),
+        observation_sizes={"joint_positions": 2, "height": 1},
+        observation_units={"joint_positions": "rad", "height": "m"},
+    )
+    found = collect_histograms(play([0.0] * 5), info)
+    assert {name: tuple(values.shape) for name, values in found.items()} == {
+        "histograms/actions": (5,),
+        "histograms/joint_positions": (10,),
+    }
