@@ -19,6 +19,16 @@ from rlctl.check_env.progress import Progress
 from rlctl.errors import RlctlError
 
 _HERE = Path(__file__).parent
+NO_DISPLAY = re.compile(
+    r"cannot connect to x server|could ?n.t connect to display|could not connect to display|no \$DISPLAY|"
+    r"DISPLAY environment variable is missing|no available video device|cannot open display|"
+    r"could not load the qt platform plugin|NoSuchDisplayException|failed to open display",
+    re.IGNORECASE,
+)
+"""What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
+_MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
+_MOST_FILES = 5_000
+"""Files that are looked through for a similar name."""
 
 
 class EnvironmentRaised(Exception):
@@ -57,23 +67,9 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}{place}"
 
 
-NO_DISPLAY = re.compile(
-    r"cannot connect to x server|could ?n.t connect to display|could not connect to display|no \$DISPLAY|"
-    r"DISPLAY environment variable is missing|no available video device|cannot open display|"
-    r"could not load the qt platform plugin|NoSuchDisplayException|failed to open display",
-    re.IGNORECASE,
-)
-"""What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
-
-
 def lost_display(failure: Failure) -> bool:
     """Say whether a process ended for want of a display."""
     return failure.kind == "died" and NO_DISPLAY.search(failure.details or "") is not None
-
-
-_MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
-_MOST_FILES = 5_000
-"""Files that are looked through for a similar name."""
 
 
 def missing_file(error: BaseException | None) -> dict[str, Any] | None:

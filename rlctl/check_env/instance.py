@@ -16,6 +16,10 @@ from rlctl.check_env.messages import Failure
 from rlctl.check_env.progress import Progress
 from rlctl.errors import TaskError
 
+MOST_FAILURES = 3
+"""After so many episodes that raise no other is played for the same purpose."""
+RenderMode = Literal["rgb_array", "ansi"]
+
 
 @dataclasses.dataclass
 class Budget:
@@ -24,10 +28,18 @@ class Budget:
     deadline: float
     """On `read_clock`'s clock [s]."""
     bytes_left: int = 48 * 2**20
+    failures: int = 0
 
     @property
     def seconds_left(self) -> float:
         return self.deadline - read_clock()
+
+    @property
+    def why_spent(self) -> str:
+        """What there is no more of; empty while there is some of everything."""
+        if self.failures >= MOST_FAILURES:
+            return f"{self.failures} of them raised"
+        return "time was over" if self.seconds_left <= 0 else "memory was over" if self.bytes_left <= 0 else ""
 
     def end_within(self, seconds: float) -> float:
         """Return when something that may take so long ends at the latest, on the same clock [s]."""
@@ -80,9 +92,6 @@ class Instance:
     def close(self) -> None:
         """Close the environment."""
         self.call("close", self.env.close)
-
-
-RenderMode = Literal["rgb_array", "ansi"]
 
 
 class Context:

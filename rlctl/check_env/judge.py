@@ -17,6 +17,31 @@ from rlctl.errors import UsageError, did_you_mean
 
 LOADING = ("RL0", "RL216")
 """What is judged even where no instance could be built: loading, and windows that end it."""
+NOISE = tuple(
+    re.compile(pattern)
+    for pattern in (
+        # Positions and velocities have no natural bound; every bundled task would have this finding.
+        r"Box observation space (minimum|maximum) value is -?infinity",
+        # Wrappers are what the user trains on, so they are checked as they are.
+        r"is different from the unwrapped version",
+        r"Not able to test alternative render modes",
+        # RL108 judges this; measurements in rows and columns are no mistake.
+        r"unconventional shape",
+        # RL614 judges this with a tolerance: float rounding, which SB3's checker does not forgive, harms nobody.
+        r"The reward was not computed with `compute_reward",
+        r"computation of reward differs",
+        r"reward == env\.compute_reward",
+    )
+)
+"""Complaints that say nothing about an environment's quality."""
+EXPLAINED = (
+    (re.compile(r"support for the `seed` function is dropped"), {"RL202", "RL210", "RL301", "RL302", "RL308"}),
+    (re.compile(r"precision lowered by casting"), {"RL102", "RL103", "RL106"}),
+)
+"""Complaints that no rule owns, and rules that name the cause of one where they have found something."""
+UNOWNED = {GYMNASIUM: "RL290", SB3: "RL291"}
+"""The rule that owns what no other rule does, per checker."""
+EXPERIMENTS = {GYMNASIUM: "gymnasium checker", SB3: "sb3 checker"}
 
 
 @dataclasses.dataclass
@@ -121,37 +146,6 @@ def _waive(verdict: Verdict, waivers: Mapping[str, str]) -> None:
             raise UsageError(f"rlctl_ignore: {rule} is waived without a reason. Say why this is meant.")
     verdict.waived = [each for each in verdict.findings if each.rule in waivers]
     verdict.findings = [each for each in verdict.findings if each.rule not in waivers]
-
-
-NOISE = tuple(
-    re.compile(pattern)
-    for pattern in (
-        # Positions and velocities have no natural bound; every bundled task would have this finding.
-        r"Box observation space (minimum|maximum) value is -?infinity",
-        # Wrappers are what the user trains on, so they are checked as they are.
-        r"is different from the unwrapped version",
-        r"Not able to test alternative render modes",
-        # RL108 judges this; measurements in rows and columns are no mistake.
-        r"unconventional shape",
-        # RL614 judges this with a tolerance: float rounding, which SB3's checker does not forgive, harms nobody.
-        r"The reward was not computed with `compute_reward",
-        r"computation of reward differs",
-        r"reward == env\.compute_reward",
-    )
-)
-"""Complaints that say nothing about an environment's quality."""
-
-EXPLAINED = (
-    (re.compile(r"support for the `seed` function is dropped"), {"RL202", "RL210", "RL301", "RL302", "RL308"}),
-    (re.compile(r"precision lowered by casting"), {"RL102", "RL103", "RL106"}),
-)
-"""Complaints that no rule owns, and rules that name the cause of one where they have found something."""
-
-UNOWNED = {GYMNASIUM: "RL290", SB3: "RL291"}
-"""The rule that owns what no other rule does, per checker."""
-
-
-EXPERIMENTS = {GYMNASIUM: "gymnasium checker", SB3: "sb3 checker"}
 
 
 def require_checker(records: Records, rule: str) -> None:

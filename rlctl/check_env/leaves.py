@@ -11,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 Path = tuple[str | int, ...]
+NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,9 +83,6 @@ def pick(value: Any, path: Path) -> Any:
     for key in path:
         value = value[key]
     return value
-
-
-NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
 
 
 def flat_action(leaves: list[Leaf], action: Any) -> NDArray[np.float64]:

@@ -118,10 +118,9 @@ class Trajectory:
     def has_ended(self) -> bool:
         return self.ended in ENDS
 
-    @property
-    def place(self) -> dict[str, Any]:
-        """Seed, episode and kind of actions, for a finding's evidence."""
-        return {"seed": self.seed, "episode": self.episode, "actions": self.actions}
+    def at(self, step: int, **more: Any) -> dict[str, Any]:
+        """Return where a step is, and more, as a finding's evidence."""
+        return {"seed": self.seed, "episode": self.episode, "actions": self.actions, "step": step, **more}
 
 
 @dataclasses.dataclass(frozen=True)

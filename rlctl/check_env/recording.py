@@ -56,6 +56,7 @@ class Recording:
         except EnvironmentRaised as error:
             self._ended = "raised"
             self.failure = describe_failure(error, self.episode.instance.progress)
+            self.budget.failures += 1
             return
         self.budget.bytes_left -= self._add(moment)
         self._ended = self.episode.ended or ("memory" if self.budget.bytes_left <= 0 and moment.step else "")

@@ -13,7 +13,9 @@ from rlctl.check_env.messages import (
     Fact,
     Failure,
     Finished,
+    Form,
     Message,
+    Series,
     Skipped,
     Trajectory,
 )
@@ -100,6 +102,14 @@ class Records:
         if not any(each.steps or each.observations for each in found):
             raise NotJudged("no episode was recorded")
         return found
+
+    def forms(self, what: str) -> list[tuple[Trajectory, Form]]:
+        """Return every type that something had in the same episodes."""
+        return [(each, form) for each in self.require_alone() for form in each.forms if form.what == what]
+
+    def series(self, leaf: int) -> list[tuple[Trajectory, Series]]:
+        """Return the values of a leaf of the observation in the same episodes, where there are any."""
+        return [(each, each.observations[leaf]) for each in self.require_alone() if leaf in each.observations]
 
     def require_role(self, role: str) -> Trajectory:
         """Return the episode of a comparison; raises `NotJudged` if there is none."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +23,11 @@ ENOUGH_STEPS = 50
 def require_readable(records: Records) -> list[Trajectory]:
     """Return the episodes of a step at least, if flags and infos can be read; raises `NotJudged` otherwise."""
     records.require_built()
-    episodes = [each for each in records.require_alone() if each.steps]
-    if any(form.what == "step" for each in episodes for form in each.forms):
+    if records.forms("step"):
         raise NotJudged("step does not return five values (RL201)")
-    if any(form.what == "info" and form.type != "dict" for each in episodes for form in each.forms):
+    if any(form.type != "dict" for _, form in records.forms("info")):
         raise NotJudged("info is not a dict (RL204)")
-    return _require_enough(episodes)
+    return _require_enough([each for each in records.require_alone() if each.steps])
 
 
 def require_rewarded(records: Records) -> list[Trajectory]:
@@ -121,8 +120,3 @@ def summarize(episodes: Sequence[Trajectory]) -> str:
     kinds = list(dict.fromkeys(each.actions for each in episodes))
     kinds_text = " and ".join([", ".join(kinds[:-1]), kinds[-1]]) if len(kinds) > 1 else kinds[0]
     return f"{len(episodes)} episodes with {kinds_text} actions ({sum(each.steps for each in episodes):,} steps)"
-
-
-def at_step(episode: Trajectory, step: int, **more: object) -> Mapping[str, object]:
-    """Return a step of an episode, for a finding's evidence."""
-    return {**episode.place, "step": step, **more}

@@ -32,6 +32,9 @@ WATCHED_STEPS = 30
 FEWEST_SEEDS = 4
 LATE = 20
 """What an unfinished episode changes only after so many steps is a residue, not the episode's start [steps]."""
+NEARLY = 1e-5
+"""Up to this a first difference is a numerical residue, such as a simulation's that was not reset in full; chaos may
+make it large later. Relative to the larger value or to 1; it is also what Gymnasium's checker tolerates."""
 
 
 @experiment("comparisons", share=6.0)
@@ -190,11 +193,6 @@ def _generator_states() -> dict[str, Any]:
     if "torch" in sys.modules:
         states["torch"] = sys.modules["torch"].random.get_rng_state().numpy().tobytes()
     return states
-
-
-NEARLY = 1e-5
-"""Up to this a first difference is a numerical residue, such as a simulation's that was not reset in full; chaos may
-make it large later. Relative to the larger value or to 1; it is also what Gymnasium's checker tolerates."""
 
 
 @dataclasses.dataclass(frozen=True)

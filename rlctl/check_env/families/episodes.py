@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -26,7 +26,6 @@ ENDLESS_STEPS = 10_000
 """After so many steps an episode without an end is cut."""
 LATER_ENDLESS_STEPS = 1_000
 """The same, once every kind of action was tried."""
-MOST_FAILURES = 3
 LONGEST_EPISODE = 2_000
 """An episode that does not end within so many random steps is left [steps]."""
 STEPS_AFTER = 5
@@ -49,20 +48,16 @@ ENOUGH_STEPS = 1_000
 def record_episodes(context: Context) -> Iterator[Message]:
     """Play whole episodes with actions of every kind."""
     instance, budget = context.instance, context.budget
-    failures = cut = 0
+    cut = 0
     for number, kind in enumerate(EPISODES):
-        if budget.seconds_left < 0 or budget.bytes_left < 0:
-            what = "time" if budget.seconds_left < 0 else "memory"
-            raise NotJudged(f"{number} of {len(EPISODES)} episodes were played in the {what} there is")
+        if budget.why_spent:
+            raise NotJudged(f"{number} of {len(EPISODES)} episodes were played: {budget.why_spent}")
         longest = LATER_ENDLESS_STEPS if number >= 3 and cut else ENDLESS_STEPS
         deadline = budget.end_within(budget.seconds_left / 2)
         episode = Episode(instance, FIRST_SEED + number, kind, number=number, max_steps=longest, deadline=deadline)
         recording = Recording("episodes", episode, budget)
         yield from recording.run()
         cut += recording.was_cut
-        failures += recording.failure is not None
-        if failures >= MOST_FAILURES:
-            raise NotJudged(f"stopped after {MOST_FAILURES} episodes that raised")
 
 
 def _require_episodes(records: Records) -> list[Trajectory]:
@@ -73,15 +68,15 @@ def _require_episodes(records: Records) -> list[Trajectory]:
     return episodes
 
 
-def _require_two_flags(episodes: Sequence[Trajectory]) -> None:
-    if any(form.what == "step" for each in episodes for form in each.forms):
+def _require_two_flags(records: Records) -> None:
+    if records.forms("step"):
         raise NotJudged("step returns one flag for both (RL201)")
 
 
 @check("RL501", "episodes", "search")
 def _find_time_limit_as_terminated(records: Records) -> Iterator[Finding]:
     episodes = _require_episodes(records)
-    _require_two_flags(episodes)
+    _require_two_flags(records)
     if any(each.ended in ("truncated", "both") for each in episodes):
         return
     ended = [each for each in episodes if each.ended == "terminated"]
@@ -117,8 +112,7 @@ def _find_both_flags(records: Records) -> Iterator[Finding]:
     both = [each for each in episodes if each.ended == "both"]
     if len(both) >= 2 and not any(each.ended == "truncated" for each in episodes):
         message = f"{len(both)} episodes end with terminated=True and truncated=True, none with truncated alone"
-        evidence = {**both[0].place, "step": both[0].steps, "value": len(both), "expected": 0}
-        yield Finding("RL502", message, evidence)
+        yield Finding("RL502", message, both[0].at(both[0].steps, value=len(both), expected=0))
 
 
 @check("RL503", "episodes")
@@ -156,7 +150,7 @@ def _find_no_time_limit(records: Records) -> Iterator[Finding]:
     is_continuous = any(leaf.kind == "Box" for leaf in built.leaves)
     if len(set(lengths)) == 1 or (max(lengths) < SHORTEST_TIE and not is_continuous):
         return  # a bandit, or a game of a few moves
-    _require_two_flags(episodes)
+    _require_two_flags(records)
     if list(_find_time_limit_as_terminated.run(records)):
         raise NotJudged("a time limit seems to be flagged as terminated (RL501)")
     truncation = records.require_fact("truncation", "attributes")

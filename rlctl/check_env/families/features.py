@@ -27,15 +27,32 @@ APART = 1_000.0
 """Ratio of scales from which the smaller elements are invisible to a network of usual initial weights."""
 STILL = 1e-6
 """Relative to its size: an element that varies less is noise of the simulation."""
+_Steps = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+"""Of n steps: the seed and the number in its episode of each, its features (observation before, observation after,
+action; shape (n, elements)), and its reward."""
+NEAR, NEAR_ACTION = 0.05, 0.25
+"""Two steps are alike where each number of both observations is as near as this, and each of the actions (much of which
+the observations show already), in units of its standard deviation over everything that was recorded."""
+MOST_STEPS = 2_000
+"""Steps that are compared, each with each."""
+MOST_PAIRS = 20_000
+FEWEST_PAIRS = 30
+FEWEST_ALIKE_SEEDS = 4
+"""Seeds among which alike steps are found: with fewer it may be something special of one episode."""
+LARGE_PART = 0.25
+"""How different the rewards of alike steps of different episodes have to be, against those of all steps (standard
+deviation): half of the pairs at least."""
+TIMES = 10.0
+"""How much larger that has to be than between alike steps of one episode, where a goal is the same but noise is not."""
 
 
 def _rows(records: Records, index: int) -> Numbers:
     """Return the observations of one leaf, flat. Shape (n, elements)."""
-    episodes = [each for each in records.require_alone() if index in each.observations]
-    if not episodes:
+    recorded = records.series(index)
+    if not recorded:
         raise NotJudged("no observation of the declared shape was recorded")
-    rows = np.concatenate([each.observations[index].values for each in episodes])
-    seeds = len({each.seed for each in episodes})
+    rows = np.concatenate([series.values for _, series in recorded])
+    seeds = len({trajectory.seed for trajectory, _ in recorded})
     if len(rows) < FEWEST_ROWS or seeds < FEWEST_SEEDS:
         raise NotJudged(f"only {len(rows)} observations with {seeds} seeds were recorded")
     return rows.reshape(len(rows), -1)
@@ -108,26 +125,6 @@ def _find_unequal_scales(records: Records) -> Iterator[Finding]:
             {"value": ratio, "expected": f"up to {APART:g}", "elements": names},
             Severity.INFO if normalizes is None else Severity.WARNING,
         )
-
-
-_Steps = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
-"""Of n steps: the seed and the number in its episode of each, its features (observation before, observation after,
-action; shape (n, elements)), and its reward."""
-
-NEAR, NEAR_ACTION = 0.05, 0.25
-"""Two steps are alike where each number of both observations is as near as this, and each of the actions (much of which
-the observations show already), in units of its standard deviation over everything that was recorded."""
-MOST_STEPS = 2_000
-"""Steps that are compared, each with each."""
-MOST_PAIRS = 20_000
-FEWEST_PAIRS = 30
-FEWEST_ALIKE_SEEDS = 4
-"""Seeds among which alike steps are found: with fewer it may be something special of one episode."""
-LARGE_PART = 0.25
-"""How different the rewards of alike steps of different episodes have to be, against those of all steps (standard
-deviation): half of the pairs at least."""
-TIMES = 10.0
-"""How much larger that has to be than between alike steps of one episode, where a goal is the same but noise is not."""
 
 
 @check("RL114", *WITH_SEARCH)

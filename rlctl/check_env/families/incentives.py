@@ -20,7 +20,6 @@ from rlctl.check_env.rewarded import (
     DISCOUNT,
     SUCCESS,
     WITH_SEARCH,
-    at_step,
     constant_terms,
     discounted_steps,
     discounted_sum,
@@ -52,6 +51,19 @@ COMPARED_STEPS = 200
 """How much of the episodes is compared at most: the search's are no longer."""
 SHORTEST_COMPARED = 10
 MOST_OF = 0.5
+STARTS = 30
+START_STEPS = 3
+"""More than one, to tell what belongs to the episode from chance in each step."""
+FIRST = FIRST_SEED + 100
+"""The first of their seeds; none of the whole episodes has them."""
+MANY_AT_START = 0.2
+"""Part of the starts that may be successes by chance: a goal that is drawn near the robot now and then."""
+FEWEST_STARTS = 10
+FEWEST_EPISODES = 20
+"""Fewer episodes say little about whether one can succeed."""
+FEWEST_STEPS = 500
+"""Steps of them: less is what raises, or ends, at once."""
+OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
 
 
 @check("RL604", *WITH_SEARCH)
@@ -80,7 +92,7 @@ def _find_paid_ends(records: Records) -> Iterator[Finding]:
         f"but the last is above 0, so ending at step {example.steps} with {last:.3g} saves "
         f"{-DISCOUNT * discounted_steps(mean, longest - example.steps):.3g} (discounted by {DISCOUNT} up to step "
         f"{longest})",
-        at_step(example, example.steps, value=last, mean_reward=mean, gain=gain),
+        example.at(example.steps, value=last, mean_reward=mean, gain=gain),
         severity,
     )
 
@@ -135,7 +147,7 @@ def _find_paid_hovering(records: Records) -> Iterator[Finding]:
             f"finishing at step {best.finished.steps} earns {best.finishing:.4g} from step {step} on; stopping "
             f"there instead earns {best.per_step:.3g} per step, {best.hovering:.4g} in all (discounted by {DISCOUNT} "
             f"up to step {longest})",
-            at_step(best.finished, step, value=best.hovering, expected=expected, per_step=best.per_step),
+            best.finished.at(step, value=best.hovering, expected=expected, per_step=best.per_step),
         )
 
 
@@ -190,7 +202,7 @@ def _find_paid_idleness(records: Records) -> Iterator[Finding]:
         "RL606",
         f"doing nothing earns {mean:.4g} over {steps} steps (discounted by {DISCOUNT}), the best of "
         f"{len(something)} other episodes {best:.4g}{because}",
-        at_step(idle[0], steps, value=mean, best=best, term=bonus, share=share),
+        idle[0].at(steps, value=mean, best=best, term=bonus, share=share),
         Severity.WARNING if bonus else Severity.INFO,
     )
 
@@ -206,34 +218,15 @@ def _bonus(idle: Sequence[Trajectory]) -> tuple[str | None, float]:
     return (largest, shares[largest]) if largest is not None and shares[largest] >= MOST_OF else (None, 0.0)
 
 
-STARTS = 30
-START_STEPS = 3
-"""More than one, to tell what belongs to the episode from chance in each step."""
-FIRST = FIRST_SEED + 100
-"""The first of their seeds; none of the whole episodes has them."""
-MAX_FAILURES = 3
-MANY_AT_START = 0.2
-"""Part of the starts that may be successes by chance: a goal that is drawn near the robot now and then."""
-FEWEST_STARTS = 10
-FEWEST_EPISODES = 20
-"""Fewer episodes say little about whether one can succeed."""
-FEWEST_STEPS = 500
-"""Steps of them: less is what raises, or ends, at once."""
-OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
-
-
 @experiment("starts", share=1.0)
 def record_starts(context: Context) -> Iterator[Message]:
     """Reset with many seeds, and take the same few steps with the zero action after each."""
-    failures = 0
     for number in range(STARTS):
-        if context.budget.seconds_left < 0 or context.budget.bytes_left < 0 or failures >= MAX_FAILURES:
-            yield Skipped("starts", f"only {number} of {STARTS} starts could be made")
+        if context.budget.why_spent:
+            yield Skipped("starts", f"only {number} of {STARTS} starts were made: {context.budget.why_spent}")
             return
         episode = Episode(context.instance, FIRST + number, "zero", number=number, max_steps=START_STEPS)
-        recording = Recording("starts", episode, context.budget)
-        yield from recording.run()
-        failures += recording.failure is not None
+        yield from Recording("starts", episode, context.budget).run()
 
 
 @check("RL609", *WITH_SEARCH)
@@ -261,7 +254,7 @@ def _find_success_at_start(records: Records) -> Iterator[Finding]:
     share = len(at_once) / len(starts)
     if share > MANY_AT_START:
         message = f"{len(at_once)} of {len(starts)} episodes are a success after one step with the zero action"
-        yield Finding("RL610", message, at_step(at_once[0], 1, value=share, expected=f"up to {MANY_AT_START}"))
+        yield Finding("RL610", message, at_once[0].at(1, value=share, expected=f"up to {MANY_AT_START}"))
 
 
 @check("RL611", *WITH_SEARCH)
@@ -281,5 +274,5 @@ def _find_no_success(records: Records) -> Iterator[Finding]:
     yield Finding(
         "RL611",
         f"is_success was not true once in {summarize(episodes)}; the best reward was {reward:.4g}, at step {step + 1}",
-        at_step(best, step + 1, value=reward, episodes=len(episodes)),
+        best.at(step + 1, value=reward, episodes=len(episodes)),
     )

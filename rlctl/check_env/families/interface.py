@@ -51,18 +51,16 @@ def _find_wrong_types(records: Records) -> Iterator[Finding]:
 def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[Trajectory, Form]]:
     """Yield the first place of each type of something, without those that are fine."""
     types = set(fine)
-    for trajectory in records.require_alone():
-        for form in trajectory.forms:
-            if form.what == what and form.type not in types:
-                types.add(form.type)
-                yield trajectory, form
+    for trajectory, form in records.forms(what):
+        if form.type not in types:
+            types.add(form.type)
+            yield trajectory, form
 
 
 def _of_form(
     rule: str, message: str, trajectory: Trajectory, form: Form, expected: str, severity: Severity | None = None
 ) -> Finding:
-    evidence = {**trajectory.place, "step": form.step, "type": form.type, "expected": expected}
-    return Finding(rule, message, evidence, severity)
+    return Finding(rule, message, trajectory.at(form.step, type=form.type, expected=expected), severity)
 
 
 def _a(type_name: str) -> str:

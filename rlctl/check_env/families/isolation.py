@@ -24,6 +24,26 @@ from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 
 IN_TURNS, AFTER_CLOSE = "two instances stepped in turns", "after another instance was closed"
+MOST_RESETS = 100
+WARM_UP = 10
+"""Resets after which caches and allocators are filled; memory is measured from there on."""
+TRIAL_RESETS = 3
+"""So many are timed to see how many there is time for."""
+MARGIN = 0.7
+"""The part of the time that is planned with, since a leak makes resets slower."""
+FEWEST_RESETS = 8
+"""With fewer, growth cannot be distinguished from a slow start."""
+SETTLING_RESETS = 2
+"""The first resets load what later ones keep."""
+LEAST_GROWTH = 3
+"""In each half of the resets, so that one late object is not a leak."""
+FEWEST_RESETS_FOR_MEMORY = 30
+MEMORY_GROWTH = 8 * 2**20
+"""Over the resets after the warm-up [bytes]. Allocators of clean environments move by 1 to 2 MiB; 0.1 MB per reset
+fills the memory of 16 workers in a day."""
+LATER_SHARE = 0.4
+"""Of the growth, so much must be in the second half: what fills once slows down, a leak does not."""
+_PROCESS = Path("/proc/self")
 
 
 @experiment("instances", share=10.0)
@@ -141,28 +161,6 @@ def _find_single_instance(records: Records) -> Iterator[Finding]:
             where = "in one process" if failure.phase in ("fresh instance", "interleaved") else "in a second process"
             yield Finding("RL403", f"a second instance {where} cannot be built: {failure.error}", failure.place)
             return
-
-
-MOST_RESETS = 100
-WARM_UP = 10
-"""Resets after which caches and allocators are filled; memory is measured from there on."""
-TRIAL_RESETS = 3
-"""So many are timed to see how many there is time for."""
-MARGIN = 0.7
-"""The part of the time that is planned with, since a leak makes resets slower."""
-FEWEST_RESETS = 8
-"""With fewer, growth cannot be distinguished from a slow start."""
-SETTLING_RESETS = 2
-"""The first resets load what later ones keep."""
-LEAST_GROWTH = 3
-"""In each half of the resets, so that one late object is not a leak."""
-FEWEST_RESETS_FOR_MEMORY = 30
-MEMORY_GROWTH = 8 * 2**20
-"""Over the resets after the warm-up [bytes]. Allocators of clean environments move by 1 to 2 MiB; 0.1 MB per reset
-fills the memory of 16 workers in a day."""
-LATER_SHARE = 0.4
-"""Of the growth, so much must be in the second half: what fills once slows down, a leak does not."""
-_PROCESS = Path("/proc/self")
 
 
 @dataclasses.dataclass

@@ -23,6 +23,8 @@ OLD_KEYS = {
     "video.frames_per_second": "render_fps",
     "video.frames_per_sec": "render_fps",
 }
+WAIVERS = "rlctl_ignore"
+"""The class attribute that waives rules: rule id -> reason."""
 
 
 @experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL009", share=0.0)
@@ -125,10 +127,6 @@ def _not_found(call: str, file: Mapping[str, Any], details: str | None) -> Findi
     similar = f"; there is {file['similar']}" if file["similar"] else ""
     evidence = {**file, "traceback": details} if details else dict(file)
     return Finding("RL007", f"{call} does not find {file['file']!r}{where}{similar}", evidence)
-
-
-WAIVERS = "rlctl_ignore"
-"""The class attribute that waives rules: rule id -> reason."""
 
 
 def describe_built(instance: Instance) -> Built:

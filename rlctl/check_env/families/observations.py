@@ -19,28 +19,17 @@ ROUNDING = 1e-6
 LARGE_SHARE, SMALL_SHARE = 0.1, 0.005
 """Part of all observations from which values outside the bounds are no rare extreme, or below which they hardly matter.
 The last one of an episode does not count: a limit that ends it has just been passed."""
+COLOURS = (3, 4)
+SMALLEST_SIDE = 36
+"""An image with a shorter side does not fit through the default network's filters [pixels]."""
 
 
 def _forms(records: Records) -> Iterator[tuple[Leaf, list[tuple[Trajectory, Form]]]]:
     """Yield what each leaf that can be judged looked like, in all episodes."""
+    forms = records.forms("observation")
     for index, leaf in enumerate(records.require_built().leaves):
         if leaf.supported:
-            yield (
-                leaf,
-                [
-                    (trajectory, form)
-                    for trajectory in records.require_alone()
-                    for form in trajectory.forms
-                    if form.what == "observation" and form.leaf == index
-                ],
-            )
-
-
-def _series(records: Records, index: int) -> Iterator[tuple[Trajectory, Series]]:
-    """Yield the values of a leaf, per episode."""
-    for trajectory in records.require_alone():
-        if index in trajectory.observations:
-            yield trajectory, trajectory.observations[index]
+            yield leaf, [pair for pair in forms if pair[1].leaf == index]
 
 
 def _when(step: int) -> str:
@@ -55,15 +44,12 @@ def find_wrong_shape(records: Records) -> Iterator[Finding]:
             if what := _wrong_shape(leaf, form):
                 shape = None if form.shape is None else list(form.shape)
                 message = f"{leaf_name(leaf)} {_when(form.step)} {what}"
-                evidence = {**trajectory.place, "step": form.step, "type": form.type, "shape": shape}
-                yield Finding("RL101", message, {**evidence, "expected": list(leaf.shape)})
+                evidence = trajectory.at(form.step, type=form.type, shape=shape, expected=list(leaf.shape))
+                yield Finding("RL101", message, evidence)
                 break
-    for trajectory in records.require_alone():
-        for form in trajectory.forms:
-            if form.what == "keys":
-                message = f"observation has the keys {form.type}; the space has other ones"
-                yield Finding("RL101", message, {**trajectory.place, "step": form.step})
-                return
+    for trajectory, form in records.forms("keys")[:1]:
+        message = f"observation has the keys {form.type}; the space has other ones"
+        yield Finding("RL101", message, trajectory.at(form.step))
 
 
 def _wrong_shape(leaf: Leaf, form: Form) -> str:
@@ -88,7 +74,7 @@ def _find_wrong_dtype(records: Records) -> Iterator[Finding]:
         more = f"; {parts - 1} other parts differ too" if parts > 1 else ""
         message = f"{leaf_name(leaf)} {_when(form.step)} is {form.dtype}; the space is {leaf.dtype}{more}"
         is_number = np.dtype(form.dtype).kind in "biuf"
-        evidence = {**trajectory.place, "step": form.step, "dtype": form.dtype, "expected": leaf.dtype}
+        evidence = trajectory.at(form.step, dtype=form.dtype, expected=leaf.dtype)
         yield Finding("RL102", message, evidence, Severity.WARNING if is_number else Severity.ERROR)
 
 
@@ -110,7 +96,7 @@ def find_out_of_range(records: Records) -> Iterator[Finding]:
         worst: tuple[float, Trajectory, Series, int, int] | None = None
         outside = inner = total = 0
         from_reset = False
-        for trajectory, series in _series(records, index):
+        for trajectory, series in records.series(index):
             excess = _excess(leaf, series.values).reshape(len(series.values), -1)
             rows = excess.max(axis=1, initial=0.0)
             is_last = (series.steps == trajectory.steps) & trajectory.has_ended
@@ -158,15 +144,14 @@ def _out_of_range(
         "RL103",
         f"{element} is {value:.9g} {_when(step)}; the space allows [{low:.9g}, {high:.9g}]"
         f"{' (float rounding)' if is_rounding else ''}; {outside[0]} of {outside[1]} observations are outside",
-        {
-            **trajectory.place,
-            "step": step,
-            "element": element,
-            "value": value,
-            "expected": [low, high],
-            "observations_outside": outside[0],
-            "observations": outside[1],
-        },
+        trajectory.at(
+            step,
+            element=element,
+            value=value,
+            expected=[low, high],
+            observations_outside=outside[0],
+            observations=outside[1],
+        ),
         Severity.WARNING if is_rounding else severity,
     )
 
@@ -176,32 +161,23 @@ def find_not_finite(records: Records) -> Iterator[Finding]:
     """Find the first NaN or infinity, per leaf."""
     built = records.require_built()
     for index, _ in enumerate(built.leaves):
-        for trajectory, series in _series(records, index):
+        for trajectory, series in records.series(index):
             if series.values.dtype.kind != "f" or np.isfinite(series.values).all():
                 continue
             values = series.values.reshape(len(series.values), -1)
             row, flat = np.argwhere(~np.isfinite(values))[0].tolist()
             step, element, value = int(series.steps[row]), built.element(index, flat), str(values[row, flat])
-            evidence = {**trajectory.place, "step": step, "element": element, "value": value, "expected": "finite"}
+            evidence = trajectory.at(step, element=element, value=value, expected="finite")
             yield Finding("RL104", f"{element} is {value} {_when(step)}", evidence)
             break
 
 
 @check("RL105")
 def _find_shared_memory(records: Records) -> Iterator[Finding]:
-    leaves = records.require_built().leaves
-    for trajectory in records.require_alone():
-        for form in trajectory.forms:
-            if form.what == "memory" and form.leaf is not None:
-                name = leaf_name(leaves[form.leaf])
-                message = f"step {form.step} wrote into the memory of the {name} returned before it"
-                yield Finding("RL105", message, {**trajectory.place, "step": form.step, "steps": form.count})
-                return
-
-
-COLOURS = (3, 4)
-SMALLEST_SIDE = 36
-"""An image with a shorter side does not fit through the default network's filters [pixels]."""
+    for trajectory, form in records.forms("memory")[:1]:
+        name = leaf_name(records.require_built().leaves[form.leaf or 0])
+        message = f"step {form.step} wrote into the memory of the {name} returned before it"
+        yield Finding("RL105", message, trajectory.at(form.step, steps=form.count))
 
 
 @check("RL106", "build")
@@ -276,8 +252,7 @@ def _looks_like_image(leaf: Leaf) -> bool:
 
 
 def _brightest(records: Records, index: int) -> int | None:
-    episodes = [each.observations[index].values for each in records.require_alone() if index in each.observations]
-    return max((int(values.max()) for values in episodes if values.size), default=None)
+    return max((int(each.values.max()) for _, each in records.series(index) if each.values.size), default=None)
 
 
 @check("RL109", "build")

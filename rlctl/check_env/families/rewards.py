@@ -18,7 +18,6 @@ from rlctl.check_env.messages import FIRST_SEED, MOST_INFOS, Message, Trajectory
 from rlctl.check_env.records import Records
 from rlctl.check_env.rewarded import (
     WITH_SEARCH,
-    at_step,
     constant_terms,
     has_succeeded,
     require_rewarded,
@@ -38,6 +37,10 @@ MEANT_CONSTANT = re.compile(
     r"(^|_)(alive|aliveness|surviv\w*|time|steps?|living|life|exist\w*|constant|bias)(_|$)", re.I
 )
 """Names of terms that are meant to be the same at every step."""
+STEPS = 50
+TOLERANCE = 1e-4
+"""Difference between two rewards, relative to the larger one or to 1, up to which it is rounding to float32."""
+GOALS = ("achieved_goal", "desired_goal")
 
 
 @check("RL601")
@@ -47,7 +50,7 @@ def find_not_finite(records: Records) -> Iterator[Finding]:
         wrong = np.flatnonzero(~np.isfinite(episode.rewards) & episode.reward_is_number)
         if wrong.size:
             step, value = int(wrong[0]) + 1, str(episode.rewards[wrong[0]])
-            evidence = at_step(episode, step, value=value, expected="finite")
+            evidence = episode.at(step, value=value, expected="finite")
             yield Finding("RL601", f"the reward is {value} at step {step}", evidence)
             return
 
@@ -85,7 +88,7 @@ def _find_badly_scaled(records: Records) -> Iterator[Finding]:
         message = f"the reward is {value:.3g} at step {step + 1}; usual is {size:.2g}"
     else:
         return
-    evidence = at_step(largest, step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
+    evidence = largest.at(step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
     yield Finding("RL603", message, evidence, Severity.INFO if records.normalizes() else Severity.WARNING)
 
 
@@ -113,7 +116,7 @@ def _find_wrong_sum(records: Records) -> Iterator[Finding]:
             "RL607",
             f"the terms add up to {total:.6g} at step {step + 1}, the reward is {reward:.6g}; they differ at {wrong:,} "
             f"of {steps:,} steps",
-            at_step(episode, step + 1, value=total, expected=reward, terms=terms),
+            episode.at(step + 1, value=total, expected=reward, terms=terms),
         )
 
 
@@ -124,12 +127,6 @@ def _find_constant_penalty(records: Records) -> Iterator[Finding]:
         if value < 0 and not MEANT_CONSTANT.search(name):
             message = f"reward term {name!r} is {value:.6g} at every step of {summarize(episodes)}"
             yield Finding("RL612", message, {"term": name, "value": value, "episodes": len(episodes)})
-
-
-STEPS = 50
-TOLERANCE = 1e-4
-"""Difference between two rewards, relative to the larger one or to 1, up to which it is rounding to float32."""
-GOALS = ("achieved_goal", "desired_goal")
 
 
 @experiment("hindsight", "RL614", share=0.3)

@@ -20,7 +20,7 @@ from rlctl.check_env.actions import action_at, zero_action
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.instance import Context
-from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
+from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
 from rlctl.check_env.recording import Recording
 from rlctl.check_env.rewarded import has_succeeded
 
@@ -46,7 +46,6 @@ CONTINUED = 12
 """Episodes that follow the best and then go on otherwise."""
 STOPS = (1, 2, 4, 8)
 """How many steps before its best moment, or its end, an episode is played again with nothing done from there on."""
-MAX_FAILURES = 3
 
 
 @dataclasses.dataclass
@@ -54,14 +53,12 @@ class _Attempt:
     """One episode of the search."""
 
     sequence: list[Any]
-    rewards: NDArray[np.float64]
-    has_succeeded: bool
-    has_terminated: bool
+    played: Trajectory
 
     @property
     def score(self) -> float:
         """Mean reward over the time there was, and the best of it: to come near counts, even for a moment."""
-        rewards = np.nan_to_num(self.rewards)
+        rewards = np.nan_to_num(self.played.rewards)
         return float(rewards.sum() / LONGEST + rewards.max()) if rewards.size else -np.inf
 
 
@@ -78,8 +75,8 @@ def search(context: Context) -> Iterator[Message]:
     yield from searcher.cross_entropy_search()
     yield from searcher.perturb_best()
     yield from searcher.stop_early()
-    if searcher.why_stopped:
-        yield Skipped("search", f"{searcher.episode} episodes were searched: {searcher.why_stopped}")
+    if context.budget.why_spent:
+        yield Skipped("search", f"{len(searcher.attempts)} episodes were searched: {context.budget.why_spent}")
 
 
 class _Search:
@@ -87,9 +84,6 @@ class _Search:
         self.instance = context.instance
         self.budget = context.budget
         self.attempts: list[_Attempt] = []
-        self.why_stopped = ""
-        self._failures = 0
-        self._steps = self.episode = self._longest = 0
         self._seed = FIRST_SEED
         self._rng = np.random.default_rng(FIRST_SEED)
         self._space = self.instance.env.action_space
@@ -99,9 +93,9 @@ class _Search:
     def do_nothing(self) -> Iterator[Message]:
         """Play with zero actions, and stay with the first seed where that does not succeed."""
         for seed in range(FIRST_SEED, FIRST_SEED + MOST_SEEDS):
-            self._seed, self.attempts = seed, []
+            self._seed = seed
             yield from self.play([zero_action(self._space)] * self._length, "zero")
-            if not self.attempts[0].has_succeeded or not self._goes_on():
+            if not has_succeeded(self.attempts[-1].played) or not self._goes_on():
                 return
 
     def cross_entropy_search(self) -> Iterator[Message]:
@@ -109,7 +103,7 @@ class _Search:
         shape = (SEGMENTS, self._size)
         mean, width = np.full(shape, 0.5), np.full(shape, WIDTH)
         best, best_score = mean, -np.inf
-        while self._goes_on(CEM_FRACTION) and not any(each.has_succeeded for each in self.attempts):
+        while self._goes_on(CEM_FRACTION) and not any(has_succeeded(each.played) for each in self._of_seed):
             generation: list[tuple[float, NDArray[np.float64]]] = []
             for number in range(GENERATION):
                 centre, spread = (best, WIDTH * width) if number == 0 else (mean, width)
@@ -129,59 +123,56 @@ class _Search:
         for _ in range(CONTINUED):
             if not self._goes_on():
                 return
-            best = max(self.attempts, key=lambda each: each.score)
-            at = int(len(best.rewards) * np.sqrt(self._rng.random()))  # rather late than early
+            best = max(self._of_seed, key=lambda each: each.score)
+            at = int(best.played.steps * np.sqrt(self._rng.random()))  # rather late than early
             action = action_at(self._space, self._rng.random(self._size))
             yield from self.play([*best.sequence[:at], *[action] * (self._length - at)])
 
     def stop_early(self) -> Iterator[Message]:
         """Follow the sequences that finished, or else the best, and do nothing from shortly before on."""
-        played = [each for each in self.attempts if each.rewards.size]
-        if not played:
+        followed = [each for each in self._of_seed if each.played.steps]
+        if not followed:
             return
-        finished = [each for each in played if each.has_succeeded and each.has_terminated]
-        finished = finished or [each for each in played if each.has_terminated]
-        chosen = [max(finished, key=lambda each: each.rewards[-1])] if finished else []
-        chosen.append(max(played, key=lambda each: each.score))
+        ended = [each for each in followed if each.played.ended == "terminated"]
+        finished = [each for each in ended if has_succeeded(each.played)] or ended
+        chosen = [max(finished, key=lambda each: each.played.rewards[-1])] if finished else []
+        chosen.append(max(followed, key=lambda each: each.score))
         nothing = zero_action(self._space)
         for each in chosen:
+            is_over, rewards = each.played.ended == "terminated", np.nan_to_num(each.played.rewards)
             for before in STOPS:
-                end = len(each.rewards) if each.has_terminated else int(np.argmax(np.nan_to_num(each.rewards))) + 1
-                at = max(0, end - before)
+                at = max(0, (len(rewards) if is_over else int(rewards.argmax()) + 1) - before)
                 if self._goes_on():
                     yield from self.play([*each.sequence[:at], *[nothing] * (self._length - at)])
 
     def play(self, sequence: list[Any], kind: str = "searched") -> Iterator[Message]:
         """Play one sequence of actions."""
         given = (copy.deepcopy(action) for action in sequence)
-        longest_s = max(0.0, self.budget.seconds_left / 4)
-        deadline, steps = self.budget.end_within(longest_s), len(sequence)
+        deadline = self.budget.end_within(max(0.0, self.budget.seconds_left / 4))
+        number, steps = len(self.attempts), len(sequence)
         episode = Episode(
-            self.instance, self._seed, kind, number=self.episode, max_steps=steps, deadline=deadline, given=given
+            self.instance, self._seed, kind, number=number, max_steps=steps, deadline=deadline, given=given
         )
         recording = Recording("search", episode, self.budget)
         yield from recording.run()
         played = recording.trajectory
-        is_terminated = played.ended == "terminated"
-        self.attempts.append(_Attempt(sequence, played.rewards, has_succeeded(played), is_terminated))
-        self.episode += 1
-        self._steps += played.steps
-        self._longest = max(self._longest, played.steps)
-        self._failures += recording.failure is not None
+        self.attempts.append(_Attempt(sequence, played))
         if played.ended in ("truncated", "both"):
             self._length = min(self._length, played.steps)
+
+    @property
+    def _of_seed(self) -> list[_Attempt]:
+        """The attempts with the seed that is searched with, which can be followed again."""
+        return [each for each in self.attempts if each.played.seed == self._seed]
 
     def _hold(self, parameters: NDArray[np.float64]) -> list[Any]:
         actions = [action_at(self._space, each) for each in parameters]
         # Where episodes end soon the actions have to change soon.
-        segment = max(2, min(self._length, round(STRETCH * self._longest)) // SEGMENTS)
+        longest = max(each.played.steps for each in self.attempts)
+        segment = max(2, min(self._length, round(STRETCH * longest)) // SEGMENTS)
         return [actions[min(SEGMENTS - 1, step // segment)] for step in range(self._length)]
 
     def _goes_on(self, part: float = 1.0) -> bool:
-        if self.budget.seconds_left <= 0:
-            self.why_stopped = "time was over"
-        elif self.budget.bytes_left <= 0:
-            self.why_stopped = "memory was over"
-        elif self._failures >= MAX_FAILURES:
-            self.why_stopped = f"{MAX_FAILURES} of them raised"
-        return not self.why_stopped and self._steps < part * MOST_STEPS and self.episode < part * MOST_EPISODES
+        steps = sum(each.played.steps for each in self.attempts)
+        is_left = steps < part * MOST_STEPS and len(self.attempts) < part * MOST_EPISODES
+        return is_left and not self.budget.why_spent
