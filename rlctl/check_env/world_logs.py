@@ -14,6 +14,7 @@ from rlctl.check_env.bullet_worlds import (
     ANGULAR,
     JOINTS,
     VELOCITY,
+    Body,
     Jump,
     Pair,
     World,
@@ -81,18 +82,19 @@ class Log:
         """The kind of the episode's actions."""
         return str(self.places[0]["actions"]) if self.places else ""
 
-    def series(self, body: int) -> NDArray[np.float64]:
-        """Return a body's state at every look. Shape (looks, 9 + 2 * joints)."""
-        return np.array([states[body] for states in self.states])
+    @property
+    def bodies(self) -> list[tuple[Body, NDArray[np.float64]]]:
+        """The bodies, and the state of each at every look. Shape (looks, 9 + 2 * joints) each."""
+        series = zip(*self.states, strict=True)
+        return [(body, np.array(each)) for body, each in zip(self.world.bodies, series, strict=False)]
 
     @property
     def moves(self) -> bool:
         """Whether anything ever had a speed."""
-        for i, body in enumerate(self.world.bodies) if self.states else ():
-            states = self.series(i)
-            if states[:, VELOCITY].any() or states[:, ANGULAR].any() or states[:, JOINTS + len(body.joints) :].any():
-                return True
-        return False
+        return any(
+            states[:, VELOCITY].any() or states[:, ANGULAR].any() or states[:, JOINTS + len(body.joints) :].any()
+            for body, states in self.bodies
+        )
 
 
 def _limit(client: int, pair: Pair) -> float:

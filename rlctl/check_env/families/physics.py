@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.bullet_calls import BulletCall, BulletCalls, record_calls
-from rlctl.check_env.bullet_worlds import ANGULAR, JOINTS, POSITION, VELOCITY, Joint, Jump, Pair, connected
+from rlctl.check_env.bullet_worlds import ANGULAR, HEIGHT, JOINTS, VELOCITY, Body, Joint, Jump, Pair, connected
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
@@ -161,37 +162,39 @@ def _penetration(world: LoggedWorld) -> Iterator[Finding]:
 
 
 def _longest_row(is_deep: Sequence[bool]) -> list[int]:
-    row: list[int] = []
-    longest: list[int] = []
-    for i, each in enumerate(is_deep):
-        row = [*row, i] if each else []
-        longest = row if len(row) > len(longest) else longest
-    return longest
+    groups = itertools.groupby(range(len(is_deep)), key=is_deep.__getitem__)
+    return max((list(row) for deep, row in groups if deep), key=len, default=[])
 
 
 def _joint_limits(world: LoggedWorld) -> Iterator[Finding]:
-    worst: dict[str, dict[str, tuple[float, int, Place, float, Joint]]] = {}
+    found: list[tuple[float, str, Joint, int, Place, float]] = []
     for log in world.logs:
-        for i, body in enumerate(log.world.bodies) if log.states else ():
-            found, positions = worst.setdefault(body.name, {}), log.series(i)[:, JOINTS:]
+        for body, states in log.bodies:
             for j, joint in enumerate(body.joints):
-                outside = _outside(joint, positions[:, j])
+                positions = states[:, JOINTS + j]
+                outside = _outside(joint, positions)
                 steps, row = int((outside > 0).sum()), int(outside.argmax())
-                if steps >= LASTING_STEPS and outside[row] > found.get(joint.name, (0.0,))[0]:
-                    found[joint.name] = float(outside[row]), steps, log.places[row], float(positions[row, j]), joint
-    for name, found in worst.items():
-        ordered = sorted(found.values(), key=lambda each: -each[0])
-        for _, steps, place, value, joint in ordered[:1]:
-            others = [each[-1].name for each in ordered[1:]]
-            unit = "rad" if joint.is_angle else "m"
-            more = f"; so {'are' if len(others) > 1 else 'is'} {list_names(others, MOST_NAMES)}" if others else ""
-            limits = [joint.low, joint.high]
-            yield Finding(
-                "RL804",
-                f"{joint.name} of {name} is at {value:.3g} {unit} {_when(place)}; its limits are [{limits[0]:.3g}, "
-                f"{limits[1]:.3g}] {unit}; it is outside by much in {steps} steps{more}",
-                {**place, "joint": joint.name, "value": value, "expected": limits, "other_joints": others},
-            )
+                if steps >= LASTING_STEPS:
+                    place = log.places[row]
+                    found.append((float(outside[row]), body.name, joint, steps, place, float(positions[row])))
+    found.sort(key=lambda each: -each[0])
+    for name in dict.fromkeys(each[1] for each in found):
+        _, _, joint, steps, place, value = next(each for each in found if each[1] == name)
+        others = list(dict.fromkeys(each[2].name for each in found if each[1] == name))[1:]
+        unit = "rad" if joint.is_angle else "m"
+        more = f"; so {'are' if len(others) > 1 else 'is'} {list_names(others, MOST_NAMES)}" if others else ""
+        yield Finding(
+            "RL804",
+            f"{joint.name} of {name} is at {value:.3g} {unit} {_when(place)}; its limits are [{joint.low:.3g}, "
+            f"{joint.high:.3g}] {unit}; it is outside by much in {steps} steps{more}",
+            {
+                **place,
+                "joint": joint.name,
+                "value": value,
+                "expected": [joint.low, joint.high],
+                "other_joints": others,
+            },
+        )
 
 
 def _outside(joint: Joint, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -206,7 +209,7 @@ def _outside(joint: Joint, values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _explosion(world: LoggedWorld) -> Iterator[Finding]:
     """Yield the worst of what is faster than any robot, or is not a number."""
-    found = [each for log in world.logs if log.states for i in range(len(log.world.bodies)) for each in _fast(log, i)]
+    found = [each for log in world.logs for body, states in log.bodies for each in _fast(log, body, states)]
     found.sort(key=lambda each: -each[0])
     parts = {part for _, part, *_ in found}
     for _, _, message, evidence in found[:1]:
@@ -214,9 +217,8 @@ def _explosion(world: LoggedWorld) -> Iterator[Finding]:
         yield Finding("RL805", message + more, evidence)
 
 
-def _fast(log: Log, i: int) -> Iterator[tuple[float, str, str, Place]]:
+def _fast(log: Log, body: Body, states: NDArray[np.float64]) -> Iterator[tuple[float, str, str, Place]]:
     """Yield what of a body is too fast for several looks: speed, what it is, message, evidence."""
-    body, states = log.world.bodies[i], log.series(i)
     for row, column in np.argwhere(~np.isfinite(states))[:1].tolist():
         value, place = str(states[row, column]), log.places[row]
         message = f"the state of {body.name} is {value} {_when(place)}"
@@ -250,9 +252,9 @@ def _unrest(world: LoggedWorld) -> Iterator[Finding]:
             {"seed": jump.seed, "body": jump.body, "value": jump.speed, "expected": jump.explained},
         )
     for log in world.logs:
-        for i, body in enumerate(log.world.bodies) if log.actions == "zero" else ():
+        for body, states in log.bodies if log.actions == "zero" else ():
             first = next((row for row, touching in enumerate(log.touching) if body.id in touching), 0)
-            heights = np.nan_to_num(log.series(i)[:, POSITION][:, 2])
+            heights = np.nan_to_num(states[:, HEIGHT])
             height = float(heights[0] - heights[first])
             if body.is_free and height > HIGHEST_DROP and body.name not in thrown:
                 message = f"{body.name} drops {100 * height:.0f} cm after reset before it touches anything"
