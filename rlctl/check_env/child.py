@@ -16,7 +16,7 @@ from rlctl.check_env.experiment import Experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
 from rlctl.check_env.instance import Budget, Context
-from rlctl.check_env.messages import End, Fact, Failure, Finished, Message, Mistake, Skipped
+from rlctl.check_env.messages import End, Failure, Finished, Message, Mistake, Skipped
 from rlctl.check_env.progress import Progress
 from rlctl.check_env.wire import encode
 from rlctl.errors import RecipeError, UsageError
@@ -77,9 +77,7 @@ def _run(experiment: Experiment, context: Context) -> Iterator[Message]:
     found: set[str] = set()
     try:
         for message in experiment.run(context):
-            if isinstance(message, Fact):
-                context.facts[message.name] = message.value
-            elif isinstance(message, Finding):
+            if isinstance(message, Finding):
                 found.add(message.rule)
             yield message
         is_complete = True

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from rlctl import env_spec, registry
 from rlctl.check_env.clock import read_clock
 from rlctl.check_env.failures import EnvironmentRaised, describe, describe_failure
-from rlctl.check_env.leaves import Leaf, leaves_of
+from rlctl.check_env.leaves import leaves_of
 from rlctl.check_env.messages import Failure
 from rlctl.check_env.progress import Progress
 from rlctl.errors import TaskError
@@ -49,13 +49,15 @@ class Budget:
 class Instance:
     """One environment, and how it is called."""
 
-    def __init__(
-        self, env: Any, leaves: list[Leaf], action_leaves: list[Leaf], accepts_seed: bool, progress: Progress
-    ) -> None:
+    def __init__(self, env: Any, progress: Progress) -> None:
+        """Raises `TaskError` where its observation space cannot be read."""
+        try:
+            self.leaves = leaves_of(getattr(env, "observation_space", None))
+        except Exception as error:
+            raise TaskError(f"observation_space raises {describe(error)}") from error
         self.env = env
-        self.leaves = leaves
-        self.action_leaves = action_leaves
-        self.accepts_seed = accepts_seed
+        self.action_leaves = leaves_of(getattr(env, "action_space", None))
+        self.accepts_seed = _accepts_seed(env)
         self.progress = progress
 
     @property
@@ -90,8 +92,8 @@ class Instance:
         return self.call("reset", *timed, **keywords)
 
     def close(self) -> None:
-        """Close the environment."""
-        self.call("close", self.env.close)
+        """Close the environment, where it can be."""
+        self.call("close", getattr(self.env, "close", lambda: None))
 
 
 class Context:
@@ -104,8 +106,6 @@ class Context:
         """How far the last attempt to build an instance came: `import` or `constructor`."""
         self.budget = Budget(read_clock())
         """What the experiment that is running may use."""
-        self.facts: dict[str, Any] = {}
-        """The facts that earlier experiments of this process have sent."""
         self._instance: Instance | None = None
 
     def make(self, render_mode: RenderMode | None = None) -> Any:
@@ -123,13 +123,13 @@ class Context:
     def build(self, render_mode: RenderMode | None = None) -> Instance:
         """Return a new instance; what its constructor raises is an `EnvironmentRaised`."""
         try:
-            return self._wrap(self.make(render_mode))
+            return Instance(self.make(render_mode), self.progress)
         except BaseException as error:
             raise EnvironmentRaised("build") from error
 
     def build_first(self) -> Instance:
         """Build the instance that this process keeps; raises what the constructor raises."""
-        self._instance = self._wrap(self.make())
+        self._instance = Instance(self.make(), self.progress)
         return self._instance
 
     @property
@@ -151,29 +151,19 @@ class Context:
         try:
             yield instance
         finally:
-            if hasattr(instance.env, "close"):
-                with contextlib.suppress(EnvironmentRaised):
-                    instance.close()
+            with contextlib.suppress(EnvironmentRaised):
+                instance.close()
 
     def close(self, instance: Instance | None = None) -> Iterator[Failure]:
         """Close an instance, by default the one that this process keeps; yield what it raised."""
         if instance is None:
             self.progress.phase("close")
             instance = self._instance
-        if instance is None or not hasattr(instance.env, "close"):
-            return
         try:
-            instance.close()
+            if instance is not None:
+                instance.close()
         except EnvironmentRaised as error:
             yield describe_failure(error, self.progress)
-
-    def _wrap(self, env: Any) -> Instance:
-        try:
-            observation_space = getattr(env, "observation_space", None)
-        except Exception as error:
-            raise TaskError(f"observation_space raises {describe(error)}") from error
-        action_leaves = leaves_of(getattr(env, "action_space", None))
-        return Instance(env, leaves_of(observation_space), action_leaves, _accepts_seed(env), self.progress)
 
 
 def _accepts_seed(env: Any) -> bool:

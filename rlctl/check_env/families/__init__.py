@@ -24,8 +24,7 @@ of its first rule, found by nobody else.
 It names the experiments that it needs (by default those that record the common episodes, `RECORDING`) and raises
 `NotJudged` or `NotApplicable`. A rule may have both, and then has the findings of both. What a check needs of an
 experiment besides episodes is a `Fact`: `yield Fact("truncation", "never")`, then `records.require_fact("truncation",
-"attributes")`; a later experiment of the same process reads `context.facts`. A recording experiment yields what
-`Recording.run()` returns.
+"attributes")`. A recording experiment yields what `Recording.run()` returns.
 
 **Texts** (name, severity, meaning, fix, what the libraries' checkers say about it) are in `rules.yaml`, not here. A
 finding gives its own severity or fix only where they differ from the rule's. Every check and experiment of a module in

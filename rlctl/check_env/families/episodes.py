@@ -12,7 +12,7 @@ from rlctl.check_env.experiment import RECORDING, check, experiment
 from rlctl.check_env.families import observations, rewards
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.instance import Context
-from rlctl.check_env.messages import ENDS, FIRST_SEED, Fact, Message, Trajectory
+from rlctl.check_env.messages import ENDS, FIRST_SEED, Message, Trajectory
 from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 
@@ -175,14 +175,14 @@ def step_after_end(context: Context) -> Iterator[Message]:
     end = episode.steps
     while episode.steps < end + STEPS_AFTER and recording.failure is None:  # to refuse is what it should do
         recording.step()
-    yield Fact("end", end)
     yield recording.trajectory
 
 
 @check("RL505", *RECORDING, "after the end")
 def find_nonsense_after_end(records: Records) -> Iterator[Finding]:
     """Judge the steps after the end by the rules on observations and rewards that no other episode breaks."""
-    end, after = records.require_fact("end", "after the end"), records.require_role("after the end")
+    after = records.require_role("after the end")
+    end = int((after.terminated | after.truncated).argmax()) + 1
     only = dataclasses.replace(records, trajectories=[dataclasses.replace(after, role="episodes")])
     for each in (observations.find_wrong_shape, observations.find_not_finite, rewards.find_not_finite):
         found = [] if list(each.run(records)) else list(each.run(only))
