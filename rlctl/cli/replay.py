@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rlctl import completion
 from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Set, choose_checkpoint, claim_stdout, parse_changes
+
+if TYPE_CHECKING:
+    from rlctl.replay.choice import Choice
 
 
 def replay(
@@ -21,7 +24,22 @@ def replay(
             autocompletion=completion.complete_run,
         ),
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", help="Episodes to roll out.", min=1)] = 1,
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            "--episodes", help="Episodes to roll out, or to choose from.", min=1, show_default="1; 100 to choose from"
+        ),
+    ] = None,
+    worst: Annotated[
+        int | None, typer.Option(metavar="N", help="The N worst of --episodes.", min=1, show_default=False)
+    ] = None,
+    best: Annotated[
+        int | None, typer.Option(metavar="N", help="The N best of --episodes.", min=1, show_default=False)
+    ] = None,
+    failures: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Up to N that failed of --episodes, worst first.", min=1, show_default=False),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
@@ -45,6 +63,10 @@ def replay(
             show_default=False,
         ),
     ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a film instead, .mp4 or .gif.", show_default=False),
+    ] = None,
     json: Json = None,
 ) -> None:
     """Show what a policy does: rollouts as Rerun recordings, without a display."""
@@ -63,7 +85,19 @@ def replay(
             verify=verify,
             gui=gui,
             output=output,
+            video=video,
+            choice=_read_choice(worst=worst, best=best, failures=failures),
         )
     )
     show(result, json)
     result.check()
+
+
+def _read_choice(**counts: int | None) -> Choice | None:
+    from rlctl.errors import UsageError
+    from rlctl.replay.choice import Choice
+
+    given = [Choice(kind, count) for kind, count in counts.items() if count is not None]  # type: ignore[arg-type]
+    if len(given) > 1:
+        raise UsageError(f"--{given[0].kind} and --{given[1].kind}: give one of --worst, --best and --failures")
+    return given[0] if given else None

@@ -13,7 +13,8 @@ from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.baseline import Baseline, choose_task, load_baseline
 from rlctl.eval.statistics import Spread, mean_action_change, mean_terms, success_interval, success_rate
-from rlctl.rollout.acting import Exploration, check_playable
+from rlctl.rollout.acting import Exploration, Player, PolicyPlayer, check_playable
+from rlctl.rollout.baselines import make_player
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
@@ -157,6 +158,12 @@ class LoadedPolicy:
             workers.set_other_policy(str(self.path.resolve()))
         else:
             workers.set_policy(self.info, self.tensors)
+
+    def make_player(self) -> Player:
+        """Return what plays it in this process, with the same bits as in workers."""
+        if self.tensors is None:
+            return make_player(str(self.path.resolve()), self.info.env.spaces()[1])
+        return PolicyPlayer(self.info, self.tensors)
 
 
 def load_player(path: Path, deterministic: bool) -> LoadedPolicy:

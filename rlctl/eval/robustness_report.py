@@ -50,9 +50,8 @@ def format_outcome(outcome: Outcome) -> str:
     if outcome.success_rate is not None and outcome.success_interval is not None:
         low, high = outcome.success_interval
         parts.append(f"success {outcome.success_rate:.1%} ({low:.1%} to {high:.1%})")
-    interval = outcome.return_interval
-    spread = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
-    return ", ".join([*parts, f"return {outcome.mean_return:.4g}{spread}"])
+    low, high = outcome.return_interval
+    return ", ".join([*parts, f"return {outcome.mean_return:.4g} ({low:.4g} to {high:.4g})"])
 
 
 def _show_map(found: RobustnessMap, worst: Cell | None) -> None:

@@ -57,17 +57,6 @@ def success_interval(results: Sequence[EpisodeResult]) -> tuple[float, float] | 
     return float(interval.low), float(interval.high)
 
 
-def return_interval(results: Sequence[EpisodeResult]) -> tuple[float, float] | None:
-    """Return the 95 % interval of the mean return, by Student's t distribution; None for a single episode."""
-    from scipy.stats import sem, t
-
-    returns = [result.total_reward for result in results]
-    if len(returns) < 2:
-        return None
-    mean, half = float(np.mean(returns)), float(t.ppf(0.975, len(returns) - 1) * sem(returns))
-    return mean - half, mean + half
-
-
 def mean_return(results: Sequence[EpisodeResult]) -> float:
     """Return the mean of the episodes' sums of rewards."""
     return float(np.mean([result.total_reward for result in results]))

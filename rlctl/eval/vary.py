@@ -16,7 +16,7 @@ from rlctl.env_spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval import axes as axes_of
 from rlctl.eval.evaluate import EvalRequest, Gates, LoadedPolicy, choose_specs, load_player, start_workers
-from rlctl.eval.statistics import mean_return, return_interval, success_interval, success_rate
+from rlctl.eval.statistics import mean_interval, mean_return, success_interval, success_rate
 from rlctl.rollout.acting import Exploration
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
@@ -150,7 +150,7 @@ def summarize(results: Sequence[EpisodeResult]) -> Outcome:
         success_rate=success_rate(results),
         success_interval=success_interval(results),
         mean_return=mean_return(results),
-        return_interval=return_interval(results),
+        return_interval=mean_interval([result.total_reward for result in results]),
     )
 
 

@@ -181,7 +181,7 @@ class EpisodeRecorder:
 
     def begin(self, observation: Any, info: dict[str, Any]) -> None:
         """Add what a reset returned."""
-        self._observations.append(_copy(observation, self._env.observation_space))
+        self._observations.append(copy_observation(observation, self._env.observation_space))
         self._log_events(0, info)
 
     def add_step(
@@ -190,7 +190,7 @@ class EpisodeRecorder:
         """Add an action and what the step returned."""
         if not math.isfinite(reward):
             raise ValueError(f"reward is {reward}")
-        copied = _copy(observation, self._env.observation_space)
+        copied = copy_observation(observation, self._env.observation_space)
         self._actions.append(np.array(action))
         self._observations.append(copied)
         self._rewards.append(reward)
@@ -259,10 +259,10 @@ class EpisodeRecorder:
             self._add_log(*(("success", "INFO") if self._successes[-1] else ("no success", "WARN")))
 
 
-def _copy(observation: Any, space: spaces.Space[Any]) -> Any:
+def copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
     """Copy an observation in the dtype of its space, as recorded episodes have it; some environments reuse theirs."""
     if isinstance(space, spaces.Dict):
-        return {key: _copy(observation[key], part) for key, part in space.spaces.items()}
+        return {key: copy_observation(observation[key], part) for key, part in space.spaces.items()}
     value = np.array(observation, dtype=space.dtype)
     if value.shape != space.shape:
         raise ValueError(f"observation has shape {value.shape}, the space has {space.shape}")

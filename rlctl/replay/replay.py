@@ -8,7 +8,17 @@ from pathlib import Path
 from rlctl import output
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import UsageError
-from rlctl.replay.recorder import Choose, Rollout, drawable_env, play_episode, recorded_actions
+from rlctl.eval.evaluate import load_player
+from rlctl.replay.choice import Choice, choose_episodes
+from rlctl.replay.film import check_file, film_episodes, filmable_env
+from rlctl.replay.recorder import (
+    Choose,
+    Rollout,
+    copy_observation,
+    drawable_env,
+    play_episode,
+    recorded_actions,
+)
 from rlctl.replay.report import ReplayedEpisode, ReplayResult
 from rlctl.replay.reproduce import print_warning, record_episode, verify_episode
 from rlctl.replay.scene import Env
@@ -18,7 +28,8 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import describe
 from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import find_owner, find_policy, locate_task
-from rlctl.run.policy import Policy, load_policy
+
+_EPISODES_TO_CHOOSE_FROM = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +37,8 @@ class ReplayRequest:
     """What the command line asks for."""
 
     source: str | None
-    episodes: int = 1
+    episodes: int | None = None
+    """None: one, or 100 to choose from."""
     seed: int = 0
     checkpoint: str = "best"
     task: str | None = None
@@ -34,6 +46,15 @@ class ReplayRequest:
     verify: Path | None = None
     gui: bool = False
     output: Path | None = None
+    video: Path | None = None
+    """Write a film instead of recordings."""
+    choice: Choice | None = None
+    """Play `episodes` fast and replay those with certain outcomes."""
+
+    @property
+    def shown(self) -> int:
+        """How many episodes are shown, at most."""
+        return self.choice.count if self.choice else self.episodes or 1
 
 
 def run_replay(request: ReplayRequest) -> ReplayResult:
@@ -48,8 +69,12 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
         return _verify(request.verify)
     if _is_episode(request.source):
         path = Path(str(request.source))
+        if request.video is not None:
+            return _film_episode(path, request.video)
         return _show_episode(path) if request.gui else _record_episode(path, request.output)
     actor = _Actor(request)
+    if request.video is not None:
+        return actor.film(request.video)
     return actor.show() if request.gui else actor.record()
 
 
@@ -68,12 +93,18 @@ def _check_request(request: ReplayRequest) -> None:
     recorded = request.verify is not None or _is_episode(source)
     if recorded and request.checkpoint != "best":
         raise UsageError("a recorded episode is replayed as it was: leave out --checkpoint and --pretrained")
-    if recorded and (request.task is not None or request.changes or request.episodes != 1):
+    if recorded and (request.task is not None or request.changes or request.episodes not in (None, 1)):
         raise UsageError("a recorded episode is replayed as it was: leave out --task, --set and --episodes")
+    if recorded and request.choice is not None:
+        raise UsageError(f"--{request.choice.kind} chooses among the episodes of a policy; {source} is a recorded one")
+    if request.video is not None:
+        if request.gui or target is not None or request.verify is not None:
+            raise UsageError("--video writes a film and nothing else: leave out --gui, --output and --verify")
+        check_file(request.video)
     if target is None:
         return
-    if target.suffix == ".rrd" and request.episodes > 1:
-        raise UsageError(f"--output {target}: a recording has one episode; give a folder for {request.episodes}")
+    if target.suffix == ".rrd" and request.shown > 1:
+        raise UsageError(f"--output {target}: a recording has one episode; give a folder for {request.shown}")
     if target.suffix == ".rrd" and target.is_dir():
         raise UsageError(f"--output {target}: a folder whose name ends in .rrd; give a name inside it")
     if target.suffix != ".rrd" and target.is_file():
@@ -106,8 +137,17 @@ def _show_episode(path: Path) -> ReplayResult:
     info, spec = episode.info, episode.info.spec
     with open_window(spec) as env:
         actions = recorded_actions(episode, env, path)
-        rollouts = show_episodes(env, spec, [info.seed], lambda: actions)
+        rollouts = show_episodes(env, spec, [info.seed], lambda seed: actions)
     return ReplayResult(spec.task, info.policy, [_summarize(rollout) for rollout in rollouts])
+
+
+def _film_episode(path: Path, film_file: Path) -> ReplayResult:
+    episode = _load_episode(path)
+    info, spec = episode.info, episode.info.spec
+    with filmable_env(spec) as env:
+        actions = recorded_actions(episode, env, path)
+        rollouts, film = film_episodes(film_file, env, spec, [info.seed], lambda seed: actions, policy=info.policy)
+    return ReplayResult(spec.task, info.policy, [_summarize(rollout) for rollout in rollouts], film=film)
 
 
 class _Actor:
@@ -115,26 +155,39 @@ class _Actor:
 
     def __init__(self, request: ReplayRequest) -> None:
         self._output = request.output
-        self._seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes)
         found = find_policy(request.source, request.checkpoint)
         output.print_notes(found.notes)
         self._file, self._run = found.file, found.run
-        if self._file.suffix == ".safetensors":
-            from rlctl.run.torch_policy import pin_threads
-
-            pin_threads()
-        self._policy: Policy = load_policy(self._file)
-        info = self._policy.info
+        policy = load_player(self._file, deterministic=True)
+        info = policy.info
+        self._info, self._player = info, policy.make_player()
         self._spec: EnvSpec = found.locate(info.derive_spec(request.task, request.changes))
         self._name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
         self._described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
+        self._chosen: dict[int, float] = {}
+        """Returns of the chosen episodes, by seed."""
+        self._choice = ""
+        if request.choice is None:
+            self._seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)
+        else:
+            episodes = request.episodes or _EPISODES_TO_CHOOSE_FROM
+            results, self._choice = choose_episodes(policy, self._spec, episodes, request.seed, request.choice)
+            self._seeds = [result.seed for result in results]
+            self._chosen = {result.seed: result.total_reward for result in results}
 
     def show(self) -> ReplayResult:
         with open_window(self._spec) as env:
             self._check_fits(env)
             rollouts = show_episodes(env, self._spec, self._seeds, self._begin)
-        shown = [_summarize(rollout) for rollout in rollouts]
-        return ReplayResult(self._spec.task, self._name, shown, policy_file=self._described)
+        return self._report([_summarize(rollout) for rollout in rollouts])
+
+    def film(self, path: Path) -> ReplayResult:
+        if not self._seeds:
+            return self._report([])
+        with filmable_env(self._spec) as env:
+            self._check_fits(env)
+            rollouts, film = film_episodes(path, env, self._spec, self._seeds, self._begin, policy=self._name)
+        return dataclasses.replace(self._report([_summarize(rollout) for rollout in rollouts]), film=film)
 
     def record(self) -> ReplayResult:
         from rlctl.replay.rrd import write_rrd
@@ -143,21 +196,35 @@ class _Actor:
         with drawable_env(spec, print_warning) as env:
             self._check_fits(env)
             for seed in self._seeds:
-                rollout = play_episode(env, spec, seed, self._begin(), policy=self._name, draw=print_warning)
+                rollout = play_episode(env, spec, seed, self._begin(seed), policy=self._name, draw=print_warning)
                 recording = self._next_recording()
                 episode = recording.with_suffix(".npz")
                 save_episode(episode, rollout.episode)
                 title, several = f"{spec.task} / episode {recording.stem}", len(self._seeds) > 1
                 write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
                 done.append(_summarize(rollout, recording, episode))
-        return ReplayResult(spec.task, self._name, done, policy_file=self._described)
+        return self._report(done)
+
+    def _report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
+        for each in episodes:
+            before = self._chosen.get(each.seed, each.total_reward)
+            if before != each.total_reward:
+                print_warning(
+                    f"warning: seed {each.seed}: return {each.total_reward:.6g}, it was {before:.6g} when it was "
+                    f"chosen; does the environment repeat itself? rlctl check-env {self._spec.task}"
+                )
+        return ReplayResult(self._spec.task, self._name, episodes, policy_file=self._described, choice=self._choice)
 
     def _check_fits(self, env: Env) -> None:
-        self._policy.info.check_fits(describe(env), self._file)
+        self._info.check_fits(describe(env), self._file)
 
-    def _begin(self) -> Choose:
-        self._policy.reset()
-        return lambda observation, _: self._policy.predict(observation)
+    def _begin(self, seed: int) -> Choose:
+        """Begin an episode as a worker does."""
+        player, (space, _) = self._player, self._info.env.spaces()
+        if player.state is not None:
+            player.state[:] = 0.0
+        player.begin_segment(seed, 0)
+        return lambda observation, step: player.act(copy_observation(observation, space), seed, step)[1]
 
     def _next_recording(self) -> Path:
         """Return `--output`, or the next number in that folder, in the run, or (without a run) in ./episodes."""

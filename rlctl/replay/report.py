@@ -42,6 +42,20 @@ class Verification:
 
 
 @dataclasses.dataclass(frozen=True)
+class FilmReport:
+    """A film that was written."""
+
+    file: Path
+    pictures: int
+    width: int
+    height: int
+    rate: float
+    """Pictures per second, as it plays."""
+    drawn_per_s: float
+    """Pictures per second, as they were drawn."""
+
+
+@dataclasses.dataclass(frozen=True)
 class ReplayResult:
     """Episodes that were played, and the verification of one."""
 
@@ -51,6 +65,9 @@ class ReplayResult:
     verification: Verification | None = None
     policy_file: str = ""
     """Where the policy is, and what it is; empty for a recorded episode."""
+    choice: str = ""
+    """What the episodes are of many others, where they were chosen by outcome."""
+    film: FilmReport | None = None
 
     def check(self) -> None:
         """Raise `AnswerIsNo` if a recorded episode could not be reproduced."""
@@ -71,8 +88,16 @@ def show(result: ReplayResult, json: str | None) -> None:
     randomization = describe_randomization(result.episodes[0].events) if result.episodes else ""
     parts = [each for each in (result.policy_file or result.policy, randomization) if each]
     out.print(f"{result.task}: {', '.join(parts)}" if parts else result.task, markup=False)
+    if result.choice:
+        out.print(result.choice)
     for episode in result.episodes:
         out.print(_line(episode), markup=False)
+    if film := result.film:
+        out.print(
+            f"{film.file}: {film.pictures} pictures of {film.width}x{film.height}, {film.rate:.3g} per second; "
+            f"drawn at {film.drawn_per_s:.3g} per second",
+            markup=False,
+        )
     if command := open_command(result):
         out.print(f"open with: {command}", markup=False)
         out.print(f"without a display, in a browser: {command.replace('rerun', 'rerun --serve-web', 1)}", markup=False)
@@ -109,6 +134,10 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
         "open": open_command(result),
         "versions": collect_versions(),
     }
+    if result.choice:
+        content["choice"] = result.choice
+    if result.film is not None:
+        content["film"] = {**dataclasses.asdict(result.film), "file": str(result.film.file)}
     if (verification := result.verification) is not None:
         difference, versions = verification.difference, verification.other_versions.items()
         content["verification"] = {

@@ -32,12 +32,12 @@ def open_window(spec: EnvSpec) -> Iterator[Env]:
         env.close()
 
 
-def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[], Choose]) -> list[Rollout]:
+def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose]) -> list[Rollout]:
     """Play an episode per seed in real time; closing PyBullet's window ends it early, without an error."""
     shown: list[Rollout] = []
     for seed in seeds:
         try:
-            shown.append(play_episode(env, spec, seed, _in_real_time(begin(), frame_time(env) or _DT)))
+            shown.append(play_episode(env, spec, seed, _in_real_time(begin(seed), frame_time(env) or _DT)))
         except TaskError as error:
             if "Not connected to physics server" not in str(error.__cause__):
                 raise

@@ -27,8 +27,8 @@ class Outcome(_Content):
     success_interval: Interval | None
     """95 % Wilson score interval of the success rate."""
     mean_return: float
-    return_interval: Interval | None
-    """95 % interval of the mean, by Student's t; None for a single episode."""
+    return_interval: Interval
+    """95 % interval of the mean, by Student's t; the value itself, twice, for a single episode."""
 
 
 class Cell(Outcome):

@@ -165,7 +165,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         drawn |= self._signals.drawn
         info: dict[str, Any] = {"events": drawn} if drawn else {}
         if self.render_mode == "human":
-            self._move_markers()
+            self.move_markers()
         return observation, info
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -199,7 +199,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._running = not (terminated or truncated)
         observation = self._observe()
         if self.render_mode == "human":
-            self._move_markers()
+            self.move_markers()
         return observation, reward, terminated, truncated, info
 
     def _check_action(self, action: Any) -> Any:
@@ -276,7 +276,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
                 )
         return TaskError(f"{self.name}: observation outside its bounds at step {self._step}")
 
-    def _move_markers(self) -> None:
+    def move_markers(self) -> None:
+        """Put the markers, which an environment that renders has in its world, where the task has them now."""
         positions = self.task.markers()
         for name, marker in self._markers.items():
             self.sim.move_marker(marker, positions[name])
@@ -284,7 +285,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def render(self) -> Any:
         """Return an RGB image of shape (240, 320, 3) in `rgb_array` mode; the window shows itself in `human`."""
         if self.render_mode == "rgb_array":
-            self._move_markers()
+            self.move_markers()
             return self.sim.render()
         return None
 

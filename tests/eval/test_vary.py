@@ -9,9 +9,8 @@ from rlctl.env_spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval.axes import read_axes
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
-from rlctl.eval.statistics import return_interval
+from rlctl.eval.statistics import mean_interval
 from rlctl.eval.vary import RobustnessRequest, check_gates, format_duration, measure_robustness
-from rlctl.rollout.workers import EpisodeResult
 from rlctl.run.robustness import read
 from tests.eval.conftest import ENVS
 
@@ -37,7 +36,7 @@ def test_a_cell_is_the_evaluation_with_its_values(block_run, measured):
     cell = found.cells[3]
     assert (cell.success_rate, cell.success_interval) == (alone.success_rate, alone.success_interval)
     assert cell.mean_return == alone.returns.mean
-    assert cell.return_interval == return_interval([episode.result for episode in alone.episodes])
+    assert cell.return_interval == mean_interval([episode.result.total_reward for episode in alone.episodes])
 
 
 def test_nominal_and_worst_cells(measured):
@@ -49,11 +48,11 @@ def test_nominal_and_worst_cells(measured):
     assert found.cells[4].success_rate == 0.0
 
 
-def test_return_interval_by_hand():
-    results = [EpisodeResult(0, 0, value, 1, None, {}, None) for value in (1.0, 2.0, 3.0, 6.0)]
+def test_interval_of_the_mean_by_hand():
+    returns = [1.0, 2.0, 3.0, 6.0]
     # Mean 3, standard deviation sqrt(14 / 3) = 2.160247, over sqrt(4): 1.080123; t of 3 degrees of freedom: 3.182446.
-    assert return_interval(results) == pytest.approx((3 - 3.437435, 3 + 3.437435), abs=1e-5)
-    assert return_interval(results[:1]) is None
+    assert mean_interval(returns) == pytest.approx((3 - 3.437435, 3 + 3.437435), abs=1e-5)
+    assert mean_interval(returns[:1]) == (1.0, 1.0)
 
 
 def test_it_is_kept_with_the_run(block_run, measured):

@@ -11,7 +11,7 @@ def test_episodes_take_their_time():
     env = spec.make()
     arrived = []
 
-    def begin():
+    def begin(seed):
         arrived.append(time.monotonic())
         return lambda observation, step: env.action_space.sample() if step < 12 else None
 
@@ -31,7 +31,7 @@ def test_closing_the_window_ends_it_well():
             pybullet.disconnect(physicsClientId=env.unwrapped.sim.client)
         return env.action_space.sample()
 
-    assert show_episodes(env, spec, [1, 2], lambda: choose) == []
+    assert show_episodes(env, spec, [1, 2], lambda seed: choose) == []
     env.close()
 
 

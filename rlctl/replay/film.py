@@ -1,0 +1,258 @@
+"""Films of episodes, `.mp4` or `.gif`, without a display: from PyBullet's software renderer, or `render()`."""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import fractions
+import itertools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import RlctlError, UsageError
+from rlctl.replay.recorder import Choose, Rollout, frame_time, play_episode
+from rlctl.replay.report import FilmReport
+from rlctl.replay.scene import Env
+from rlctl.run import files
+from rlctl.task.bullet import pybullet
+from rlctl.task.env import TaskEnv
+
+Picture = NDArray[np.uint8]
+SUFFIXES = (".mp4", ".gif")
+
+_SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels]
+_RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
+_DT = 1 / 30  # [s] a step, where an environment does not say
+_PAUSE_S = 0.5  # [s] at the end of each episode
+_EYE_DIRECTION = np.array([1.0, -0.9, 0.55])  # from the right of a robot that looks along x, from above
+_FIELD_OF_VIEW = 45.0  # [degrees]
+_CLOSEST, _FARTHEST = 0.8, 8.0  # [m]; the renderer draws nothing beyond 10 m
+_GROUND_SIZE = 8.0  # [m]; what is wider both ways is not looked at
+
+
+def check_file(path: Path) -> None:
+    """Raise `UsageError` for a file that is not a film's, or one that nothing installed can encode."""
+    if path.suffix not in SUFFIXES:
+        raise UsageError(f"--video {path}: give a file that ends in .mp4 or .gif")
+    if path.suffix == ".mp4":
+        try:
+            import av  # noqa: F401
+        except ImportError:
+            raise UsageError("--video: .mp4 needs PyAV: pip install 'rlctl[video]'; .gif needs nothing more") from None
+
+
+@contextlib.contextmanager
+def filmable_env(spec: EnvSpec) -> Iterator[Env]:
+    """Build an environment that can be filmed, and close it; raises `UsageError` for one that makes no pictures."""
+    try:
+        env = spec.make("rgb_array")
+    except RlctlError as error:
+        spec.make().close()  # raises again if the pictures were not the reason
+        raise UsageError(f"--video: {spec.task} makes no pictures: {str(error).splitlines()[0]}") from None
+    try:
+        yield env
+    finally:
+        env.close()
+
+
+def film_episodes(
+    path: Path, env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose], *, policy: str
+) -> tuple[list[Rollout], FilmReport]:
+    """Play an episode per seed and write one film of all, whole or not at all."""
+    rollouts: list[Rollout] = []
+    film = _Film(path.suffix, env)
+
+    def write(part: Path) -> None:
+        with film.open(part):
+            for seed in seeds:
+                rollouts.append(play_episode(env, spec, seed, film.watch(begin(seed)), policy=policy))
+                film.pause()
+
+    files.write_with(path, write)
+    return rollouts, film.report(path)
+
+
+class _Film:
+    """Takes the pictures of one film."""
+
+    def __init__(self, suffix: str, env: Env) -> None:
+        inner = env.unwrapped
+        self._view = _World(inner, *_SIZE[suffix]) if isinstance(inner, TaskEnv) else _Pictures(env)
+        dt = frame_time(env) or _DT
+        self._every = max(1, round(1 / (_RATE[suffix] * dt)))
+        self.rate = 1 / (dt * self._every)
+        self._writer: _Writer
+        self._count = 0
+        self._seconds = 0.0
+        self._last: Picture | None = None
+
+    @contextlib.contextmanager
+    def open(self, path: Path) -> Iterator[None]:
+        self._writer = (_Mp4 if path.suffix == ".mp4" else _Gif)(path, self.rate)
+        yield
+        self._writer.close()
+
+    def watch(self, choose: Choose) -> Choose:
+        """Take a picture before actions: of the reset, and of every few steps."""
+
+        def take_and_choose(observation: Any, step: int) -> Any:
+            if step == 0:
+                self._view.begin()
+            if step % self._every == 0:
+                self._take()
+            return choose(observation, step)
+
+        return take_and_choose
+
+    def _take(self) -> None:
+        start = time.perf_counter()
+        self._last = self._view.draw()
+        self._seconds += time.perf_counter() - start
+        self._count += 1
+        self._writer.add(self._last)
+
+    def pause(self) -> None:
+        """Take the end of an episode, and stay there for a moment."""
+        self._take()
+        assert self._last is not None
+        for _ in range(round(_PAUSE_S * self.rate)):
+            self._writer.add(self._last)
+
+    def report(self, path: Path) -> FilmReport:
+        assert self._last is not None
+        height, width = self._last.shape[:2]
+        return FilmReport(path, self._count, width, height, self.rate, self._count / self._seconds)
+
+
+class _View(abc.ABC):
+    """Draws the present state of an environment."""
+
+    def begin(self) -> None:  # noqa: B027 (most have nothing to do)
+        """Look at an episode that begins."""
+
+    @abc.abstractmethod
+    def draw(self) -> Picture:
+        """Return a picture, shape (height, width, 3)."""
+
+
+class _Pictures(_View):
+    """The pictures that an environment makes itself."""
+
+    def __init__(self, env: Env) -> None:
+        self._env = env
+
+    def draw(self) -> Picture:
+        try:
+            picture = np.asarray(self._env.render())
+        except Exception as error:  # missing pygame, no OpenGL
+            raise UsageError(f"--video: no picture of it: {type(error).__name__}: {error}") from None
+        if picture.ndim != 3 or picture.shape[2] != 3:
+            raise UsageError(f"--video: its render() returned {picture.dtype} of shape {picture.shape}, not a picture")
+        height, width = (size - size % 2 for size in picture.shape[:2])  # encoders want even sizes
+        return np.ascontiguousarray(picture[:height, :width].astype(np.uint8))
+
+
+class _World(_View):
+    """A task's PyBullet world, seen by a camera that follows the first robot that moves about."""
+
+    def __init__(self, env: TaskEnv, width: int, height: int) -> None:
+        self._env = env
+        self._size = width, height
+
+    def begin(self) -> None:
+        bodies = list(self._env.sim.bodies.values())
+        robots = [body for body in bodies if body.joint_names] or bodies
+        trunks = [(body, trunk) for body in robots if (trunk := body.find_trunk()) is not None]
+        self._followed = trunks[0] if trunks else None
+        markers = [np.asarray(position) for position in self._env.task.markers().values()]
+        if self._followed is None:
+            low, high = _find_bounds(bodies, markers)
+            self._target, distance = (low + high) / 2, 1.15 * float(np.linalg.norm(high - low))
+        else:
+            low, high = _find_bounds([self._followed[0]], [])
+            self._target, distance = (low + high) / 2, 1.6 * float(np.linalg.norm(high - low))
+            for marker in markers:
+                distance = max(distance, 2.5 * float(np.linalg.norm(marker - self._target)))
+        self._offset = min(max(distance, _CLOSEST), _FARTHEST) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
+
+    def draw(self) -> Picture:
+        if self._followed is not None:
+            body, trunk = self._followed
+            self._target[:2] = body.mass_state(trunk).position[:2]  # its height stays: a gait would shake the film
+        self._env.move_markers()
+        eye = self._target + self._offset
+        return self._env.sim.render(
+            *self._size, eye=eye.tolist(), target=self._target.tolist(), field_of_view=_FIELD_OF_VIEW
+        )
+
+
+def _find_bounds(bodies: Sequence[Any], markers: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the lowest and the highest corner [m] of bodies that are not the ground, and of markers."""
+    corners = list(markers)
+    for body in bodies:
+        boxes = [
+            np.array(pybullet.getAABB(body.id, link, physicsClientId=body.client))
+            for link in range(-1, len(body.link_names))
+        ]
+        wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
+        corners += [] if wide else list(itertools.chain(*boxes))
+    return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
+
+
+class _Writer(abc.ABC):
+    """Encodes pictures into a file."""
+
+    @abc.abstractmethod
+    def add(self, picture: Picture) -> None:
+        """Add a picture."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Finish the file."""
+
+
+class _Mp4(_Writer):
+    """H.264 in MP4, by PyAV: plays in browsers and slides."""
+
+    def __init__(self, path: Path, rate: float) -> None:
+        import av
+
+        self._av = av
+        self._container = av.open(str(path), "w", format="mp4", options={"movflags": "faststart"})
+        self._stream = self._container.add_stream("libx264", rate=fractions.Fraction(rate).limit_denominator(1000))
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.options = {"crf": "20"}
+
+    def add(self, picture: Picture) -> None:
+        if self._stream.width != picture.shape[1]:
+            self._stream.height, self._stream.width = picture.shape[:2]
+        frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        self._container.mux(self._stream.encode())
+        self._container.close()
+
+
+class _Gif(_Writer):
+    """An animated GIF, by Pillow, whose pictures are kept with their 256 colours until the end."""
+
+    def __init__(self, path: Path, rate: float) -> None:
+        self._path = path
+        self._duration = round(1000 / rate)  # [ms]
+        self._pictures: list[Any] = []
+
+    def add(self, picture: Picture) -> None:
+        from PIL import Image
+
+        self._pictures.append(Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE))
+
+    def close(self) -> None:
+        first, *rest = self._pictures
+        first.save(self._path, "GIF", save_all=True, append_images=rest, duration=self._duration, loop=0)
