@@ -162,7 +162,8 @@ class LoadedPolicy:
     def make_player(self) -> Player:
         """Return what plays it in this process, with the same bits as in workers."""
         if self.tensors is None:
-            return make_player(str(self.path.resolve()), self.info.env.spaces()[1])
+            observation_space, action_space = self.info.env.spaces()
+            return make_player(str(self.path.resolve()), action_space, observation_space)
         return PolicyPlayer(self.info, self.tensors)
 
 

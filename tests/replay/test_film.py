@@ -50,7 +50,7 @@ def test_pictures_of_a_plain_environment(tmp_path):
     rollout, _ = play("Pixels")
     save_episode(tmp_path / "one.npz", rollout.episode)
     film = run_replay(ReplayRequest(str(tmp_path / "one.npz"), video=tmp_path / "film.gif")).film
-    assert (film.pictures, film.width, film.height, film.rate) == (12, 60, 40, pytest.approx(20))
+    assert (film.pictures, film.width, film.height, film.rate) == (11, 60, 40, pytest.approx(20))
 
 
 def test_an_environment_without_pictures(tmp_path):
