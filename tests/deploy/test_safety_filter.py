@@ -203,7 +203,7 @@ def give_order(safety, order):
         getattr(safety, order)()
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(steps=STEPS, on_fault=st.sampled_from(["hold", "home", "stop"]), lowpass=st.sampled_from([None, 2.0]))
 def test_positions_keep_every_limit(steps, on_fault, lowpass):
     limits = {"position": [-1.0, 0.8], "speed": 2.0, "acceleration": 6.0}
@@ -228,7 +228,7 @@ def test_positions_keep_every_limit(steps, on_fault, lowpass):
     assert (np.abs(np.diff(moved, axis=0)) <= 0.06 + 1e-5).all()  # 6 rad/s^2 over 0.1 s twice
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(steps=STEPS, command=st.sampled_from(["step", "speed"]))
 def test_motions_keep_every_limit(steps, command):
     limits = {"position": [-1.0, 0.8], "speed": 2.0}
@@ -248,7 +248,7 @@ def test_motions_keep_every_limit(steps, command):
             assert ((known + x >= -1.0 - tolerance) | (x >= -tolerance)).all()
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(steps=STEPS, command=st.sampled_from(["torque", "action"]))
 def test_values_keep_every_limit(steps, command):
     limits = {"rate": 5.0, "action": [-1.5, 2.0], **({"torque": 1.8} if command == "torque" else {})}
