@@ -117,9 +117,24 @@ def test_python_is_python(block):
     compile(block.text, str(block), "exec")
 
 
-@pytest.mark.parametrize("block", find_blocks("yaml"), ids=str)
+def is_limits(block) -> bool:
+    return block.text.startswith("command:")
+
+
+@pytest.mark.parametrize("block", [each for each in find_blocks("yaml") if not is_limits(each)], ids=str)
 def test_recipes_are_recipes(block):
     recipe.validate(yaml_text.load(block.text, str(block)), str(block))
+
+
+def test_limits_are_limits_of_reach():
+    from rlctl.deploy import Limits, SafetyFilter
+    from rlctl.run.lookup import find_policy
+    from rlctl.run.policy import read_info
+    from rlctl.run.shipped import PRETRAINED
+
+    info = read_info(find_policy("reach", PRETRAINED).file)
+    (block,) = [each for each in find_blocks("yaml") if is_limits(each)]
+    SafetyFilter(info.env, Limits.model_validate(yaml_text.load(block.text, str(block))))
 
 
 def test_other_files_can_be_read():

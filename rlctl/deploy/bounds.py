@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.deploy.limits import JointLimits, Limits, check_names
 from rlctl.errors import RecipeError, UsageError
+from rlctl.joints import Joints
 
 Array = NDArray[np.float64]
 Report = Callable[[str, Array, Array, Array], None]
@@ -32,11 +33,12 @@ class Bounds:
     move by `x` in a control step; the arrays bound `x`, its change, and where it leads.
     """
 
-    def __init__(self, limits: Limits, space: spaces.Box, names: list[str], control_dt: float | None) -> None:
+    def __init__(
+        self, limits: Limits, space: spaces.Box, names: list[str], control_dt: float | None, known: Joints | None = None
+    ) -> None:
         self.names = names
-        count = len(names)
         check_names("joint", [name for name in limits.limits if name != "all"], names, "limits: ")
-        each = [_merge(limits, name) for name in names]
+        each = [_merge(limits, name, _list_known(limits, known, index)) for index, name in enumerate(names)]
         for joint, name in zip(each, names, strict=True):
             _check_fitting(limits, joint, name)
         timed = limits.command == "speed" or any(joint.speed or joint.acceleration or joint.rate for joint in each)
@@ -44,13 +46,15 @@ class Bounds:
             raise RecipeError("limits: this policy does not say its control_dt; write control_dt: SECONDS")
         dt = control_dt or 1.0
         self.is_value = limits.command in ("position", "torque", "action")
-        scale = np.broadcast_to(np.asarray(limits.scale, np.float64), (count,)) if _fits(limits.scale, count) else None
-        if scale is None:
-            raise RecipeError(f"limits: scale has {len(np.atleast_1d(limits.scale))} numbers, the action {count}")
+        scale, offset = _choose_units(limits, known, names)
+        if not self.is_value and offset.any():
+            raise RecipeError(f"limits: offset: with command: {limits.command} action 0 is to keep still; leave it out")
+        self.offset = offset
+        """What action 0 is in the unit of a value."""
         self.factor = scale * (dt if limits.command == "speed" else 1.0)
         """What 1 of the action is in the unit of `x`."""
-        low = self.factor * np.maximum(space.low.ravel(), _gather(each, "action", -np.inf, 0))
-        high = self.factor * np.minimum(space.high.ravel(), _gather(each, "action", np.inf, 1))
+        low = offset + self.factor * np.maximum(space.low.ravel(), _gather(each, "action", -np.inf, 0))
+        high = offset + self.factor * np.minimum(space.high.ravel(), _gather(each, "action", np.inf, 1))
         position = np.array([_gather(each, "position", -np.inf, 0), _gather(each, "position", np.inf, 1)])
         speed = np.array([joint.speed or joint.rate or np.inf for joint in each]) * dt
         if self.is_value:
@@ -153,10 +157,27 @@ def _clip(x: Array, low: Any, high: Any, name: str, report: Report) -> Array:
     return allowed
 
 
-def _merge(limits: Limits, name: str) -> JointLimits:
+def _merge(limits: Limits, name: str, known: dict[str, Any]) -> JointLimits:
     own = limits.limits.get(name, JointLimits())
     every = limits.limits.get("all", JointLimits())
-    return JointLimits(**{**every.model_dump(exclude_none=True), **own.model_dump(exclude_none=True)})
+    given = {**every.model_dump(exclude_none=True), **own.model_dump(exclude_none=True)}
+    return JointLimits(**{**known, **given})
+
+
+def _list_known(limits: Limits, joints: Joints | None, index: int) -> dict[str, Any]:
+    """Return the limits of one joint that the task's model of the robot has, as far as they can be kept."""
+    found: dict[str, Any] = {}
+    if joints is None:
+        return found
+    measured = limits.measured.position is not None
+    moves = limits.command in ("position", "step", "speed")
+    if joints.low and joints.high and (limits.command == "position" or (moves and measured)):
+        found["position"] = joints.low[index], joints.high[index]
+    if joints.max_speed and moves and measured:
+        found["speed"] = joints.max_speed[index]
+    if joints.max_torque and limits.command == "torque":
+        found["torque"] = joints.max_torque[index]
+    return found
 
 
 def _check_fitting(limits: Limits, joint: JointLimits, name: str) -> None:
@@ -169,8 +190,21 @@ def _check_fitting(limits: Limits, joint: JointLimits, name: str) -> None:
             )
 
 
-def _fits(value: Any, count: int) -> bool:
-    return not isinstance(value, list) or len(value) == count
+def _choose_units(limits: Limits, known: Joints | None, names: list[str]) -> tuple[Array, Array]:
+    """Return scale and offset of the command, per joint."""
+    scale: Any = 1.0
+    offset: Any = 0.0
+    if known is not None and known.action_scale and limits.command == "position":
+        scale, offset = known.action_scale, known.default_positions or 0.0
+    return _spread("scale", limits.scale, scale, names), _spread("offset", limits.offset, offset, names)
+
+
+def _spread(key: str, given: Any, default: Any, names: list[str]) -> Array:
+    """Return a number per joint: what was given, or the default."""
+    values = np.atleast_1d(np.asarray(default if given is None else given, np.float64))
+    if len(values) not in (1, len(names)):
+        raise RecipeError(f"limits: {key} has {len(values)} numbers, the action {len(names)}")
+    return np.broadcast_to(values, (len(names),)).copy()
 
 
 def _gather(joints: list[JointLimits], key: str, default: float, end: int) -> Array:

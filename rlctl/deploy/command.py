@@ -77,7 +77,7 @@ class Command:
     def follow(self, action: Array) -> NDArray[Any]:
         """Return the action closest to a wanted one. Raises `OutsideLimits` at the first step."""
         start = self._present(action)
-        target = action * self._bounds.factor
+        target = self._bounds.offset + action * self._bounds.factor
         if self._alpha < 1.0:
             before = start if self._smooth is None else self._smooth
             self._smooth = target = before + self._alpha * (target - before)
@@ -113,7 +113,7 @@ class Command:
         elif self.position is not None:
             start = self.position
         elif action is not None:
-            start = action * self._bounds.factor
+            start = self._bounds.offset + action * self._bounds.factor
         else:  # nobody knows where it is
             return self._safe if self._home is None else self._home
         self._reference = np.minimum(np.maximum(start, self._bounds.low), self._bounds.high)
@@ -134,7 +134,7 @@ class Command:
             self._before = bounds.bound(target - reference, self._before, reference, self._describe)
             command = np.minimum(np.maximum(reference + self._before, bounds.low), bounds.high)
             self._reference = command
-        action = (command / bounds.factor).astype(self._space.dtype)
+        action = ((command - bounds.offset) / bounds.factor).astype(self._space.dtype)
         if action.ndim != len(self._space.shape):
             action = action.reshape(self._space.shape)
         result: NDArray[Any] = np.minimum(np.maximum(action, self._space.low), self._space.high)
@@ -152,7 +152,8 @@ class Command:
                 value, at = x / bounds.factor, limit / bounds.factor
             else:
                 assert self._reference is not None  # positions are bounded from there
-                unit = bounds.factor if name == "action" else 1.0
-                value, at = (self._reference + x) / unit, (self._reference + allowed) / unit
+                value, at = self._reference + x, self._reference + allowed
+                if name == "action":
+                    value, at = (value - bounds.offset) / bounds.factor, (at - bounds.offset) / bounds.factor
         for index in np.flatnonzero(np.abs(allowed - x) > 1e-9).tolist():
             self._report(f"{bounds.names[index]}.{name}", float(value[index]), float(at[index]))

@@ -46,10 +46,14 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     count = math.prod(space.shape or ())
     bounds: Bounds | None = None
     if isinstance(space, spaces.Box):
-        names = limits.joints or _list_joints(info, count)
+        known = info.joints if info.joints is not None and len(info.joints.names) == count else None
+        if limits.joints is not None and known is not None and limits.joints != list(known.names):
+            check_names("joint", limits.joints, known.names, "limits: joints: ")
+            raise RecipeError(f"limits: joints: the action's order is {', '.join(known.names)}")
+        names = limits.joints or (list(known.names) if known else [f"action[{index}]" for index in range(count)])
         if len(names) != count or len(set(names)) != count:
             raise RecipeError(f"limits: joints: {len(set(names))} different names, the action has {count} elements")
-        bounds = Bounds(limits, space, names, control_dt)
+        bounds = Bounds(limits, space, names, control_dt, known)
     elif limits.limits or limits.lowpass_hz:
         raise UsageError("limits: the actions of this policy are choices, not quantities that can be bounded")
     measured = _find_measured(limits, layout, count)
@@ -60,11 +64,6 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     _check_measured(limits, bounds, measured, layout)
     safe = _make_safe_command(limits, bounds, count)
     return FittedLimits(layout, space, control_dt, bounds, measured, home, safe)
-
-
-def _list_joints(info: EnvInfo, count: int) -> list[str]:
-    names = list(getattr(info, "joint_names", ()))
-    return names if len(names) == count else [f"action[{index}]" for index in range(count)]
 
 
 def _find_measured(limits: Limits, layout: ObservationLayout, count: int) -> slice | None:
@@ -114,7 +113,7 @@ def _make_safe_command(limits: Limits, bounds: Bounds | None, count: int) -> Arr
         raise RecipeError("limits: safe_action: of positions, steps and speeds it is to keep still; leave it out")
     if bounds is None:
         return np.zeros(count)
-    wanted = np.zeros(count) if safe is None else safe * bounds.factor
+    wanted = bounds.offset + (np.zeros(count) if safe is None else safe) * bounds.factor
     clipped: Array = np.clip(wanted, bounds.low, bounds.high)
     if safe is not None and not np.allclose(clipped, wanted):
         raise RecipeError("limits: safe_action: it is outside the limits of the action")

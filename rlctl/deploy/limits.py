@@ -21,6 +21,7 @@ _UNITS = {
     "acceleration": "rad/s^2 or m/s^2",
     "torque": "N m or N",
     "rate": "1/s",
+    "offset": "rad, m, N m or their like",
     "scale": "rad, m, N m or their like per 1 of the action",
     "lowpass_hz": "Hz",
     "control_dt": "s",
@@ -82,12 +83,15 @@ class Limits(_Section):
 
     command: Literal["position", "step", "speed", "torque", "action"] = "action"
     """What an action commands: joint positions, steps from the present positions, speeds, torques, or anything."""
-    scale: Positive | list[Positive] = 1.0
-    """Size of 1 of the action in the unit of the command; one number, or one per joint."""
+    scale: Positive | list[Positive] | None = None
+    """Size of 1 of the action in the unit of the command; one number, or one per joint. null: the task's, or 1."""
+    offset: Number | list[Number] | None = None
+    """Command of action 0, for commands of position, torque and action. null: the task's default positions, or 0."""
     joints: list[str] | None = None
-    """Names of the joints in the order of the action."""
+    """Names of the joints in the order of the action; null: the task's."""
     limits: dict[str, JointLimits] = {}
-    """Limits by joint name; `all` is for every joint, and a joint's own are put over it."""
+    """Limits by joint name; `all` is for every joint, and a joint's own are put over it. What is not said is as the
+    task's model of the robot has it."""
     lowpass_hz: Positive | None = None
     """Cut-off frequency of the low-pass on the command [Hz]."""
     blend_in_s: Annotated[Number, Field(ge=0)] = 0.0

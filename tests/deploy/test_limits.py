@@ -5,8 +5,9 @@ from gymnasium import spaces
 
 from rlctl.deploy import SafetyFilter, read_limits
 from rlctl.errors import ArtifactError, RecipeError
+from rlctl.joints import Joints
 from rlctl.run.env_info import EnvInfo, space_to_json
-from tests.deploy.conftest import make_arm
+from tests.deploy.conftest import make_arm, observe_at
 
 GOOD = """
 command: position
@@ -86,6 +87,31 @@ def test_limits_that_a_policy_cannot_have(write, arm, change, message):
     with pytest.raises(RecipeError) as error:
         SafetyFilter(arm, write(GOOD.replace(*change)))
     assert message in str(error.value)
+
+
+def test_what_the_task_knows_of_its_joints(write, arm):
+    known = Joints(
+        ["hip", "knee"],
+        default_positions=[0.5, -1.0],
+        action_scale=[0.25, 0.5],
+        low=[-1, -2],
+        high=[0.6, 0],
+        max_speed=[9, 9],
+    )  # fmt: skip
+    arm = arm.model_copy(update={"joints": known})
+    safety = SafetyFilter(arm, write("command: position\nlimits: {knee: {position: [-1.5, -0.5]}}"))
+    safety.observe(observe_at(0, 0))
+    # 0.5 + 0.25 * 0.2 and -1 + 0.5 * 0.2 are within; 0.5 + 0.25 * 2 = 1 is not below 0.6, which is 0.4 of the action.
+    assert safety.limit([0.2, 0.2]) == pytest.approx([0.2, 0.2])
+    assert safety.limit([2.0, -9.0]) == pytest.approx([0.4, -1.0])
+    assert [(event.name, event.limit) for event in list(safety.events)[-2:]] == [
+        ("hip.position", pytest.approx(0.6)),
+        ("knee.position", pytest.approx(-1.5)),
+    ]
+    with pytest.raises(RecipeError, match="the action's order is hip, knee"):
+        SafetyFilter(arm, write("joints: [knee, hip]"))
+    with pytest.raises(RecipeError, match="action 0 is to keep still"):
+        SafetyFilter(arm, write("{command: speed, offset: 1}"))
 
 
 def test_without_a_control_dt(write):

@@ -35,7 +35,9 @@ def test_it_acts_through_our_server(tmp_path):
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"
     installed = subprocess.run(
-        [python, "-m", "pip", "install", "-q", "openpi-client==0.1.2", "typing-extensions"], capture_output=True, text=True
+        [python, "-m", "pip", "install", "-q", "openpi-client==0.1.2", "typing-extensions"],
+        capture_output=True,
+        text=True,
     )
     if installed.returncode != 0:
         pytest.skip(f"openpi-client cannot be installed here: {installed.stderr.splitlines()[-1:]}")
