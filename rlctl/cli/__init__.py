@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from rlctl import __version__, error_boundary
-from rlctl.cli import check_env, eval, export, replay, runs, serve, tasks, train
+from rlctl.cli import check_env, eval, export, identify, replay, runs, serve, tasks, train
 from rlctl.errors import RlctlError
 
 app = typer.Typer(
@@ -48,6 +48,7 @@ app.command("eval")(eval.evaluate)
 app.command()(export.export)
 app.command()(replay.replay)
 app.command()(serve.serve)
+app.command()(identify.identify)
 app.add_typer(tasks.app, name="tasks")
 app.add_typer(runs.app, name="runs")
 

@@ -1,0 +1,60 @@
+"""`rlctl identify`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rlctl import completion
+from rlctl.cli.arguments import TASK_FORMS, Json, Set, claim_stdout, parse_changes
+
+
+def identify(
+    task: Annotated[str, typer.Argument(metavar="TASK", help=TASK_FORMS, autocompletion=completion.complete_task)],
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--log",
+            metavar="FILE",
+            help="CSV of the robot: time, action_..., position_JOINT, velocity_JOINT; a row per action.",
+            show_default=False,
+        ),
+    ] = None,
+    excite: Annotated[
+        Path | None,
+        typer.Option("--excite", metavar="FILE", help="Write a safe trajectory to log instead.", show_default=False),
+    ] = None,
+    events: Annotated[
+        list[str],
+        typer.Option("--event", metavar="NAME", help="Find the values of this event only; repeat it for more."),
+    ] = [],
+    seconds: Annotated[float, typer.Option(help="Length of the trajectory of --excite [s].", min=1.0)] = 10.0,
+    settings: Set = [],
+    seed: Annotated[int, typer.Option(help="Seed of the search, or of the trajectory.", min=0)] = 0,
+    json: Json = None,
+) -> None:
+    """Find the physical values that make the simulation follow a recording of the robot."""
+    claim_stdout()
+    from rlctl import output
+    from rlctl.deploy.identify import report
+    from rlctl.deploy.identify.excite import write_excitation
+    from rlctl.deploy.identify.identify import identify
+    from rlctl.env_spec import EnvSpec
+    from rlctl.errors import UsageError
+
+    spec = parse_changes(settings).apply(EnvSpec(task))
+    if excite is not None and log is None:
+        report.show_excitation(write_excitation(spec, excite, seconds=seconds, seed=seed), json)
+        return
+    if log is None or excite is not None:
+        raise UsageError(f"give one of: rlctl identify {task} --excite FILE, or --log FILE")
+    found = identify(
+        spec,
+        log,
+        events=events,
+        seed=seed,
+        report=lambda line: output.err().print(f"identify: {line}", highlight=False),
+    )
+    report.show(found, json)

@@ -1,0 +1,128 @@
+"""A trajectory that tells much about a robot and stays within its limits: every action a sum of sines."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlctl.deploy.identify.follow import describe_expected, find_joints, open_world
+from rlctl.deploy.identify.log import Array, Log, write_log
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import AnswerIsNo
+from rlctl.task.env import TaskEnv
+from rlctl.task.events import EventSettings
+
+_LOWEST_HZ, _HIGHEST_HZ = 0.2, 2.5
+_SINES = 5  # per action, each with frequencies of its own
+_AMPLITUDES = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.15, 0.1, 0.05)
+_MARGIN = 0.1  # of a joint's range that is left at both ends
+_FADE_S = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Excitation:
+    """A trajectory that was simulated without leaving the limits."""
+
+    path: Path
+    task: str
+    seconds: float
+    amplitude: float
+    """Part of the actions' range that it uses."""
+    largest_share: float
+    """How far the joints went, of their range without its margins; 0 where no joint has limits."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain data."""
+        return {**dataclasses.asdict(self), "path": str(self.path)}
+
+
+def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) -> Excitation:
+    """Write the largest trajectory that is safe in simulation, as a log: actions, and what the simulation did.
+
+    Safe: every joint stays 10 % of its range away from its ends and below its top speed, no body that is fixed to the
+    world touches another one, and the task does not end. Raises `AnswerIsNo` if even 5 % of the actions' range is not.
+    """
+    env = open_world(spec)
+    try:
+        expected = describe_expected(env, spec.task)
+        # A world as the task builds it; what acts by chance would only disturb.
+        env.set_events(EventSettings())
+        shape = _draw_sines(env, round(seconds / env.task.control_dt), seed)
+        reason = ""
+        for amplitude in _AMPLITUDES:
+            reason, log, share = _try(env, amplitude * shape, expected.driven)
+            if not reason:
+                write_log(path, log, expected)
+                return Excitation(path, spec.task, seconds, amplitude, share)
+        raise AnswerIsNo(
+            f"{spec.task}: no safe trajectory found: even at {_AMPLITUDES[-1]:.0%} of the actions {reason}"
+        )
+    finally:
+        env.close()
+
+
+def _draw_sines(env: TaskEnv, steps: int, seed: int) -> Array:
+    """Return a trajectory of shape (steps, actions), within [-1, 1] of half the actions' range, from rest to rest."""
+    rng = np.random.default_rng(seed)
+    count = int(np.prod(env.action_space.shape or ()))
+    time = np.arange(steps)[:, None] * env.task.control_dt
+    total = np.zeros((steps, count))
+    for _ in range(_SINES):
+        hertz = np.exp(rng.uniform(np.log(_LOWEST_HZ), np.log(_HIGHEST_HZ), count))
+        total += np.sin(2 * np.pi * hertz * time + rng.uniform(0, 2 * np.pi, count))
+    fade = max(1, round(_FADE_S / env.task.control_dt))
+    ramp = np.minimum(1.0, np.minimum(np.arange(steps), np.arange(steps)[::-1])[:, None] / fade)
+    total *= ramp
+    result: Array = total / np.abs(total).max(axis=0)
+    return result
+
+
+def _try(env: TaskEnv, shape: Array, driven: tuple[str, ...]) -> tuple[str, Log, float]:
+    """Play a trajectory; return why it is not safe, or nothing, the log, and how far the joints went."""
+    joints = find_joints(env)
+    names = driven or tuple(joints)
+    low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
+    middle = np.clip(np.zeros_like(low), low, high)
+    env.reset(seed=0)
+    actions, measured, share = [], [], 0.0
+    for row in shape:
+        side = row.reshape(low.shape)
+        action = (middle + np.where(side > 0, side * (high - middle), side * (middle - low))).astype(low.dtype)
+        states = [
+            (float(body.joint_positions[i]), float(body.joint_velocities[i])) for body, i in (joints[n] for n in names)
+        ]
+        actions.append(action.ravel())
+        measured.append(states)
+        env.task.act(action)
+        env.sim.step()
+        reason, reached = _find_danger(env, [joints[name] for name in names], names)
+        if reason:
+            return reason, Log(names, np.array(actions), np.zeros(0), np.zeros(0)), share
+        share = max(share, float(reached))
+    arrays = np.array(measured)
+    return "", Log(names, np.array(actions), arrays[:, :, 0], arrays[:, :, 1]), share
+
+
+def _find_danger(env: TaskEnv, joints: list[tuple[Any, int]], names: tuple[str, ...]) -> tuple[str, float]:
+    largest = 0.0
+    for (body, index), name in zip(joints, names, strict=True):
+        low, high, limit = body.joint_low[index], body.joint_high[index], body.joint_max_speed[index]
+        position, speed = body.joint_positions[index], abs(body.joint_velocities[index])
+        if low < high and np.isfinite(high - low):
+            middle, half = (low + high) / 2, (high - low) * (0.5 - _MARGIN)
+            largest = max(largest, abs(position - middle) / half)
+            if largest > 1:
+                return f"{name} comes near its end", largest
+        if limit > 0 and speed > 1.05 * limit:
+            return f"{name} turns faster than its {limit:.3g} rad/s", largest
+    if env.task.is_terminated():
+        return "the episode ends", largest
+    bodies = {id(body): body for body, _ in joints if body.fixed}.values()
+    for body in bodies:
+        for other in env.sim.bodies.values():
+            if other is not body and (touching := body.links_touching(other)):
+                return f"{sorted(touching)[0]} touches {other.name}", largest
+    return "", largest

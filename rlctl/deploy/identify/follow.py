@@ -1,0 +1,125 @@
+"""Plays a log's actions in the task's world and compares what the joints do with what was measured."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from rlctl.deploy.identify.log import Array, Expected, Log
+from rlctl.deploy.identify.parameters import Unknowns
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import TaskError, UsageError
+from rlctl.task.env import TaskEnv
+from rlctl.task.events import EventSettings
+
+WINDOW_S = 1.0
+"""After so long [s] the simulation begins again from what was measured: small errors do not add up without end."""
+_SMOOTHED = 9  # rows, around the one that a window begins from
+
+
+def open_world(spec: EnvSpec) -> TaskEnv:
+    """Build a task's environment; raises `UsageError` for an environment that is not a task of rlctl."""
+    env = spec.make().unwrapped
+    if not isinstance(env, TaskEnv):
+        env.close()
+        raise UsageError(f"{spec.task} is a plain Gymnasium environment: only tasks of rlctl have events to identify")
+    if not hasattr(env.action_space, "low"):
+        env.close()
+        raise UsageError(f"{spec.task}: identify is for actions in a Box, not {env.action_space}")
+    return env
+
+
+def find_joints(env: TaskEnv) -> dict[str, tuple[Any, int]]:
+    """Return the joints of the world by name: the body and the index in its joint arrays."""
+    found: dict[str, tuple[Any, int]] = {}
+    for body in env.sim.bodies.values():
+        for index, joint in enumerate(body.joint_names):
+            found.setdefault(joint, (body, index))
+    return found
+
+
+def describe_expected(env: TaskEnv, task: str) -> Expected:
+    """Return what a log of this task has to hold; raises `UsageError` if no joint of a fixed body is there."""
+    joints = find_joints(env)
+    described = env.task.describe_joints()
+    driven = tuple(described.names) if described else ()
+    free = [body.name for body, _ in joints.values() if not body.fixed and body.joint_names]
+    if not joints or (free and not any(body.fixed for body, _ in joints.values())):
+        what = f"the base of {free[0]!r} is free, and a log of joints does not have it" if free else "it has no joints"
+        raise UsageError(f"{task}: {what}; identify is for robots with a fixed base")
+    limits = {name: (float(body.joint_low[i]), float(body.joint_high[i])) for name, (body, i) in joints.items()}
+    return Expected(limits, driven, int(np.prod(env.action_space.shape or ())), env.task.control_dt)
+
+
+class Follower:
+    """A world and a log; `compare` says how far apart they are for some values."""
+
+    def __init__(self, env: TaskEnv, log: Log, unknowns: Unknowns) -> None:
+        self.unknowns = unknowns
+        self._env = env
+        self._log = log
+        self._joints = [find_joints(env)[name] for name in log.joints]
+        self._bodies = {body.name: body for body, _ in self._joints}
+        steps = max(10, round(WINDOW_S / env.task.control_dt))
+        self.starts = list(range(0, len(log.actions) - 2, steps))
+        """Rows that the simulation begins from."""
+        self.steps = steps
+        self.control_dt = env.task.control_dt
+        rows = min(_SMOOTHED, len(log.actions) // 2 * 2 - 1)
+        self._begin = [savgol_filter(values, rows, 2, axis=0) for values in (log.positions, log.velocities)]
+        self._measured = np.concatenate([log.positions, log.velocities], axis=1)
+        shape = env.action_space.shape or ()
+        self._actions = log.actions.reshape(-1, *shape)
+        low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
+        self._resting = np.clip(np.zeros(shape), low, high)
+        self._dtype = env.action_space.dtype
+
+    @property
+    def spread(self) -> Array:
+        """How much each measured position and velocity varies, shape (2 * joints,)."""
+        spread: Array = np.maximum(self._measured.std(axis=0), 1e-9)
+        return spread
+
+    def compare(self, positions: Array | None, delay: int) -> Array:
+        """Return simulated less measured positions and velocities, shape (rows, 2 * joints), window by window.
+
+        `positions` are those of the unknowns in their ranges; None is the world as the task builds it.
+        """
+        changes = {} if positions is None else self.unknowns.settings(positions.tolist())
+        self._env.set_events(EventSettings(False, changes))
+        errors: Array = np.concatenate([self._play(start, delay) for start in self.starts]) - np.concatenate(
+            [self._measured[start + 1 : start + 1 + self.steps] for start in self.starts]
+        )
+        return errors
+
+    def windows(self) -> list[slice]:
+        """Return the rows of each window in what `compare` returns."""
+        ends = np.cumsum([len(self._measured[start + 1 : start + 1 + self.steps]) for start in self.starts])
+        return [slice(low, high) for low, high in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)]
+
+    def _play(self, start: int, delay: int) -> Array:
+        env = self._env
+        env.reset(seed=0)
+        for body in self._bodies.values():
+            angles, speeds = body.joint_positions.copy(), body.joint_velocities.copy()
+            for column, (owner, index) in enumerate(self._joints):
+                if owner is body:
+                    angles[index], speeds[index] = self._begin[0][start, column], self._begin[1][start, column]
+            body.set_joints(angles, speeds)
+        rows = min(self.steps, len(self._actions) - 1 - start)
+        played = np.empty((rows, self._measured.shape[1]))
+        for row in range(rows):
+            step = start + row - delay
+            action = self._actions[step] if step >= 0 else self._resting
+            env.task.act(action.astype(self._dtype))
+            env.sim.step()
+            played[row] = self._read()
+        if not np.isfinite(played).all():
+            raise TaskError("the simulation of the log is not finite")
+        return played
+
+    def _read(self) -> list[float]:
+        states = {name: (body.joint_positions, body.joint_velocities) for name, body in self._bodies.items()}
+        return [float(states[body.name][kind][index]) for kind in (0, 1) for body, index in self._joints]

@@ -1,0 +1,221 @@
+"""Finds the physical values of a task's events from a log, and says how well the log determines each."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlctl.deploy.identify.follow import Follower, describe_expected, open_world
+from rlctl.deploy.identify.log import Array, Log, check_actions, read_log
+from rlctl.deploy.identify.parameters import Parameter, Unknowns, find_unknowns
+from rlctl.deploy.identify.search import Fit, SearchWorkers, search
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import AnswerIsNo
+from rlctl.rollout.workers import available_cores
+
+CONFIDENCE = 1.96
+"""Standard deviations of a 95 % interval."""
+WIDEST = 0.3
+"""A value whose interval goes further than this part of it to each side is not known from the log."""
+_SHARE = 0.3  # of a direction that a value has at least, to be named with it
+_LEAST_WIDTH = 0.02
+"""Of a value, to train on: an interval is about the noise of the log, and the model is not the robot."""
+_STILL = 1e-3  # [rad or m]
+_TOLD_APART = 1.05  # ratio of two delays' errors from which on they differ
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """A value with its 95 % interval."""
+
+    name: str
+    event: str
+    key: str
+    value: float
+    low: float
+    high: float
+    known: bool
+    note: str = ""
+    """Why it is not known, or that it is at the end of the range it was looked for in."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Identification:
+    """What a log says of a task's physical values."""
+
+    task: str
+    log: Path
+    rows: int
+    seconds: float
+    values: list[Found]
+    delay_event: str
+    delay: int
+    """[control steps]."""
+    delay_known: bool
+    position_error: tuple[float, float]
+    """Root mean square of the positions' error [rad or m], with the task's own values and with the found ones."""
+    velocity_error: tuple[float, float]
+    """[rad/s or m/s]."""
+    curves: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Of the joint that was followed worst: its name, measured positions, and those simulated before and after."""
+
+    def events(self) -> dict[str, dict[str, Any]]:
+        """Return what is known as a recipe's `events`: the intervals, to train on, at least 2 % to each side."""
+        settings: dict[str, dict[str, Any]] = {}
+        for each in self.values:
+            if each.known:
+                least = _LEAST_WIDTH * abs(each.value)
+                low, high = min(each.low, each.value - least), max(each.high, each.value + least)
+                settings.setdefault(each.event, {})[each.key] = [_round(low), _round(high)]
+        if self.delay_event and self.delay_known:
+            settings[self.delay_event] = {"steps": [self.delay, self.delay]}
+        return settings
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain data."""
+        return {**dataclasses.asdict(self), "log": str(self.log), "events": self.events()}
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def identify(
+    spec: EnvSpec,
+    log_file: Path,
+    *,
+    events: Collection[str] = (),
+    seed: int = 0,
+    n_workers: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> Identification:
+    """Find the values of a task's events, all or those named, with which the simulation follows a log.
+
+    Raises `ArtifactError` for a log that cannot be used, `UsageError` for what the task does not have, and `AnswerIsNo`
+    if the log says nothing of any value.
+    """
+    env = open_world(spec)
+    try:
+        unknowns = find_unknowns(env.task.events, events, spec.task)
+        expected = describe_expected(env, spec.task)
+        log = read_log(log_file, expected)
+        space: Any = env.action_space
+        check_actions(log, log_file, np.ravel(space.low), np.ravel(space.high))
+        if log.positions.std(axis=0).max() < _STILL:
+            raise AnswerIsNo(
+                f"{log_file}: nothing moves in this log, so it says nothing of {', '.join(_list_names(unknowns))}; "
+                f"a trajectory that does: rlctl identify {spec.task} --excite FILE"
+            )
+        follower = Follower(env, log, unknowns)
+        weights = 1.0 / follower.spread
+        with SearchWorkers(spec, log, unknowns, n_workers or available_cores()) as workers:
+            fits = search(workers, unknowns, weights, seed, report)
+        best = min(fits.values(), key=lambda fit: fit.cost)
+        found = _judge(unknowns, best)
+        delay_known = all(fit.cost > _TOLD_APART * best.cost for fit in fits.values() if fit is not best)
+        if not any(each.known for each in found) and not (unknowns.delay and delay_known):
+            notes = "; ".join(dict.fromkeys(each.note for each in found))
+            raise AnswerIsNo(
+                f"{log_file}: this log determines none of the values: {notes}\n"
+                f"a trajectory that moves more: rlctl identify {spec.task} --excite FILE"
+            )
+        return _summarise(spec.task, log_file, follower, log, best, found, delay_known)
+    finally:
+        env.close()
+
+
+def _list_names(unknowns: Unknowns) -> list[str]:
+    return [*(each.name for each in unknowns.parameters), *([unknowns.delay] if unknowns.delay else [])]
+
+
+def _summarise(
+    task: str, file: Path, follower: Follower, log: Log, best: Fit, found: list[Found], delay_known: bool
+) -> Identification:
+    before, after = follower.compare(None, 0), follower.compare(best.at, best.delay)
+    count = len(log.joints)
+
+    def sizes(errors: Array) -> tuple[float, float]:
+        return _root_mean_square(errors[:, :count]), _root_mean_square(errors[:, count:])
+
+    errors = list(zip(sizes(before), sizes(after), strict=True))
+    worst = int(np.square(before[:, :count]).mean(axis=0).argmax())
+    measured = np.concatenate([log.positions[start + 1 :][: follower.steps] for start in follower.starts])[:, worst]
+    return Identification(
+        task=task,
+        log=file,
+        rows=len(log.actions),
+        seconds=len(log.actions) * follower.control_dt,
+        values=found,
+        delay_event=follower.unknowns.delay,
+        delay=best.delay,
+        delay_known=delay_known,
+        position_error=errors[0],
+        velocity_error=errors[1],
+        curves={
+            "joint": log.joints[worst],
+            "measured": measured.tolist(),
+            "before": (measured + before[:, worst]).tolist(),
+            "after": (measured + after[:, worst]).tolist(),
+        },
+    )
+
+
+def _root_mean_square(values: Array) -> float:
+    return float(np.sqrt(np.square(values).mean()))
+
+
+def _judge(unknowns: Unknowns, fit: Fit) -> list[Found]:
+    """Return each value with its interval, and whether the log determines it."""
+    if not unknowns.parameters:
+        return []
+    spans = np.array([each.relative_span for each in unknowns.parameters])
+    # As changes of the values' logarithms (or of the values themselves), not of positions in their ranges.
+    information = fit.information / np.outer(spans, spans)
+    regular = information + 1e-9 * np.trace(information) * np.eye(len(spans)) + 1e-12 * np.eye(len(spans))
+    inverse = np.linalg.inv(regular)
+    by_window = inverse @ (fit.spread_by_window / np.outer(spans, spans)) @ inverse
+    deviations = np.sqrt(np.maximum(np.diag(inverse) * fit.cost, np.diag(by_window)))
+    alone = np.sqrt(fit.cost / np.diag(regular))  # if all others were known
+    return [
+        _judge_one(unknowns, index, fit, float(deviations[index]), float(alone[index]), regular)
+        for index in range(len(spans))
+    ]
+
+
+def _judge_one(unknowns: Unknowns, index: int, fit: Fit, deviation: float, alone: float, information: Array) -> Found:
+    parameter, position = unknowns.parameters[index], float(fit.at[index])
+    value, half = parameter.value(position), CONFIDENCE * deviation
+    if parameter.is_logarithmic:
+        low, high = value * np.exp(-min(half, 5.0)), value * np.exp(min(half, 5.0))
+        known, known_alone = half <= WIDEST, CONFIDENCE * alone <= WIDEST
+    else:
+        low, high = value - half, value + half
+        limit = WIDEST * max(abs(value), 0.1 * parameter.relative_span)
+        known, known_alone = half <= limit, CONFIDENCE * alone <= limit
+    note = ""
+    if not known:
+        note = (
+            _explain_unknown(unknowns, index, information)
+            if known_alone
+            else f"this log says nothing of {parameter.name}"
+        )
+    elif min(position, 1 - position) < 0.005:
+        end = parameter.low if position < 0.5 else parameter.high
+        note = f"at the end of the range it was looked for in, {end:.3g}: is something else different?"
+        known = False
+    return Found(parameter.name, parameter.event, parameter.key, value, float(low), float(high), bool(known), note)
+
+
+def _explain_unknown(unknowns: Unknowns, index: int, information: Array) -> str:
+    """Say which values together can change without a trace in the log."""
+    sizes, directions = np.linalg.eigh(information)
+    shares = np.abs(directions[index]) / np.sqrt(np.maximum(sizes, 1e-12 * sizes[-1]))
+    direction = directions[:, int(shares.argmax())]
+    names = [each.name for each, part in zip(unknowns.parameters, direction, strict=True) if abs(part) >= _SHARE]
+    own: Parameter = unknowns.parameters[index]
+    others = [name for name in names if name != own.name] or ["the others"]
+    return f"this log cannot tell {own.name} from {' and '.join(others)}"

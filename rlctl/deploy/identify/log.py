@@ -1,0 +1,190 @@
+"""A recording of a robot: a CSV file with a row per control step, columns by name."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.run import files, untrusted
+
+Array = NDArray[np.float64]
+
+TIME = "time"
+_POSITION, _VELOCITY = "position_", "velocity_"
+_GAP = 1.5
+"""Control periods between two rows from which on something is missing between them."""
+_OTHER_RATE = 0.1
+"""Relative difference of the rows' period from the control period that is no jitter."""
+_LARGEST = 200 * 2**20  # [bytes]
+LEAST_ROWS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Log:
+    """What a robot was told and what it did: a row per control step.
+
+    `positions[t]` and `velocities[t]` were measured when `actions[t]` was commanded.
+    """
+
+    joints: tuple[str, ...]
+    actions: Array
+    """Shape (T, actions)."""
+    positions: Array
+    """[rad or m], shape (T, joints)."""
+    velocities: Array
+    """[rad/s or m/s], shape (T, joints)."""
+
+    def as_json(self) -> dict[str, object]:
+        """Return plain data, for a worker."""
+        arrays = {key: getattr(self, key).tolist() for key in ("actions", "positions", "velocities")}
+        return {"joints": list(self.joints), **arrays}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Sequence[object]]) -> Log:
+        """Return what `as_json` has written."""
+        arrays = {key: np.array(data[key], np.float64) for key in ("actions", "positions", "velocities")}
+        return cls(tuple(map(str, data["joints"])), **arrays)
+
+
+@dataclasses.dataclass(frozen=True)
+class Expected:
+    """What a task needs of a log."""
+
+    joints: Mapping[str, tuple[float, float]]
+    """Joints of the world with their limits [rad or m]; a pair that is not rising says that there are none."""
+    driven: tuple[str, ...]
+    """Joints in the order of the action, where the task describes them."""
+    actions: int
+    control_dt: float
+    """[s]."""
+
+    @property
+    def action_columns(self) -> list[str]:
+        """Names of the columns of the action."""
+        names = self.driven if len(self.driven) == self.actions else [str(index) for index in range(self.actions)]
+        return [f"action_{name}" for name in names]
+
+
+def write_log(path: Path, log: Log, expected: Expected) -> None:
+    """Write a log as CSV, whole or not at all."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    measured = [f"{kind}{joint}" for kind in (_POSITION, _VELOCITY) for joint in log.joints]
+    writer.writerow([TIME, *expected.action_columns, *measured])
+    for step, row in enumerate(np.hstack([log.actions, log.positions, log.velocities])):
+        writer.writerow([f"{step * expected.control_dt:.6f}", *(f"{value:.8g}" for value in row)])
+    files.write_text(path, text.getvalue())
+
+
+def read_log(path: Path, expected: Expected) -> Log:
+    """Read and check a log; raises `ArtifactError` that names the line, or the column, and what to do."""
+    columns, lines = _read_columns(path)
+    _check_time(path, _take(path, columns, TIME), expected.control_dt, lines)
+    measured = [name.removeprefix(_POSITION) for name in columns if name.startswith(_POSITION)]
+    joints = tuple(dict.fromkeys([*expected.driven, *measured]))
+    for joint in joints:
+        if joint not in expected.joints:
+            raise ArtifactError(
+                f"{path}: column {_POSITION + joint!r}: the task has no joint {joint!r}."
+                f"{did_you_mean(joint, expected.joints)} It has: {', '.join(expected.joints)}."
+            )
+    if not joints:
+        raise ArtifactError(
+            f"{path}: no column of a joint's position: call it {_POSITION}{next(iter(expected.joints))}"
+        )
+    stacked = {
+        kind: np.column_stack([_take(path, columns, f"{kind}{joint}") for joint in joints])
+        for kind in (_POSITION, _VELOCITY)
+    }
+    _check_units(path, joints, stacked[_POSITION], expected)
+    actions = np.column_stack([_take(path, columns, name) for name in expected.action_columns])
+    return Log(joints, actions, stacked[_POSITION], stacked[_VELOCITY])
+
+
+def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:
+    """Return the columns, and the line of each row."""
+    try:
+        rows = list(csv.reader(io.StringIO(untrusted.read_bytes(path, _LARGEST).decode("utf-8-sig"))))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ArtifactError(f"{path}: not a CSV file: {error}") from None
+    if not rows or TIME not in [name.strip() for name in rows[0]]:
+        raise ArtifactError(f"{path}: its first line must name the columns: {TIME}, action_..., position_JOINT, ...")
+    names = [name.strip() for name in rows[0]]
+    if doubled := [name for name in names if names.count(name) > 1]:
+        raise ArtifactError(f"{path}: there are two columns {doubled[0]!r}")
+    kept = [(line, row) for line, row in enumerate(rows[1:], start=2) if row]
+    if len(kept) < LEAST_ROWS:
+        raise ArtifactError(
+            f"{path}: {len(kept)} rows; a recording of a few seconds is needed, at least {LEAST_ROWS} rows"
+        )
+    values = np.array([_read_row(path, line, row, names) for line, row in kept])
+    return dict(zip(names, values.T, strict=True)), [line for line, _ in kept]
+
+
+def _read_row(path: Path, line: int, row: list[str], names: list[str]) -> list[float]:
+    if len(row) != len(names):
+        raise ArtifactError(f"{path}, line {line}: {len(row)} values for {len(names)} columns")
+    numbers = []
+    for name, text in zip(names, row, strict=True):
+        try:
+            number = float(text)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise ArtifactError(f"{path}, line {line}: {name} is {text.strip()!r}, not a finite number")
+        numbers.append(number)
+    return numbers
+
+
+def _take(path: Path, columns: Mapping[str, Array], name: str) -> Array:
+    if name not in columns:
+        raise ArtifactError(f"{path}: no column {name!r}.{did_you_mean(name, columns)} It has: {', '.join(columns)}.")
+    return columns[name]
+
+
+def _check_time(path: Path, time: Array, control_dt: float, lines: list[int]) -> None:
+    periods = np.diff(time)
+    if (back := np.flatnonzero(periods <= 0)).size:
+        raise ArtifactError(
+            f"{path}, line {lines[back[0] + 1]}: time does not go forward: {time[back[0]]:g} s, then "
+            f"{time[back[0] + 1]:g} s"
+        )
+    usual = float(np.median(periods))
+    if abs(usual - control_dt) > _OTHER_RATE * control_dt:
+        raise ArtifactError(
+            f"{path}: a row every {usual:.4g} s, but the task acts every {control_dt:.4g} s: write a row per action"
+        )
+    if (gaps := np.flatnonzero(periods > _GAP * control_dt)).size:
+        raise ArtifactError(
+            f"{path}, line {lines[gaps[0] + 1]}: a gap of {periods[gaps[0]]:.3g} s; give the longest part without gaps"
+        )
+
+
+def _check_units(path: Path, joints: Sequence[str], positions: Array, expected: Expected) -> None:
+    for joint, values in zip(joints, positions.T, strict=True):
+        low, high = expected.joints[joint]
+        largest = float(np.abs(values).max())
+        if largest > 2 * math.pi and low < high and largest > 1.2 * max(abs(low), abs(high)):
+            raise ArtifactError(
+                f"{path}: {_POSITION}{joint} reaches {largest:.3g}, the joint ends at {max(abs(low), abs(high)):.3g} "
+                "rad: is that degrees? Multiply by pi / 180."
+            )
+
+
+def check_actions(log: Log, path: Path, low: Array, high: Array) -> None:
+    """Raise `UsageError` for actions that are far outside the task's: other units, or another controller's."""
+    outside = np.maximum(low - log.actions, log.actions - high).max(axis=0)
+    if (outside > 0.01 * (high - low)).any():
+        worst = int(outside.argmax())
+        raise UsageError(
+            f"{path}: action {worst} reaches {np.abs(log.actions[:, worst]).max():.3g}, the task's goes from "
+            f"{low[worst]:.3g} to {high[worst]:.3g}: log the policy's action, not the motor's command"
+        )

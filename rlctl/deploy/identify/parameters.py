@@ -1,0 +1,115 @@
+"""What of a task's events can be found from a log: physical values that hold for a whole episode, and the delay."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection, Mapping
+
+from rlctl.errors import UsageError, did_you_mean
+from rlctl.task.events import Event, delay, set_color, shift_gravity
+from rlctl.task.events.ranges import Widening
+
+_WIDER = 2.0
+"""How far beyond the range of the task's event a value is looked for, as a factor."""
+_SMALLEST = 0.01  # of the upper end, where a range begins at 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A value of an event, looked for between `low` and `high`; on a logarithmic scale if both are above 0."""
+
+    event: str
+    key: str
+    low: float
+    high: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.event}.{self.key}"
+
+    @property
+    def is_logarithmic(self) -> bool:
+        return self.low > 0
+
+    def value(self, position: float) -> float:
+        """Return the value at a position in [0, 1] of the range."""
+        if self.is_logarithmic:
+            return self.low * math.exp(position * math.log(self.high / self.low))
+        return self.low + position * (self.high - self.low)
+
+    def position(self, value: float) -> float:
+        """Return where a value is in the range, in [0, 1]."""
+        if self.is_logarithmic:
+            found = math.log(max(value, self.low) / self.low) / math.log(self.high / self.low)
+        else:
+            found = (value - self.low) / (self.high - self.low)
+        return min(max(found, 0.0), 1.0)
+
+    @property
+    def relative_span(self) -> float:
+        """By how much a value changes over the range: of its logarithm, or in its own unit."""
+        return math.log(self.high / self.low) if self.is_logarithmic else self.high - self.low
+
+
+@dataclasses.dataclass(frozen=True)
+class Unknowns:
+    """All that is looked for."""
+
+    parameters: tuple[Parameter, ...]
+    delay: str = ""
+    """The event that delays actions; empty if none does, or it is not looked for."""
+    longest_delay: int = 0
+    """[control steps]."""
+
+    def settings(self, positions: Collection[float]) -> dict[str, dict[str, float]]:
+        """Return positions in the ranges as a recipe's `events`."""
+        settings: dict[str, dict[str, float]] = {}
+        for parameter, position in zip(self.parameters, positions, strict=True):
+            settings.setdefault(parameter.event, {})[parameter.key] = parameter.value(position)
+        return settings
+
+
+def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: str) -> Unknowns:
+    """Return what can be found of a task's events, or of the chosen ones.
+
+    Raises `UsageError` for a name that the task does not have, an event that no log can tell, and if nothing is left.
+    """
+    for name in chosen:
+        if name not in events:
+            raise UsageError(
+                f"--events: {task} has no event {name!r}.{did_you_mean(name, events)} It has: {', '.join(events)}."
+            )
+    found: list[Parameter] = []
+    delayed, longest = "", 0
+    for name, event in events.items():
+        ranges = _list_ranges(name, event)
+        is_delay = event.when == "action" and event.function is delay
+        possible = is_delay or (event.when == "reset" and event.function not in (set_color, shift_gravity) and ranges)
+        if name in chosen and not possible:
+            raise UsageError(
+                f"--events: {name} is not a physical value that holds for an episode; those that are act at 'reset', "
+                "and the delay of actions"
+            )
+        if not possible or (chosen and name not in chosen):
+            continue
+        if is_delay:
+            delayed, longest = name, max(5, 2 * int(ranges["steps"][1]))
+        else:
+            found += [_make_parameter(name, key, *values) for key, values in ranges.items()]
+    if not found and not delayed:
+        raise UsageError(f"{task} has no event with a physical value to find: see rlctl tasks show {task}")
+    return Unknowns(tuple(found), delayed, longest)
+
+
+def _list_ranges(name: str, event: Event) -> dict[str, tuple[float, float]]:
+    values = event.bind(name).values
+    return {key: value.end for key, value in values.items() if isinstance(value, Widening)}
+
+
+def _make_parameter(event: str, key: str, low: float, high: float) -> Parameter:
+    if low < 0:
+        middle, half = (low + high) / 2, _WIDER * max((high - low) / 2, 1e-6)
+        return Parameter(event, key, middle - half, middle + half)
+    low = low / _WIDER if low > 0 else _SMALLEST * max(high, 1e-6)
+    return Parameter(event, key, low, _WIDER * max(high, low))

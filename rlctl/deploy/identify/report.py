@@ -1,0 +1,80 @@
+"""What `rlctl identify` prints."""
+
+from __future__ import annotations
+
+import sys
+
+import yaml
+
+from rlctl import output
+from rlctl.deploy.identify.excite import Excitation
+from rlctl.deploy.identify.identify import Found, Identification
+
+_PLOT_SIZE = (100, 18)
+_PLOT_POINTS = 400
+
+
+def show(result: Identification, json: str | None) -> None:
+    """Print the values with their intervals, or write them as JSON to a file or, for `-`, to stdout."""
+    if json is not None:
+        output.write_result_json(json, result.as_json())
+    if json == "-":
+        return
+    out = output.out()
+    out.print(f"{result.task}: {result.log}, {result.rows:,} rows, {result.seconds:.1f} s", highlight=False)
+    for line in _list_lines(result):
+        out.print(line, highlight=False, markup=False)
+    if sys.stdout.isatty():
+        out.print(draw_curves(result), highlight=False, markup=False)
+    out.print("\nto train on what was found, in a recipe:", highlight=False)
+    out.print(write_fragment(result), end="", highlight=False, markup=False)
+
+
+def write_fragment(result: Identification) -> str:
+    """Return the part of a recipe that lets the found values act, as intervals."""
+    return yaml.safe_dump({"events": result.events()}, sort_keys=False, default_flow_style=None)
+
+
+def _list_lines(result: Identification) -> list[str]:
+    width = max([len(each.name) for each in result.values] + [len(result.delay_event) + 6, len("position error")])
+    lines = [f"{each.name:<{width}}  {_format_value(each)}" for each in result.values]
+    if result.delay_event:
+        note = "" if result.delay_known else "; this log cannot tell it from one step more or less"
+        lines.append(f"{result.delay_event + '.steps':<{width}}  {result.delay}{note}")
+    for name, (before, after) in (("position error", result.position_error), ("velocity error", result.velocity_error)):
+        lines.append(f"{name:<{width}}  {before:.3g} -> {after:.3g}, root mean square over windows of 1 s")
+    return lines
+
+
+def _format_value(found: Found) -> str:
+    if found.known:
+        return f"{found.value:.4g}, 95 % in [{found.low:.4g}, {found.high:.4g}]"
+    return f"not known: {found.note}"
+
+
+def draw_curves(result: Identification) -> str:
+    """Return the joint that was followed worst, measured and simulated, drawn with characters."""
+    import plotext
+
+    plotext.clear_figure()
+    plotext.plotsize(*_PLOT_SIZE)
+    plotext.title(f"{result.curves['joint']}: position over rows")
+    for label in ("measured", "before", "after"):
+        plotext.plot(result.curves[label][:_PLOT_POINTS], label=label)
+    return str(plotext.uncolorize(plotext.build()))
+
+
+def show_excitation(result: Excitation, json: str | None) -> None:
+    """Print where a trajectory is and how it was bounded."""
+    if json is not None:
+        output.write_result_json(json, result.as_json())
+    if json == "-":
+        return
+    lines = [
+        f"{result.path}: {result.seconds:g} s for {result.task}, {result.amplitude:.0%} of the actions' range",
+        f"in simulation the joints use {result.largest_share:.0%} of their range without its margins, touch nothing "
+        "and stay below their top speeds; the robot's cables and surroundings are not simulated",
+        f"play its actions on the robot, log in the same columns, then: rlctl identify {result.task} --log FILE",
+    ]
+    for line in lines:
+        output.out().print(line, highlight=False, markup=False)

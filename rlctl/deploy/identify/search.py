@@ -1,0 +1,188 @@
+"""The search for the values that make the simulation follow a log: trials, least squares, intervals."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, wait
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from rlctl import errors
+from rlctl.deploy.identify.log import Array, Log
+from rlctl.deploy.identify.parameters import Unknowns
+from rlctl.env_spec import EnvSpec
+from rlctl.errors import TaskError
+from rlctl.rollout.child_process import ChildProcess
+
+_TRIALS = 12  # per unknown, and as many again
+_STARTS = 3
+_EVALUATIONS, _LAST_EVALUATIONS = 12, 25
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """Where a search ended: positions of the values in their ranges."""
+
+    at: Array
+    delay: int
+    cost: float
+    """Mean of the squared weighted errors."""
+    information: Array
+    """J'J of the weighted errors, shape (unknowns, unknowns)."""
+    spread_by_window: Array
+    errors: Array
+    """Root mean square per measured position, then velocity, in their units."""
+    rows: int
+
+    @classmethod
+    def from_answer(cls, answer: dict[str, Any]) -> Fit:
+        arrays = {key: np.array(answer[key], np.float64) for key in ("at", "information", "spread_by_window", "errors")}
+        return cls(**{**answer, **arrays})
+
+
+class SearchWorkers:
+    """Processes that follow a log. Answers come in the order of the questions; errors of the task are raised here."""
+
+    def __init__(self, spec: EnvSpec, log: Log, unknowns: Unknowns, count: int) -> None:
+        first = {
+            "log": log.as_json(),
+            "parameters": [dataclasses.asdict(each) for each in unknowns.parameters],
+            "delay": unknowns.delay,
+            "longest_delay": unknowns.longest_delay,
+        }
+        main = "rlctl.deploy.identify.worker:main"
+        self._children = []
+        try:
+            for _ in range(count):
+                child = ChildProcess(main, {"spec": dataclasses.asdict(spec)}, stdout=2, stderr=2)
+                self._children.append(child)
+                child.connection.send_bytes(json.dumps(first).encode())
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def count(self) -> int:
+        return len(self._children)
+
+    def ask(self, questions: Sequence[dict[str, Any]]) -> list[Any]:
+        """Return the answers to questions, each given to the next worker that is free."""
+        answers: dict[int, Any] = {}
+        waiting = list(enumerate(questions))[::-1]
+        asked: dict[Any, int] = {}
+        free = [child.connection for child in self._children]
+        while waiting or asked:
+            while waiting and free:
+                index, question = waiting.pop()
+                connection = free.pop()
+                connection.send_bytes(json.dumps(question).encode())
+                asked[connection] = index
+            for connection in [each for each in wait(list(asked)) if isinstance(each, Connection)]:
+                try:
+                    answer = json.loads(connection.recv_bytes())
+                except (EOFError, OSError):
+                    raise TaskError("a worker process ended while it followed the log; see what it printed") from None
+                if isinstance(answer, dict) and "error" in answer:
+                    raise getattr(errors, answer["error"], TaskError)(answer["message"])
+                answers[asked.pop(connection)] = answer
+                free.append(connection)
+        return [answers[index] for index in range(len(questions))]
+
+    def close(self) -> None:
+        """End the processes."""
+        for child in self._children:
+            child.close()
+
+    def __enter__(self) -> SearchWorkers:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+def search(
+    workers: SearchWorkers, unknowns: Unknowns, weights: Array, seed: int, report: Callable[[str], None]
+) -> dict[int, Fit]:
+    """Return the best fit per delay that was followed up; the best of all has the lowest cost.
+
+    Trials all over the ranges choose where least squares start; then the delays beside the best one are tried, and the
+    errors are weighted anew, each measured signal by how well it can be followed.
+    """
+    fits: dict[int, Fit] = {}
+
+    def follow_up(questions: list[dict[str, Any]]) -> None:
+        for answer in workers.ask(questions):
+            fit = Fit.from_answer(answer)
+            if fit.delay not in fits or fit.cost < fits[fit.delay].cost:
+                fits[fit.delay] = fit
+
+    trials = _make_trials(unknowns, seed)
+    report(f"{len(trials)} trials")
+    parts = [trials[index :: workers.count * 4] for index in range(workers.count * 4)]
+    costs = workers.ask([{"trials": part, "weights": weights.tolist()} for part in parts if part])
+    ranked = sorted(
+        (
+            (cost, trial)
+            for part, found in zip(parts, costs, strict=False)
+            for cost, trial in zip(_take_costs(found), part, strict=True)
+        ),
+        key=lambda pair: pair[0],
+    )
+    starts = _choose_starts([trial for _, trial in ranked])
+    report(f"least squares from {len(starts)} starts")
+    follow_up([_ask_fit(trial["at"], trial["delay"], weights, _EVALUATIONS) for trial in starts])
+    best = _best(fits)
+    while beside := [d for d in (best.delay - 1, best.delay + 1) if 0 <= d <= unknowns.longest_delay and d not in fits]:
+        follow_up([_ask_fit(best.at.tolist(), delay, weights, _EVALUATIONS) for delay in beside])
+        if _best(fits).delay == best.delay:
+            break
+        best = _best(fits)
+    best = _best(fits)
+    report("intervals")
+    final = 1.0 / np.maximum(best.errors, 1e-4 / weights)
+    near = [d for d in (best.delay - 1, best.delay, best.delay + 1) if d in fits]
+    fits = {}
+    follow_up(
+        [
+            _ask_fit(best.at.tolist(), delay, final, _LAST_EVALUATIONS if delay == best.delay else _EVALUATIONS)
+            for delay in near
+        ]
+    )
+    return fits
+
+
+def _take_costs(found: Any) -> list[float]:
+    # A world that came apart costs more than any other.
+    return [cost if np.isfinite(cost) else np.inf for cost in found]
+
+
+def _best(fits: dict[int, Fit]) -> Fit:
+    return min(fits.values(), key=lambda fit: fit.cost)
+
+
+def _ask_fit(at: list[float], delay: int, weights: Array, evaluations: int) -> dict[str, Any]:
+    return {"at": at, "delay": delay, "weights": weights.tolist(), "evaluations": evaluations}
+
+
+def _make_trials(unknowns: Unknowns, seed: int) -> list[dict[str, Any]]:
+    """Return points all over the ranges, with every delay in turn."""
+    size = len(unknowns.parameters)
+    delays = range(unknowns.longest_delay + 1)
+    if size == 0:
+        return [{"at": [], "delay": delay} for delay in delays]
+    count = max(len(delays), _TRIALS * (size + 1))
+    points = qmc.Halton(size, seed=seed).random(count).tolist()
+    return [{"at": point, "delay": delays[index % len(delays)]} for index, point in enumerate(points)]
+
+
+def _choose_starts(ranked: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the best trial of each of the best delays, then the next best ones."""
+    firsts = list({trial["delay"]: trial for trial in reversed(ranked)}.values())
+    firsts = [trial for trial in ranked if trial in firsts][:_STARTS]
+    others = [trial for trial in ranked if trial not in firsts]
+    return [*firsts, *others[: max(0, _STARTS - len(firsts))]]
