@@ -36,7 +36,9 @@ class PolicyClient:
     async def _connect(self) -> dict[str, Any]:
         try:
             self._session = aiohttp.ClientSession(headers=self._headers)
-            self._socket = await self._session.ws_connect(self.url, compress=0, max_msg_size=_LARGEST)
+            self._socket = await self._session.ws_connect(
+                self.url, compress=0, max_msg_size=_LARGEST, timeout=aiohttp.ClientWSTimeout(ws_close=1.0)
+            )
             return self._unpack(await self._socket.receive(_TIMEOUT_S))
         except (aiohttp.ClientError, OSError, ValueError) as error:
             await self._session.close()

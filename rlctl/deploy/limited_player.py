@@ -43,6 +43,10 @@ class LimitedPlayer(Player):
         action = self._safety.limit(wanted)
         return action, action
 
+    def close(self) -> None:
+        """Give back what the player holds."""
+        self._player.close()
+
     def report(self) -> dict[str, Any]:
         """Return how often each limit stepped in and each fault occurred in this episode."""
         return {**self._player.report(), "interventions": dict(self._safety.counts - self._before)}

@@ -49,5 +49,9 @@ class RemotePlayer(Player):
         action = action.reshape(shape).astype(self._action_space.dtype)
         return action, action
 
+    def close(self) -> None:
+        """Close the connection."""
+        self._client.close()
+
     def report(self) -> dict[str, Any]:
         return self._report

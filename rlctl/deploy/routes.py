@@ -16,7 +16,7 @@ from rlctl.deploy.access import Access
 from rlctl.deploy.server import PolicyServer
 from rlctl.errors import RlctlError
 
-_LARGEST_POLICY = 256 * 2**20  # [bytes]
+_LARGEST_POLICY = 64 * 2**20  # [bytes]
 _BODY_TIMEOUT_S = 10.0
 _ORDERS = ("stop", "home", "hold", "resume")
 

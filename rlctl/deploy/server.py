@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import contextlib
 import dataclasses
 import itertools
 import time
@@ -127,8 +126,11 @@ class PolicyServer:
             )
             await socket.prepare(request)
             await socket.send_bytes(messages.pack(self.metadata))
-            with contextlib.suppress(ConnectionError, TimeoutError):  # it died, or does not read
+            try:
                 await self._answer_all(socket, session)
+            except (ConnectionError, TimeoutError):  # it died, or does not read
+                if request.transport is not None:
+                    request.transport.abort()
             return socket
         finally:
             self._close_session(session)

@@ -81,7 +81,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
                 spec=direct.spec,
                 episodes=request.episodes,
                 seed=request.seed,
-                n_envs=request.n_envs,
+                n_envs=1,  # as one robot: simulations beside it would take the server's time
                 env_timeout_s=request.env_timeout_s,
             ),
             Gates(),

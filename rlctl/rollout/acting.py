@@ -80,6 +80,9 @@ class Player(abc.ABC):
     def explore(self, exploration: Exploration) -> None:  # noqa: B027 (most players cannot)
         """Differ from the deterministic actions so from now on."""
 
+    def close(self) -> None:  # noqa: B027
+        """Give back what it holds."""
+
     def report(self) -> dict[str, Any]:
         """Return what there is to say of the episode that ended, as plain data."""
         return {}

@@ -144,6 +144,7 @@ class Worker:
     def load_policy(self, message: messages.LoadPolicy) -> None:
         """Act with another policy from now on."""
         self._states = None
+        self._close_player()
         if message.info is None:
             self.player = make_player(message.other, self.action_space, self.space)
         else:
@@ -353,8 +354,13 @@ class Worker:
             raise FailedInEpisode(episode.index, episode.seed, episode.step) from error
         self.arrays.inside[episode.index, 1] = -1
 
+    def _close_player(self) -> None:
+        if (player := getattr(self, "player", None)) is not None:  # there is none before the first policy
+            player.close()
+
     def close(self) -> None:
-        """Close the environments."""
+        """Close the environments, and what plays them."""
+        self._close_player()
         for episode in self.episodes:
             try:
                 episode.env.close()
