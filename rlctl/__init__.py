@@ -3,6 +3,7 @@
     cli           the command line: parse, call one function, print
     check_env  train  eval  export  replay    the five verbs, a folder each
     tasks         list, show and begin tasks
+    deploy        what comes after: a safety filter, a policy server
     rollout       many environments in worker processes; seeds; episodes
     run           what is on disk: recipes, run folders, policies, episodes
     task          for authors of tasks: Task, Sim, Body, Event, rewards
