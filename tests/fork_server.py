@@ -31,12 +31,17 @@ from pathlib import Path
 from rlctl.rollout.process_start import set_default_start
 
 ROOT = Path(__file__).parents[1]
-FOR_WORKERS = ("rlctl.rollout.worker_process", "rlctl.task.env", "rlctl.run.env_info", "gymnasium.envs.registration")
+FOR_WORKERS = (
+    *("rlctl.rollout.worker_process", "rlctl.task.env", "rlctl.run.env_info", "rlctl.check_env.child"),
+    *("gymnasium.envs.registration", "gymnasium.utils.env_checker"),
+)
 FOR_COMMANDS = (
     *("torch._dynamo", "torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
     *("rlctl.eval.evaluate", "rlctl.run.torch_policy", "typer.rich_utils", "yaml"),
 )
 """What is imported when it is needed; one that is missing here costs time only."""
+HASH_SEED = "0"
+"""Of all forks: that of check-env's processes but one."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PR_SET_CHILD_SUBREAPER = 36
 
@@ -102,6 +107,7 @@ class ForkServer:
                 [sys.executable, "-c", code],
                 cwd=ROOT,
                 pass_fds=(theirs.fileno(),),
+                env={**os.environ, "PYTHONHASHSEED": HASH_SEED},
                 process_group=0,  # an interrupt at the terminal is for the tests
             )
         return cls(ours, process)
@@ -135,9 +141,9 @@ class ForkServer:
     ):
         """Start `[python, "-c", code, ...]` or `[python, "-m", module, ...]` with options of `subprocess.Popen`.
 
-        One that is to have another hash seed is a fresh interpreter.
+        One that is to have another hash seed than the server is a fresh interpreter.
         """
-        if env is not None and env.get("PYTHONHASHSEED") != os.environ.get("PYTHONHASHSEED"):
+        if env is not None and env.get("PYTHONHASHSEED", HASH_SEED) != HASH_SEED:
             options = {"env": env, "cwd": cwd, "process_group": process_group, "start_new_session": start_new_session}
             return subprocess.Popen(command, pass_fds=pass_fds, stdin=stdin, stdout=stdout, stderr=stderr, **options)
         with contextlib.ExitStack() as opened:
@@ -199,7 +205,7 @@ def close():
 
 
 def start(command, **options):
-    """Start a worker as `subprocess.Popen` does, by the server of this process."""
+    """Start a child process as `subprocess.Popen` does, by the server of this process."""
     return for_workers().start(command, **options)
 
 

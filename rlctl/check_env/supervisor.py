@@ -192,7 +192,7 @@ class Supervisor:
             child.close()
 
     def _start(self) -> None:
-        while self._waiting and len(self._active) < AT_ONCE:
+        while self._waiting and len(self._active) < (AT_ONCE if self._has_built else 1):
             name = next(iter(self._waiting))
             seconds = self._seconds_left.get(name, self._budget_s)
             if name == "checkers":
@@ -209,8 +209,6 @@ class Supervisor:
             return
         if isinstance(message, End):
             self._end(child, grace_s=1.0)
-            if child.name == "probe" and not self._has_built:
-                self._waiting.clear()  # what cannot be built here cannot be built there
             return
         if isinstance(message, Built):
             self._has_built = True
@@ -237,6 +235,8 @@ class Supervisor:
         if failure is not None:
             self._receive(failure)
             self._start_again(child)
+        if not self._has_built:
+            self._waiting.clear()  # what cannot be built here cannot be built there
         del self._active[child.process.connection]
         child.close(grace_s)
 

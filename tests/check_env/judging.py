@@ -11,6 +11,7 @@ from rlctl.check_env import child, families
 from rlctl.check_env.bullet_worlds import connected
 from rlctl.check_env.finding import RULES
 from rlctl.check_env.judge import judge
+from rlctl.check_env.messages import Finished
 from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
 
@@ -44,29 +45,60 @@ def case(
 
 
 def records_of(task, *experiments, seconds=families.PROCESS_S):
-    """What some experiments find out, or all; each process begins with nothing that an earlier one left."""
-    task = str(FOLDER / task) if ".py:" in task else task
-    records = Records(task)
-    for client in connected():  # of an environment that was not closed
-        pybullet.disconnect(client)
+    """What some experiments find out, or all."""
+    records = Records(_path(task))
     for name, process in families.PROCESSES.items():
         wanted = [each.name for each in process.experiments if not experiments or each.name in experiments]
-        for module in [module for module in sys.modules if module.startswith("broken_")]:
-            del sys.modules[module]
-        if name == "probe":
-            wanted.append("build")
-        for message in child.run(name, EnvSpec(task), wanted, seconds) if wanted else ():
+        for message in _run(task, name, wanted, seconds):
+            records.add(message)
+    return records
+
+
+def shared_records_of(task, *experiments):
+    """What some experiments find out, each in a process of its own, and once for all tests: many have one twin."""
+    records = Records(_path(task))
+    for experiment in families.EXPERIMENTS:
+        for message in _play(task, experiment) if experiment in ("build", *experiments) else ():
             records.add(message)
     return records
 
 
 @functools.cache
-def verdict_of(task, *rules, seconds=families.PROCESS_S, also_needs=()):
-    """The verdict by some rules, from the experiments that they need; or by all."""
-    needed = families.find_needs(rules) | {"build", *also_needs} if rules else ()
-    verdict = judge(records_of(task, *needed, seconds=seconds), rules or tuple(RULES))
+def _play(task, experiment):
+    (process,) = [
+        name for name, each in families.PROCESSES.items() if families.EXPERIMENTS[experiment] in each.experiments
+    ]
+    messages = _run(task, process, [experiment])
+    built = [i for i, each in enumerate(messages) if isinstance(each, Finished) and each.experiment == "build"]
+    return messages[built[0] + 1 :] if built and experiment != "build" else messages
+
+
+def _run(task, process, experiments, seconds=families.PROCESS_S):
+    """Run experiments of a process, which begins with nothing that an earlier one left."""
+    for client in connected():  # of an environment that was not closed
+        pybullet.disconnect(client)
+    for module in [module for module in sys.modules if module.startswith("broken_")]:
+        del sys.modules[module]
+    wanted = [*(["build"] if process == "probe" else []), *experiments]
+    return list(child.run(process, EnvSpec(_path(task)), wanted, seconds)) if wanted else []
+
+
+def _path(task):
+    return str(FOLDER / task) if ".py:" in task else task
+
+
+def verdict_of(task, *rules, also_needs=()):
+    """The verdict by some rules, from the experiments that they need; or by all, from one process after the other."""
+    needed = {*families.find_needs(rules), *also_needs}
+    records = shared_records_of(task, *needed) if rules else _whole(task)
+    verdict = judge(records, rules or tuple(RULES))
     assert verdict.crashed == {}
     return verdict
+
+
+@functools.cache
+def _whole(task):
+    return records_of(task)
 
 
 def findings(task, *rules, **settings):

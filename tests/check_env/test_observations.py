@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from rlctl.check_env import families
 from rlctl.check_env.judge import judge
-from tests.check_env.judging import case, check_case, findings, found, records_of, rules_of
+from tests.check_env.judging import case, check_case, findings, found, rules_of, shared_records_of
 
 BROKEN = "broken_observations.py"
 CASES = [
@@ -45,7 +46,7 @@ def test_constant_elements_are_named_with_their_value():
 
 
 def test_scales_matter_as_far_as_nothing_normalises():
-    evidence = records_of(f"{BROKEN}:Millimetres")
+    evidence = shared_records_of(f"{BROKEN}:Millimetres", *families.find_needs(["RL112"]))
     severities = []
     for normalizes in (None, False, True):
         findings = judge(dataclasses.replace(evidence, normalizes=lambda: normalizes)).findings  # noqa: B023

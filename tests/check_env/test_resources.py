@@ -6,8 +6,9 @@ from rlctl.check_env import supervisor
 from rlctl.check_env.check import check
 from rlctl.check_env.families import isolation
 from rlctl.check_env.finding import NotJudged
+from rlctl.check_env.judge import judge
 from rlctl.env_spec import EnvSpec
-from tests.check_env.judging import FOLDER, case, check_case, findings
+from tests.check_env.judging import FOLDER, case, check_case, findings, records_of
 
 FILE = "broken_resources.py"
 CASES = [
@@ -33,12 +34,12 @@ def the_finding(name, rule):
 
 
 def test_each_reset_leaves_a_client():
-    (finding,) = findings(f"{FILE}:Reconnects", "RL405", seconds=8.0)
+    (finding,) = judge(records_of(f"{FILE}:Reconnects", "build", "leaks", seconds=2.0), ["RL405"]).findings
     assert finding.severity == "error"
     assert finding.evidence["per_reset"] == 1.0
     assert finding.evidence["value"] - finding.evidence["expected"] == finding.evidence["resets"] >= 7
     assert finding.message.startswith("PyBullet clients grow with every reset: from ")
-    assert findings(f"{FILE}:ReconnectsProperly", "RL405", seconds=8.0) == []
+    assert judge(records_of(f"{FILE}:ReconnectsProperly", "build", "leaks", seconds=2.0), ["RL405"]).findings == []
 
 
 def test_memory_is_counted():

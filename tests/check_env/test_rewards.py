@@ -9,7 +9,7 @@ from gymnasium import spaces
 from rlctl.check_env.actions import action_at
 from rlctl.check_env.families.incentives import pair_up
 from rlctl.check_env.rewarded import discounted_steps, discounted_sum
-from tests.check_env.judging import case, check_case, findings, found, records_of, rules_of
+from tests.check_env.judging import case, check_case, findings, found, rules_of, shared_records_of
 
 BROKEN = "broken_rewards.py"
 
@@ -84,7 +84,7 @@ def test_falling_is_compared_with_going_on():
 
 
 def test_hovering_is_compared_from_where_two_lives_part():
-    life = records_of("broken_envs.py:Clean").role("search")[0]
+    life = shared_records_of("broken_envs.py:Clean", "search").role("search")[0]
     actions = np.zeros((4, 2))
     actions[2:] = 1.0
     finished = dataclasses.replace(life, rewards=np.array([0.0, 0.0, 9.0]), action_values=np.zeros((3, 2)))
@@ -149,7 +149,7 @@ def test_numbers_become_actions_of_every_kind():
 
 
 def test_search_finds_what_chance_does_not():
-    lives = records_of("reach", "search").role("search")
+    lives = shared_records_of("reach", "search").role("search")
     assert any(life.infos["is_success"].values.any() for life in lives if life.actions == "searched")
     assert len({life.seed for life in lives if life.actions == "searched"}) == 1
     assert sum(life.steps for life in lives) <= 6200

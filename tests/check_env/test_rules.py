@@ -12,6 +12,7 @@ import pytest
 
 from rlctl.check_env.families.library_checkers import collect_complaints
 from rlctl.check_env.finding import RULES
+from rlctl.check_env.judge import judge
 from tests.check_env.judging import FOLDER, case, check_case, findings, found, records_of, verdict_of
 
 CASES = [
@@ -84,7 +85,7 @@ def test_finds_the_mistake_and_only_that(case):
         pytest.param("broken_envs.py:CleanDict", marks=pytest.mark.slow),
         pytest.param("broken_envs.py:FixedStartNoise", marks=pytest.mark.slow),
         pytest.param("broken_envs.py:OwnWorld", marks=pytest.mark.slow),
-        "reach",
+        pytest.param("reach", marks=pytest.mark.slow),  # in test_processes.py by the command
     ],
 )
 def test_clean_is_clean(name):
@@ -94,12 +95,20 @@ def test_clean_is_clean(name):
     assert {*verdict.judged, *verdict.not_applicable} == set(RULES)
 
 
-OTHERS = ["MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1", "Taxi-v4", "CliffWalking-v1"]
+OTHERS = [
+    "Pendulum-v1",
+    "Blackjack-v1",
+    "MountainCar-v0",
+    "MountainCarContinuous-v0",
+    "Acrobot-v1",
+    "Taxi-v4",
+    "CliffWalking-v1",
+]
 
 
 @pytest.mark.parametrize(
     "task",
-    ["Pendulum-v1", "FrozenLake-v1", "Blackjack-v1", *(pytest.param(task, marks=pytest.mark.slow) for task in OTHERS)],
+    ["FrozenLake-v1", *(pytest.param(task, marks=pytest.mark.slow) for task in OTHERS)],
 )
 def test_gymnasiums_own_environments_have_no_errors(task):
     assert not {severity for _, severity in found(task)} & {"error"}
@@ -129,7 +138,8 @@ def test_an_assertion_without_a_message_is_quoted(tmp_path):
 
 
 def test_an_experiment_that_could_not_be_made_says_why():
-    assert verdict_of("broken_envs.py:Endless", "RL505").not_judged == {"RL505": "the episode did not come to an end"}
+    verdict = judge(records_of("broken_envs.py:Endless", "build", "after the end"), ["RL505"])
+    assert verdict.not_judged == {"RL505": "the episode did not come to an end"}
 
 
 def test_out_of_range_is_placed():
@@ -152,7 +162,7 @@ def test_exception_is_placed():
 
 
 def test_names_of_a_tasks_observation_are_used():
-    built = records_of("reach").built
+    built = records_of("reach", "build").built
     # 7 joint positions, 7 velocities, then the hand.
     assert built.element(0, 15) == "hand[1]"
     assert built.max_steps == 120

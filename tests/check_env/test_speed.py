@@ -16,7 +16,7 @@ from rlctl.check_env.judge import judge
 from rlctl.check_env.own_code import kind_of
 from rlctl.check_env.records import Records
 from rlctl.check_env.sampling import Sampler, Samples, Stopwatch, TimedCall
-from tests.check_env.judging import case, check_case, records_of
+from tests.check_env.judging import case, check_case, shared_records_of
 
 CASES = [
     case("broken_speed.py:SlowStep", ("RL901", "warning")),
@@ -30,10 +30,9 @@ STEP = TimedCall("pybullet.stepSimulation", "world.py:10", 0.61)
 NOTHING = Speed(66e-6, 52e-6, 200, 5, [STEP], [], [], [], False)
 
 
-@functools.cache
 def measured(task):
     """What only the experiments that this family reads find out."""
-    return records_of(task, "episodes", "speed")
+    return shared_records_of(task, "episodes", "speed")
 
 
 def with_speed(**changes):
@@ -55,7 +54,7 @@ def test_finds_the_mistake_and_only_that(case):
 
 @pytest.mark.parametrize(
     "task",
-    ["reach", "CartPole-v1", "Pendulum-v1", "broken_envs.py:Clean", "broken_envs.py:OwnWorld", "broken_speed.py:World",
+    [pytest.param("reach", marks=pytest.mark.slow), "CartPole-v1", "broken_envs.py:Clean", "broken_speed.py:World",
      "broken_speed.py:Sees", "broken_speed.py:RendersNothing", "broken_speed.py:KeepsPartials"],
 )  # fmt: skip
 def test_what_is_fast_has_no_finding(task):

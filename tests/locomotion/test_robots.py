@@ -169,9 +169,8 @@ def test_the_packaged_recipe(name):
     assert packaged.n_envs * packaged.algo_kwargs["n_steps"] % packaged.algo_kwargs["batch_size"] == 0
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "hopper" else pytest.mark.slow) for name in ROBOTS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROBOTS)
 def test_nothing_is_found_by_check_env(rlctl, name):
     done = rlctl("check-env", name)
     assert done.returncode == 0, done.stdout
