@@ -37,6 +37,7 @@ NOISE = tuple(
 EXPLAINED = (
     (re.compile(r"support for the `seed` function is dropped"), {"RL202", "RL210", "RL301", "RL302", "RL308"}),
     (re.compile(r"precision lowered by casting"), {"RL102", "RL103", "RL106"}),
+    (re.compile(r"Box observation space maximum and minimum values are equal"), {"RL103"}),
 )
 """Complaints that no rule owns, and rules that name the cause of one where they have found something."""
 UNOWNED = {GYMNASIUM: "RL290", SB3: "RL291"}
@@ -163,8 +164,6 @@ def judge_complaints(records: Records, rules: Collection[str], found: Collection
     for complaint in records.complaints:
         if any(pattern.search(complaint.text) for pattern in NOISE):
             continue
-        if any(pattern.search(complaint.text) and not causes.isdisjoint(found) for pattern, causes in EXPLAINED):
-            continue
         owners = [rule.id for rule in RULES.values() if rule.owns(complaint.text)]
         if any(owner in found for owner in owners):
             continue
@@ -173,9 +172,13 @@ def judge_complaints(records: Records, rules: Collection[str], found: Collection
             owned.setdefault(owner, []).append(complaint)
     for rule, complaints in owned.items():
         if rule in UNOWNED.values():  # unrelated complaints of one checker
-            yield from (_finding(rule, [each]) for each in complaints)
+            yield from (_finding(rule, [each]) for each in complaints if not _is_explained(each, {*found, *owned}))
         else:
             yield _finding(rule, complaints)
+
+
+def _is_explained(complaint: Complaint, found: set[str]) -> bool:
+    return any(pattern.search(complaint.text) and causes & found for pattern, causes in EXPLAINED)
 
 
 def _finding(rule: str, complaints: Sequence[Complaint]) -> Finding:

@@ -1,7 +1,7 @@
 """What only the libraries' own checkers look for."""
 
 import numpy as np
-from broken_envs import Clean
+from broken_envs import Clean, NoSuperReset
 from gymnasium import spaces
 
 
@@ -32,6 +32,10 @@ class SeedsItself(Clean):
 
     def start(self):
         self.position = np.random.default_rng().uniform(-0.5, 0.5, 2).astype(np.float32)
+
+
+class OwnSeedAndReset(NoSuperReset, OwnSeed):
+    """What only Gymnasium's checker looks at, twice."""
 
 
 class Goal(Clean):

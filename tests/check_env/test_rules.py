@@ -127,6 +127,7 @@ def test_goals_that_are_not_arrays_are_not_asked_for_rewards_by_sb3():
 
 def test_a_complaint_whose_cause_another_rule_names_is_left_out():
     assert found("broken_checkers.py:SeedsItself", "RL290", "RL301") == {("RL301", "error")}
+    assert found("broken_checkers.py:OwnSeedAndReset", "RL210", "RL290") == {("RL210", "info")}
 
 
 def test_an_assertion_without_a_message_is_quoted(tmp_path):
