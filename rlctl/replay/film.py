@@ -5,35 +5,25 @@ from __future__ import annotations
 import abc
 import contextlib
 import fractions
-import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError, UsageError
 from rlctl.replay.recorder import Choose, Rollout, frame_time, play_episode
 from rlctl.replay.report import FilmReport
 from rlctl.replay.scene import Env
+from rlctl.replay.view import Picture, look_at
 from rlctl.run import files
-from rlctl.task.bullet import pybullet
-from rlctl.task.env import TaskEnv
 
-Picture = NDArray[np.uint8]
 SUFFIXES = (".mp4", ".gif")
 
 _SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels]
 _RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
 _DT = 1 / 30  # [s] a step, where an environment does not say
 _PAUSE_S = 0.5  # [s] at the end of each episode
-_EYE_DIRECTION = np.array([1.0, -0.9, 0.55])  # from the right of a robot that looks along x, from above
-_FIELD_OF_VIEW = 45.0  # [degrees]
-_CLOSEST, _FARTHEST = 0.8, 8.0  # [m]; the renderer draws nothing beyond 10 m
-_GROUND_SIZE = 8.0  # [m]; what is wider both ways is not looked at
 
 
 def check_file(path: Path) -> None:
@@ -82,8 +72,7 @@ class _Film:
     """Takes the pictures of one film."""
 
     def __init__(self, suffix: str, env: Env) -> None:
-        inner = env.unwrapped
-        self._view = _World(inner, *_SIZE[suffix]) if isinstance(inner, TaskEnv) else _Pictures(env)
+        self._view = look_at(env, *_SIZE[suffix])
         dt = frame_time(env) or _DT
         self._every = max(1, round(1 / (_RATE[suffix] * dt)))
         self.rate = 1 / (dt * self._every)
@@ -128,81 +117,6 @@ class _Film:
         assert self._last is not None
         height, width = self._last.shape[:2]
         return FilmReport(path, self._count, width, height, self.rate, self._count / self._seconds)
-
-
-class _View(abc.ABC):
-    """Draws the present state of an environment."""
-
-    def begin(self) -> None:  # noqa: B027 (most have nothing to do)
-        """Look at an episode that begins."""
-
-    @abc.abstractmethod
-    def draw(self) -> Picture:
-        """Return a picture, shape (height, width, 3)."""
-
-
-class _Pictures(_View):
-    """The pictures that an environment makes itself."""
-
-    def __init__(self, env: Env) -> None:
-        self._env = env
-
-    def draw(self) -> Picture:
-        try:
-            picture = np.asarray(self._env.render())
-        except Exception as error:  # missing pygame, no OpenGL
-            raise UsageError(f"--video: no picture of it: {type(error).__name__}: {error}") from None
-        if picture.ndim != 3 or picture.shape[2] != 3:
-            raise UsageError(f"--video: its render() returned {picture.dtype} of shape {picture.shape}, not a picture")
-        height, width = (size - size % 2 for size in picture.shape[:2])  # encoders want even sizes
-        return np.ascontiguousarray(picture[:height, :width].astype(np.uint8))
-
-
-class _World(_View):
-    """A task's PyBullet world, seen by a camera that follows the first robot that moves about."""
-
-    def __init__(self, env: TaskEnv, width: int, height: int) -> None:
-        self._env = env
-        self._size = width, height
-
-    def begin(self) -> None:
-        bodies = list(self._env.sim.bodies.values())
-        robots = [body for body in bodies if body.joint_names] or bodies
-        trunks = [(body, trunk) for body in robots if (trunk := body.find_trunk()) is not None]
-        self._followed = trunks[0] if trunks else None
-        markers = [np.asarray(position) for position in self._env.task.markers().values()]
-        if self._followed is None:
-            low, high = _find_bounds(bodies, markers)
-            self._target, distance = (low + high) / 2, 1.15 * float(np.linalg.norm(high - low))
-        else:
-            low, high = _find_bounds([self._followed[0]], [])
-            self._target, distance = (low + high) / 2, 1.6 * float(np.linalg.norm(high - low))
-            for marker in markers:
-                distance = max(distance, 2.5 * float(np.linalg.norm(marker - self._target)))
-        self._offset = min(max(distance, _CLOSEST), _FARTHEST) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
-
-    def draw(self) -> Picture:
-        if self._followed is not None:
-            body, trunk = self._followed
-            self._target[:2] = body.mass_state(trunk).position[:2]  # its height stays: a gait would shake the film
-        self._env.move_markers()
-        eye = self._target + self._offset
-        return self._env.sim.render(
-            *self._size, eye=eye.tolist(), target=self._target.tolist(), field_of_view=_FIELD_OF_VIEW
-        )
-
-
-def _find_bounds(bodies: Sequence[Any], markers: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the lowest and the highest corner [m] of bodies that are not the ground, and of markers."""
-    corners = list(markers)
-    for body in bodies:
-        boxes = [
-            np.array(pybullet.getAABB(body.id, link, physicsClientId=body.client))
-            for link in range(-1, len(body.link_names))
-        ]
-        wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
-        corners += [] if wide else list(itertools.chain(*boxes))
-    return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
 
 
 class _Writer(abc.ABC):

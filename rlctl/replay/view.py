@@ -1,0 +1,107 @@
+"""What a camera sees of an environment, without a display: for films and pictures."""
+
+from __future__ import annotations
+
+import abc
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import UsageError
+from rlctl.replay.scene import Env
+from rlctl.task.bullet import pybullet
+from rlctl.task.env import TaskEnv
+
+Picture = NDArray[np.uint8]
+
+_EYE_DIRECTION = np.array([1.0, -0.9, 0.55])  # from the right of a robot that looks along x, from above
+_FIELD_OF_VIEW = 45.0  # [degrees]
+_CLOSEST, _FARTHEST = 0.8, 8.0  # [m]; the renderer draws nothing beyond 10 m
+_GROUND_SIZE = 8.0  # [m]; what is wider both ways is not looked at
+
+
+def look_at(env: Env, width: int, height: int) -> View:
+    """Return the view of an environment: a camera in a task's world, or the pictures that it makes itself.
+
+    Of a task, pictures have `width` and `height` [pixels].
+    """
+    inner = env.unwrapped
+    return _World(inner, width, height) if isinstance(inner, TaskEnv) else _Pictures(env)
+
+
+class View(abc.ABC):
+    """Draws the present state of an environment."""
+
+    def begin(self) -> None:  # noqa: B027 (most have nothing to do)
+        """Look at an episode that begins."""
+
+    @abc.abstractmethod
+    def draw(self) -> Picture:
+        """Return a picture, shape (height, width, 3)."""
+
+
+class _Pictures(View):
+    """The pictures that an environment makes itself."""
+
+    def __init__(self, env: Env) -> None:
+        self._env = env
+
+    def draw(self) -> Picture:
+        try:
+            picture = np.asarray(self._env.render())
+        except Exception as error:  # missing pygame, no OpenGL
+            raise UsageError(f"no picture of it: {type(error).__name__}: {error}") from None
+        if picture.ndim != 3 or picture.shape[2] != 3:
+            raise UsageError(f"its render() returned {picture.dtype} of shape {picture.shape}, not a picture")
+        height, width = (size - size % 2 for size in picture.shape[:2])  # encoders want even sizes
+        return np.ascontiguousarray(picture[:height, :width].astype(np.uint8))
+
+
+class _World(View):
+    """A task's PyBullet world, seen by a camera that follows the first robot that moves about."""
+
+    def __init__(self, env: TaskEnv, width: int, height: int) -> None:
+        self._env = env
+        self._size = width, height
+
+    def begin(self) -> None:
+        bodies = list(self._env.sim.bodies.values())
+        robots = [body for body in bodies if body.joint_names] or bodies
+        trunks = [(body, trunk) for body in robots if (trunk := body.find_trunk()) is not None]
+        self._followed = trunks[0] if trunks else None
+        markers = [np.asarray(position) for position in self._env.task.markers().values()]
+        if self._followed is None:
+            low, high = _find_bounds(bodies, markers)
+            self._target, distance = (low + high) / 2, 1.15 * float(np.linalg.norm(high - low))
+        else:
+            low, high = _find_bounds([self._followed[0]], [])
+            self._target, distance = (low + high) / 2, 1.6 * float(np.linalg.norm(high - low))
+            for marker in markers:
+                distance = max(distance, 2.5 * float(np.linalg.norm(marker - self._target)))
+        self._offset = min(max(distance, _CLOSEST), _FARTHEST) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
+
+    def draw(self) -> Picture:
+        if self._followed is not None:
+            body, trunk = self._followed
+            self._target[:2] = body.mass_state(trunk).position[:2]  # its height stays: a gait would shake the film
+        self._env.move_markers()
+        eye = self._target + self._offset
+        return self._env.sim.render(
+            *self._size, eye=eye.tolist(), target=self._target.tolist(), field_of_view=_FIELD_OF_VIEW
+        )
+
+
+def _find_bounds(bodies: Sequence[Any], markers: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the lowest and the highest corner [m] of bodies that are not the ground, and of markers."""
+    corners = list(markers)
+    for body in bodies:
+        boxes = [
+            np.array(pybullet.getAABB(body.id, link, physicsClientId=body.client))
+            for link in range(-1, len(body.link_names))
+        ]
+        wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
+        corners += [] if wide else list(itertools.chain(*boxes))
+    return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
