@@ -23,6 +23,10 @@ def serve(
         Path | None,
         typer.Option(metavar="FILE", help="Log of events, as JSON lines, rotated at 10 MB.", show_default=False),
     ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Record actions and observations for Rerun (.rrd).", show_default=False),
+    ] = None,
     key_file: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Key that clients must send; or RLCTL_API_KEY.", show_default=False),
@@ -50,6 +54,7 @@ def serve(
         port=0 if self_test else port,
         limits=limits,
         log=log,
+        rerun=rerun,
         key_file=key_file,
         max_clients=max_clients,
         watchdog=not self_test,  # a simulation does not keep real time

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import tempfile
 import time
 from pathlib import Path
@@ -54,11 +53,11 @@ class _Routes:
         self.server.measurements.refused += 1
 
     async def _watch(self, app: web.Application) -> Any:
-        task = asyncio.create_task(self.server.check_watchdogs())
+        tasks = [asyncio.create_task(self.server.check_watchdogs()), asyncio.create_task(self.server.write_recording())]
         yield
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         self.server.close()
 
     async def _serve_root(self, request: web.Request) -> web.StreamResponse:

@@ -86,8 +86,8 @@ class SafetyFilter:
         self._manual: Array | None = None
 
     def reset(self) -> None:
-        """Begin an episode. A stop, and a hold or a way home that was ordered, stay."""
-        self._fault, self._observed, self._manual = "", False, None
+        """Begin an episode. A stop, a hold or a way home that was ordered, and an action by hand stay."""
+        self._fault, self._observed = "", False
         self._sensors.reset()
         if self._command is not None:
             self._command.reset()

@@ -31,6 +31,7 @@ def make_server(
     port: int = 8000,
     limits: Path | None = None,
     log: Path | None = None,
+    rerun: Path | None = None,
     key_file: Path | None = None,
     max_clients: int = 64,
     watchdog: bool = True,
@@ -47,7 +48,7 @@ def make_server(
             f"--key-file FILE, or {KEY_VARIABLE} in the environment"
         )
     settings = ServerSettings(
-        host, port, None if limits is None else read_limits(limits), log, key, max_clients, watchdog
+        host, port, None if limits is None else read_limits(limits), log, rerun, key, max_clients, watchdog
     )
     return PolicyServer(load_served_policy(file), settings)
 

@@ -19,6 +19,7 @@ from rlctl.deploy.event_log import EventLog
 from rlctl.deploy.limits import Limits
 from rlctl.deploy.measurements import Measurements
 from rlctl.deploy.observation import ObservationLayout
+from rlctl.deploy.rerun_log import RerunLog
 from rlctl.deploy.safety_filter import SafetyEvent
 from rlctl.deploy.served_policy import ServedPolicy, load_served_policy
 from rlctl.deploy.session import Session
@@ -38,6 +39,8 @@ class ServerSettings:
     port: int = 8000
     limits: Limits | None = None
     log: Path | None = None
+    rerun: Path | None = None
+    """File of a Rerun recording."""
     api_key: str | None = None
     max_clients: int = 64
     watchdog: bool = True
@@ -51,8 +54,11 @@ class PolicyServer:
         self.policy = policy
         self.measurements = Measurements()
         self._log = EventLog(settings.log)
+        self._recording = None if settings.rerun is None else RerunLog(settings.rerun)
         self._numbers = itertools.count(1)
         self._sessions: dict[int, Session] = {}
+        self._manual: Any | None = None
+        """The action by hand."""
         self._order: str | None = None
         """What an operator ordered, for clients that come later too; None: to act."""
         limits = settings.limits or Limits()
@@ -90,6 +96,7 @@ class PolicyServer:
         self._log.write("connected", session.number)
         if self._order is not None:
             session.order(self._order)
+        session.safety.override(self._manual)
         return session
 
     def _close_session(self, session: Session) -> None:
@@ -102,8 +109,16 @@ class PolicyServer:
         self._log.write(event.kind, session.number, name=event.name, value=event.value, limit=event.limit)
 
     def close(self) -> None:
-        """Close the log."""
+        """Close the log and the recording."""
         self._log.close()
+        if self._recording is not None:
+            self._recording.close()
+
+    async def write_recording(self) -> None:
+        """Write what was recorded, once a second, for ever."""
+        while self._recording is not None:
+            await asyncio.sleep(1.0)
+            await asyncio.to_thread(self._recording.flush)
 
     async def check_watchdogs(self) -> None:
         """Look after clients that fell silent, for ever."""
@@ -173,9 +188,20 @@ class PolicyServer:
         if (infer_ms := answer["server_timing"]["infer_ms"]) > 0.0:
             measured.inference.add(infer_ms / 1000.0)
         measured.control_error = session.safety.control_error
+        if self._recording is not None:
+            self._record(self._recording, session, infer_ms)
         if "error" in answer:
             measured.errors += 1
         return answer
+
+    def _record(self, recording: RerunLog, session: Session, infer_ms: float) -> None:
+        root, layout = f"client_{session.number}", session.safety.layout
+        recording.add(f"{root}/action", session.action)
+        recording.add(f"{root}/infer_ms", infer_ms)
+        if session.observation is not None:
+            flat = layout.flatten(session.observation)
+            for name, place in layout.slices.items():
+                recording.add(f"{root}/observation/{name}", flat[place].copy())
 
     def note_duration(self, session: Session, seconds: float) -> None:
         """Count a request that took so long."""
@@ -196,9 +222,13 @@ class PolicyServer:
         return len(self._sessions)
 
     def override(self, action: Any | None) -> None:
-        """Give all clients an action by hand; None: the policy acts again. Raises `ValueError` for no action of it."""
+        """Give all clients, also later ones, an action by hand; None: the policy acts again.
+
+        Raises `ValueError` for what is not an action of this policy.
+        """
         for session in self._sessions.values():
             session.safety.override(action)
+        self._manual = action
         self._log.write("order", name="policy" if action is None else "override")
 
     async def replace_policy(self, file: Path) -> None:

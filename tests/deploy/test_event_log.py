@@ -1,4 +1,4 @@
-"""The log of a server: bounded, rotated, and repetitions counted."""
+"""The log of a server: bounded, rotated, and repetitions counted; and its Rerun recording."""
 
 import json
 
@@ -6,6 +6,8 @@ import pytest
 
 from rlctl.deploy.event_log import EventLog
 from rlctl.errors import ArtifactError
+from tests.deploy.serving import OBSERVATION, RunningServer, write_policy
+from tests.replay.reading import column
 
 
 def test_what_repeats_is_counted(tmp_path):
@@ -35,3 +37,18 @@ def test_a_log_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ArtifactError, match="the log cannot be written"):
         EventLog(tmp_path / "file" / "log.jsonl")
+
+
+def test_a_recording_for_rerun(tmp_path):
+    file = write_policy(tmp_path / "policy.safetensors")
+    server = RunningServer(file, watchdog=False, rerun=tmp_path / "served.rrd")
+    with server.client() as client:
+        for _ in range(5):
+            client.act(OBSERVATION)
+    server.close()
+    _, actions = column(tmp_path / "served.rrd", "/client_2/action", timeline="time")
+    assert actions.tolist() == [[6.0, 1.0]] * 5
+    _, goals = column(tmp_path / "served.rrd", "/client_2/observation/goal", timeline="time")
+    assert goals.tolist() == [[1.0, 2.0, 3.0]] * 5
+    with pytest.raises(ArtifactError, match="the recording cannot be written"):
+        RunningServer(file, rerun=file / "served.rrd")

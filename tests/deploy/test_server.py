@@ -213,7 +213,9 @@ def test_actions_by_hand(serve):
     with server.client() as client:
         client.act(OBSERVATION)
         assert server.post("/override", {"action": [1, -1]})[0] == 200
-        assert client.act(OBSERVATION)["actions"].tolist() == [[1.0, -1.0]]
+        assert client.act({**OBSERVATION, "reset": True})["actions"].tolist() == [[1.0, -1.0]]
+        with server.client() as later:
+            assert later.act(OBSERVATION)["actions"].tolist() == [[1.0, -1.0]]
         for wrong in ({"action": [1]}, {"act": 1}, {"action": "up"}, [1, 2], {"action": [1e400, 0]}):
             assert server.post("/override", wrong)[0] == 400
         assert server.post("/override", {"action": None})[0] == 200
