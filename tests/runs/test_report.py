@@ -71,12 +71,12 @@ def test_curves_of_seeds_are_averaged_at_common_steps():
         [{"steps": 10.0, "x": 1.0}, {"steps": 30.0, "x": 3.0}],
         [{"steps": 20.0, "x": 6.0}, {"steps": 40.0, "x": 6.0}],
     ]
-    curve = content.mean_curve(tables, "x", points=3)
-    assert curve["steps"].tolist() == [20, 25, 30]
-    # The first curve has 2, 2.5 and 3 there, the second 6.
-    assert curve["mean"].tolist() == [4, 4.25, 4.5]
-    assert curve["low"].tolist() == [2, 2.5, 3]
-    assert curve["high"].tolist() == [6, 6, 6]
+    curve = content.mean_curve(tables, "x")
+    assert curve["steps"].tolist() == [20, 30]
+    # The first curve has 2 and 3 there, the second 6.
+    assert curve["mean"].tolist() == [4, 4.5]
+    assert curve["low"].tolist() == [2, 3]
+    assert curve["high"].tolist() == [6, 6]
 
 
 def test_robustness_is_in_it_where_it_was_measured(group):

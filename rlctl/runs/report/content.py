@@ -165,7 +165,7 @@ def _outcome(episode: RecordedEpisode) -> str:
 def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[str, Any] | None:
     """Return steps, mean, lowest and highest over several tables at common steps; None without a value.
 
-    All of shape (points,); a single table gives its own rows, averaged where there are more than `points`.
+    All of one shape, at most (points,); a single table gives its own rows, averaged where there are more.
     """
     curves = [found for rows in tables if len(found := _points(rows, column))]
     if not curves:
@@ -177,7 +177,7 @@ def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[s
     first, last = max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves)
     if last < first:
         return None
-    steps = np.linspace(first, last, points)
+    steps = np.linspace(first, last, min(points, max(map(len, curves))))
     values = np.array([np.interp(steps, *curve.T) for curve in curves])
     return {"steps": steps, "mean": values.mean(0), "low": values.min(0), "high": values.max(0), "count": len(curves)}
 
