@@ -91,14 +91,10 @@ class Session:
         if isinstance(age_s, bool) or not isinstance(age_s, int | float | np.number):
             raise ObservationError(f"age_s is {short_repr(age_s)}, not a number of seconds")
         layout = self.safety.layout
-        if WHOLE in fields and (len(fields) > 1 or WHOLE not in layout.shapes):
-            others = [short_repr(name) for name in fields if name != WHOLE]
-            if others and WHOLE not in layout.shapes:
+        if WHOLE in fields and WHOLE not in layout.shapes:
+            if others := [short_repr(name) for name in fields if name != WHOLE]:
                 raise ObservationError(f"doubled: {WHOLE} and {', '.join(others[:8])}; send names or the flat vector")
-            if not others:
-                return layout.read(fields[WHOLE]), float(age_s)
-        if list(fields) == [WHOLE] and isinstance(fields[WHOLE], Mapping):
-            fields = dict(fields[WHOLE])
+            return layout.read(fields[WHOLE]), float(age_s)
         return layout.read(fields), float(age_s)
 
     def _adopt_policy(self) -> None:

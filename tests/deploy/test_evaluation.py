@@ -26,7 +26,7 @@ def reach_server(tmp_path_factory):
 def evaluate(tmp_path, text, **options):
     (tmp_path / "limits.yaml").write_text(text)
     request = EvalRequest(
-        "reach", checkpoint=PRETRAINED, episodes=4, n_envs=1, limits=tmp_path / "limits.yaml", **options
+        "reach", checkpoint=PRETRAINED, episodes=2, n_envs=1, limits=tmp_path / "limits.yaml", **options
     )
     return run_evaluation(request, Gates())
 
@@ -56,9 +56,9 @@ def test_limits_that_the_task_cannot_have(tmp_path):
 
 
 def test_through_a_server_it_is_the_same(reach_server):
-    direct = run_evaluation(EvalRequest("reach", checkpoint=PRETRAINED, episodes=3, n_envs=1), Gates())
+    direct = run_evaluation(EvalRequest("reach", checkpoint=PRETRAINED, episodes=2, n_envs=1), Gates())
     served = run_evaluation(
-        EvalRequest("reach", baseline=f"ws://{reach_server.address}", episodes=3, n_envs=1), Gates()
+        EvalRequest("reach", baseline=f"ws://{reach_server.address}", episodes=2, n_envs=1), Gates()
     )
     assert [each.result.total_reward for each in served.episodes] == [
         each.result.total_reward for each in direct.episodes

@@ -10,6 +10,8 @@ import urllib.request
 
 import pytest
 
+from rlctl.deploy.serve import make_server
+from rlctl.errors import RlctlError
 from tests.deploy.serving import write_policy
 
 
@@ -48,21 +50,22 @@ def test_signals(served):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "error"),
+    ("settings", "code", "error"),
     [
-        (["none.safetensors"], 5, "none.safetensors: no such file"),
-        (["policy.safetensors", "--host", "0.0.0.0"], 2, "give a key"),
-        (["policy.safetensors", "--limits", "limits.yaml"], 2, "limits: no joint 'elbo'. Known: action[0], action[1]."),
-        (["policy.safetensors", "--log", "policy.safetensors/log"], 5, "the log cannot be written"),
+        ({"host": "0.0.0.0"}, 2, "give a key"),
+        ({"limits": "limits.yaml"}, 2, "limits: no joint 'elbo'. Known: action[0], action[1]."),
+        ({"log": "policy.safetensors/log"}, 5, "the log cannot be written"),
     ],
 )
-def test_errors(rlctl, tmp_path, arguments, code, error):
-    write_policy(tmp_path / "policy.safetensors")
+def test_errors(tmp_path, monkeypatch, settings, code, error):
+    monkeypatch.delenv("RLCTL_API_KEY", raising=False)
+    file = write_policy(tmp_path / "policy.safetensors")
     (tmp_path / "limits.yaml").write_text("limits: {elbo: {action: [0, 1]}}")
-    done = rlctl("serve", *arguments, env={"RLCTL_API_KEY": ""})
-    assert (done.returncode, done.stdout) == (code, "")
-    assert error in done.stderr
-    assert "Traceback" not in done.stderr
+    paths = {key: value if key == "host" else tmp_path / value for key, value in settings.items()}
+    with pytest.raises(RlctlError) as problem:
+        make_server(file, **paths)
+    assert problem.value.exit_code == code
+    assert error in str(problem.value)
 
 
 def test_without_the_extra(rlctl, tmp_path):
