@@ -84,6 +84,8 @@ def evaluate(
     claim_stdout()
     from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluations
     from rlctl.eval.report import show_all
+    from rlctl.run.directory import is_group
+    from rlctl.run.group import read_group
 
     gates = Gates(min_success, min_success_lower, min_return)
     request = EvalRequest(
@@ -110,6 +112,12 @@ def evaluate(
         robustness = measure_robustness(request, RobustnessRequest(vary, push, yes), gates)
         show(robustness, json)
         return check_gates(robustness, gates)
+    if run is not None and policy is None and is_group(Path(run)):
+        from rlctl.eval import group
+
+        scores = group.evaluate_group(read_group(Path(run)), request)
+        group.show(scores, json)
+        return scores.check(gates)
     results = run_evaluations(request, gates)
     show_all(results, json)
     return gates.check(*results)

@@ -9,6 +9,7 @@ import typer
 
 from rlctl import completion
 from rlctl.cli.arguments import EnvTimeout, Json, NEnvs, OptionalTask, Set, claim_stdout
+from rlctl.errors import UsageError
 
 
 def train(
@@ -17,7 +18,7 @@ def train(
         str | None,
         typer.Option(
             metavar="RUN",
-            help="Go on with a run instead: a folder, a task's name, or latest.",
+            help="Go on with a run instead: a folder, also of a group, a task's name, or latest.",
             show_default=False,
             autocompletion=completion.complete_run,
         ),
@@ -47,6 +48,14 @@ def train(
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of everything random.", show_default=False)] = None,
+    seeds: Annotated[
+        str | None,
+        typer.Option(metavar="0-4", help="Train these seeds, each an ordinary run, as a group.", show_default=False),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(help="How many seeds train at a time.", min=1, show_default="half as many as cores"),
+    ] = None,
     total_timesteps: Annotated[
         str | None,
         typer.Option(
@@ -71,6 +80,7 @@ def train(
 ) -> None:
     """Train a policy, evaluate as it goes, and keep the best and the last."""
     claim_stdout()
+    from rlctl.run.directory import is_group
     from rlctl.run.recipe import merge_flags
     from rlctl.train.request import TrainRequest, run_training
     from rlctl.train.summary import show
@@ -90,4 +100,13 @@ def train(
         force=force,
         initial_policy=initial_policy,
     )
-    show(run_training(request), json)
+    if seeds is not None or (resume is not None and is_group(Path(resume))):
+        from rlctl.eval import group
+        from rlctl.train.seeds import train_seeds
+
+        result = train_seeds(request, seeds, jobs=jobs)
+        group.show(result.score, json)
+        return result.check()
+    if jobs is not None:
+        raise UsageError("--jobs is about several seeds: give --seeds 0-4, or --resume GROUP")
+    return show(run_training(request), json)

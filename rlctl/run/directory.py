@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from rlctl.run.recipe import Recipe
 
 ROOT = Path("runs")
+GROUP_FILE = "group.json"
+"""In the folder of a group, which holds runs of several seeds."""
 _DIGITS = 18  # of a training step
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 
@@ -231,9 +233,14 @@ def is_being_written(folder: Path) -> bool:
 
 
 def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
-    """Make a new run folder, `<root>/<task>/<time>_s<seed>`, and point `<root>/latest` to it."""
+    """Make a new run folder, `<root>/<task>/<time>_s<seed>`, and point `<root>/latest` to it.
+
+    Where `root` is the folder of a group the run is in it, and `latest` where it is for all runs.
+    """
     now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     folder = root / registry.make_slug(task)
+    if is_group(root):
+        folder, root = root, root.parent.parent
     for attempt in range(1000):
         name = f"{now}_s{seed}" + (f"_{attempt}" if attempt else "")
         try:
@@ -245,6 +252,11 @@ def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
         point_latest_to(root, folder / name)
         return RunDirectory(folder / name)
     raise ArtifactError(f"{folder}: cannot make a run folder")
+
+
+def is_group(path: Path) -> bool:
+    """Say whether a folder is that of a group of runs."""
+    return (path / GROUP_FILE).is_file()
 
 
 def point_latest_to(root: Path, run: Path) -> None:

@@ -13,13 +13,14 @@ from pathlib import Path
 
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import ArtifactError, did_you_mean
-from rlctl.run.directory import ROOT, RunDirectory, point_latest_to
+from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.run.directory import ROOT, RunDirectory, is_group, point_latest_to
 from rlctl.run.policy import PolicyInfo, read_info
 from rlctl.run.shipped import PRETRAINED, find_shipped_policy
 from rlctl.run.task_version import describe_task_changes
 
 _MOST_COMPARED = 50  # older runs whose scores are looked at
+_IN_TASK = ("*/run.json", "*_seeds/*/run.json")
 _RUN_NAME = re.compile(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_s\d+(_\d+)?$")
 
 
@@ -49,7 +50,9 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
         return RunDirectory(Path(text))
     if Path(text).name == "latest" and _dangles(Path(text)):
         return find_run("latest", Path(text).parent)
-    if found := _list_newest_first(root / registry.make_slug(text), "*/run.json"):
+    if is_group(Path(text)):
+        raise UsageError(f"{text}: a group of runs; name one of them: {text.rstrip('/')}/..._s0")
+    if found := _list_newest_first(root / registry.make_slug(text), *_IN_TASK):
         return found[0]
     if Path(text).is_dir():
         raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
@@ -80,7 +83,8 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> Fou
     run = find_run(text, root)
     if text is not None and (Path(text) / "run.json").is_file():
         return FoundPolicy(run.policy_file(which), run)
-    runs = _list_newest_first(run.path.parent, "*/run.json")
+    in_group = is_group(run.path.parent)
+    runs = _list_newest_first(run.path.parent.parent if in_group else run.path.parent, *_IN_TASK)
     older = [each for each in runs if each.path.name < run.path.name] if text in (None, "latest") else runs[1:]
     candidates = [run] if text in (None, "latest") else runs
     for number, candidate in enumerate(candidates):
@@ -186,7 +190,7 @@ def _read_latest(root: Path) -> RunDirectory | None:
 
 def _repair_latest(root: Path) -> RunDirectory | None:
     """Return the newest run, and point to it where the run that `latest` points to was removed."""
-    newest = next(iter(_list_newest_first(root, "*/*/run.json")), None)
+    newest = next(iter(_list_newest_first(root, "*/*/run.json", "*/*/*_s*/run.json")), None)
     if newest is not None and _dangles(root / "latest"):
         point_latest_to(root, newest.path)
     return newest
@@ -196,7 +200,8 @@ def _dangles(link: Path) -> bool:
     return link.is_symlink() and not link.exists()
 
 
-def _list_newest_first(root: Path, pattern: str) -> list[RunDirectory]:
-    runs = [file.parent for file in root.glob(pattern) if _RUN_NAME.match(file.parent.name)]
+def _list_newest_first(root: Path, *patterns: str) -> list[RunDirectory]:
+    found = (file.parent for pattern in patterns for file in root.glob(pattern))
+    runs = [run for run in found if _RUN_NAME.match(run.name)]
     runs.sort(key=lambda run: (run.name[:19], (run / "run.json").stat().st_mtime_ns), reverse=True)
     return [RunDirectory(run) for run in runs]

@@ -37,7 +37,7 @@ def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Pat
         return _measured([run.path for run in _all_but_best(list_runs(root=root), keep_best)], "runs")
     paths = [_checked(Path(text), root) for text in runs]
     for path in paths:
-        if is_being_written(path):
+        if any(is_being_written(each) for each in (path, *(lock.parent for lock in path.glob("*/.lock")))):
             raise UsageError(f"{path}: this run is being trained; nothing was removed")
     return _measured(list(dict.fromkeys(paths)), "runs")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.errors import ArtifactError
-from rlctl.run.directory import ROOT, RunDirectory, is_being_written
+from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
 
 _TAIL_BYTES = 4096
 """The last row of a table is looked for here; a row has at most some hundred bytes."""
@@ -43,7 +43,7 @@ class RunSummary:
     @property
     def name(self) -> str:
         """Return the path below the folder of all runs: `reach/2026-11-21_10-30-00_s0`."""
-        return "/".join(self.path.parts[-2:])
+        return "/".join(self.path.parts[-3 if is_group(self.path.parent) else -2 :])
 
     @property
     def state_text(self) -> str:
@@ -60,9 +60,10 @@ class RunSummary:
 
 
 def find_runs(root: Path = ROOT) -> Iterator[Path]:
-    """Yield every run folder below `root`, damaged ones included: all folders two levels down."""
+    """Yield every run folder below `root`, damaged ones included: all folders two levels down, and those in groups."""
     for task in _folders(root):
-        yield from _folders(task)
+        for folder in _folders(task):
+            yield from _folders(folder) if is_group(folder) else [folder]
 
 
 def _folders(path: Path) -> list[Path]:

@@ -1,0 +1,94 @@
+"""A group: the runs of one task with several seeds, in one folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import re
+from pathlib import Path
+from typing import Any
+
+from rlctl import registry
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.run import files
+from rlctl.run.directory import GROUP_FILE, RunDirectory, is_group
+
+_MOST_SEEDS = 1000
+_RANGE = re.compile(r"(\d{1,9})-(\d{1,9})")
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """The folder of a group and what its `group.json` says."""
+
+    path: Path
+    task: str
+    seeds: list[int]
+    options: list[str]
+    """Of `rlctl train`, for every seed."""
+
+    @property
+    def scores_file(self) -> Path:
+        """Where the scores of all seeds are written at the end."""
+        return self.path / "scores.json"
+
+    def find_run(self, seed: int) -> RunDirectory | None:
+        """Return the newest run of a seed; None if it has not begun."""
+        pattern = re.compile(rf"_s{seed}(_\d+)?$")
+        found = [file.parent for file in self.path.glob("*/run.json") if pattern.search(file.parent.name)]
+        return RunDirectory(max(found, key=lambda each: each.name)) if found else None
+
+    def is_done(self, seed: int) -> bool:
+        """Say whether a seed's training has finished; False for a run that cannot be read."""
+        run = self.find_run(seed)
+        try:
+            return run is not None and run.status().get("status") == "finished"
+        except ArtifactError:
+            return False
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Return the seeds of `0-4` or `0,3,7-9`; raises `UsageError` for text that is not one, and for a seed twice."""
+    seeds: list[int] = []
+    for part in text.split(","):
+        part = part.strip()
+        if match := _RANGE.fullmatch(part):
+            first, last = int(match[1]), int(match[2])
+            if last < first:
+                raise UsageError(f"--seeds {text}: {part} goes down; write {last}-{first}")
+            if last - first >= _MOST_SEEDS:
+                raise UsageError(f"--seeds {text}: at most {_MOST_SEEDS} seeds")
+            seeds += range(first, last + 1)
+        elif part.isdecimal() and len(part) < 10:
+            seeds.append(int(part))
+        else:
+            raise UsageError(f"--seeds {text}: write a range or a list, such as 0-4 or 0,3,7")
+    if twice := [each for each in seeds if seeds.count(each) > 1]:
+        raise UsageError(f"--seeds {text}: seed {twice[0]} is there twice")
+    return seeds
+
+
+def create_group(task: str, seeds: list[int], options: list[str], root: Path) -> Group:
+    """Make a new group folder, `<root>/<task>/<time>_seeds`."""
+    now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder = root / registry.make_slug(task) / f"{now}_seeds"
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise ArtifactError(f"{folder}: cannot make a group's folder: {error.strerror}") from None
+    files.write_json(folder / GROUP_FILE, {"task": task, "seeds": seeds, "options": options})
+    return Group(folder, task, seeds, options)
+
+
+def read_group(path: Path) -> Group:
+    """Read a group; raises `ArtifactError` for a folder that is not one, or damaged."""
+    if not is_group(path):
+        raise ArtifactError(f"{path}: not a group of runs: it has no {GROUP_FILE}")
+    content: Any = files.read_json(path / GROUP_FILE)
+    try:
+        task, seeds, options = content["task"], content["seeds"], content["options"]
+        if not isinstance(task, str) or not all(isinstance(each, int) for each in seeds):
+            raise TypeError
+        return Group(path, task, list(seeds), [str(each) for each in options])
+    except (KeyError, TypeError):
+        raise ArtifactError(f"{path / GROUP_FILE}: damaged: it does not name a task, seeds and options") from None

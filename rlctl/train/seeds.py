@@ -1,0 +1,241 @@
+"""`rlctl train TASK --seeds 0-4`: an ordinary run for every seed, each in a process of its own, in one group."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rlctl import output, registry
+from rlctl.errors import Interrupted, RlctlError, UsageError
+from rlctl.eval.evaluate import EvalRequest
+from rlctl.eval.group import GroupScore, as_json, evaluate_group
+from rlctl.rollout.process_start import Process, default_start
+from rlctl.rollout.workers import available_cores
+from rlctl.run import files
+from rlctl.run.group import Group, create_group, parse_seeds, read_group
+from rlctl.run.recipe import resolve
+from rlctl.train.process_state import preserve_process_state
+from rlctl.train.request import TrainRequest
+from rlctl.train.warm_start import find_source
+
+CORES_PER_TRAINING = 2
+"""One plays while the other learns, in turn or side by side."""
+_POLL_S = 0.1
+
+
+class SeedsFailed(RlctlError):
+    """Some seeds of a group have failed; the exit code is the highest of theirs."""
+
+    def __init__(self, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+
+
+@dataclasses.dataclass(frozen=True)
+class SeedsResult:
+    """How the trainings of a group ended."""
+
+    score: GroupScore
+    failed: Mapping[int, int]
+    """Exit code per seed that failed."""
+
+    def check(self) -> None:
+        """Raise `SeedsFailed` if a seed failed."""
+        if self.failed:
+            which = ", ".join(f"seed {seed} with exit code {code}" for seed, code in self.failed.items())
+            raise SeedsFailed(
+                f"{self.score.group.path}: {len(self.failed)} of {len(self.score.group.seeds)} seeds failed: {which}. "
+                f"What each said is above; to try those again: rlctl train --resume {self.score.group.path}",
+                max(self.failed.values()),
+            )
+
+
+def train_seeds(
+    request: TrainRequest, seeds: str | None, *, jobs: int | None = None, episodes: int = 100
+) -> SeedsResult:
+    """Train a request with several seeds, or go on with the group that it resumes; then evaluate each best policy.
+
+    At most `jobs` train at a time. Seeds that are done are left as they are, and one that fails stops no other. Raises
+    `UsageError` for seeds that are none, `RecipeError` for a recipe that is wrong, and `Interrupted` after a signal,
+    when all have saved their checkpoints.
+    """
+    group = _begin(request, seeds) if seeds is not None else read_group(Path(str(request.resume)))
+    options = [] if seeds is not None else list_options(request)
+    waiting = [seed for seed in group.seeds if not group.is_done(seed) or options]
+    jobs = _choose_jobs(group, len(waiting), jobs)
+    failed = _Trainings({seed: _make_command(group, seed, options) for seed in waiting}, jobs).run(group)
+    score = evaluate_group(group, EvalRequest(None, episodes=episodes))
+    files.write_json(group.scores_file, as_json(score))
+    return SeedsResult(score, failed)
+
+
+def _begin(request: TrainRequest, seeds: str) -> Group:
+    """Make a new group, after a look at its task and recipe: what is wrong is wrong for every seed."""
+    if request.task is None or request.resume is not None:
+        raise UsageError("--seeds is about a new group: give a task, and no --resume")
+    if "seed" in request.settings:
+        raise UsageError("--seeds and --seed: give one of the two")
+    numbers = parse_seeds(seeds)
+    with preserve_process_state():
+        registry.load(request.task)
+    recipe = resolve(request.task, request.config, request.settings)
+    if request.initial_policy is not None:
+        find_source(request.initial_policy, recipe)
+    return create_group(request.task, numbers, list_options(request), request.root)
+
+
+def list_options(request: TrainRequest) -> list[str]:
+    """Return the options of `rlctl train` that a request stands for, but for its task, seed and folder."""
+    options = [f"--set={key}={json.dumps(value)}" for key, value in _flatten(request.settings)]
+    options += [f"--config={request.config}"] if request.config is not None else []
+    options += [f"--from={request.initial_policy}"] if request.initial_policy is not None else []
+    options += [f"--record={request.record}"] if request.record else []
+    options += ["--force"] if request.force else []
+    default = TrainRequest(None)
+    for name, value, usual in (
+        ("device", request.device, default.device),
+        ("env-timeout", request.env_timeout_s, default.env_timeout_s),
+    ):
+        options += [f"--{name}={value}"] if value != usual else []
+    return options if request.check else [*options, "--no-check"]
+
+
+def _flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _choose_jobs(group: Group, waiting: int, jobs: int | None) -> int:
+    cores = available_cores()
+    chosen = min(jobs or max(1, cores // CORES_PER_TRAINING), max(waiting, 1))
+    done = len(group.seeds) - waiting
+    output.print_notes(
+        [
+            f"{group.path}: {len(group.seeds)} seeds{f', {done} done' if done else ''}, {chosen} at a time: a training "
+            f"keeps {CORES_PER_TRAINING} cores busy, there are {cores}; --jobs changes it"
+        ]
+    )
+    return chosen
+
+
+def _make_command(group: Group, seed: int, options: Sequence[str]) -> list[str]:
+    run = group.find_run(seed)
+    if run is not None:
+        return ["train", "--resume", str(run.path), *options]
+    return ["train", group.task, "--seed", str(seed), "--output", str(group.path), *group.options, *options]
+
+
+class _Trainings:
+    """Processes that train a seed each, some of them at a time."""
+
+    def __init__(self, commands: Mapping[int, list[str]], jobs: int) -> None:
+        self._waiting = dict(commands)
+        self._running: dict[int, tuple[int, Process]] = {}  # per place: seed and process
+        self._failed: dict[int, int] = {}
+        self._jobs = jobs
+        self._signals: list[int] = []
+        self._readers: list[threading.Thread] = []
+
+    def run(self, group: Group) -> dict[int, int]:
+        """Train all; return the exit code of each seed that failed."""
+        first = None
+        with self._take_signals():
+            while self._running or (self._waiting and first is None):
+                while self._signals:
+                    number = self._signals.pop(0)
+                    first = first or number
+                    for _, process in self._running.values():
+                        with contextlib.suppress(ProcessLookupError):
+                            os.kill(process.pid, number)
+                if first is None:
+                    self._start_next()
+                self._take_ended()
+                time.sleep(_POLL_S)
+        for reader in self._readers:
+            reader.join(timeout=1.0)
+        if first is not None:
+            raise Interrupted(f"interrupted; go on with: rlctl train --resume {group.path}", first)
+        return self._failed
+
+    @contextlib.contextmanager
+    def _take_signals(self) -> Iterator[None]:
+        # They are passed on by the loop, once each: the processes have groups of their own, which a terminal's Ctrl-C
+        # does not reach.
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+        before = {
+            each: signal.signal(each, lambda number, _: self._signals.append(number))
+            for each in numbers
+            if signal.getsignal(each) != signal.SIG_IGN or each == signal.SIGINT
+        }
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _start_next(self) -> None:
+        for place in range(self._jobs):
+            if place in self._running or not self._waiting:
+                continue
+            seed = next(iter(self._waiting))
+            arguments = self._waiting.pop(seed)
+            with _share_of_cores(place, self._jobs):
+                read, write = os.pipe()
+                process = default_start()(
+                    [sys.executable, "-m", "rlctl", *arguments],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=write,
+                    process_group=0,
+                )
+            os.close(write)
+            self._running[place] = seed, process
+            reader = threading.Thread(target=_print_lines, args=(seed, read), daemon=True)
+            reader.start()
+            self._readers.append(reader)
+
+    def _take_ended(self) -> None:
+        for place, (seed, process) in list(self._running.items()):
+            code = process.poll()
+            if code is not None:
+                del self._running[place]
+                if code:
+                    self._failed[seed] = code if code > 0 else 128 - code
+
+
+def _print_lines(seed: int, descriptor: int) -> None:
+    with os.fdopen(descriptor, encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            print(f"seed {seed}: {line}", end="", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _share_of_cores(place: int, jobs: int) -> Iterator[None]:
+    """Let what is started meanwhile use its share of the cores only, from which it also takes its number of workers."""
+    if jobs == 1 or not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    cores = sorted(os.sched_getaffinity(0))
+    share = max(1, len(cores) // jobs)
+    first = place * share % len(cores)
+    os.sched_setaffinity(0, cores[first : first + share])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
