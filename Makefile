@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow test-crash test-all lint format bench clean
+.PHONY: demo test test-slow test-crash test-all lint format bench train-all clean
 
 demo: $(VENV)/.installed
 	$(BIN)/rlctl train reach
@@ -39,6 +39,10 @@ format: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m tests.benchmarks
+
+# Trains what is missing of every bundled task, and writes the tables of scores; hours. SEEDS=1-3 by default.
+train-all: $(VENV)/.dev
+	$(BIN)/python -m tests.benchmarks.train_all $(if $(SEEDS),--seeds $(SEEDS))
 
 clean:
 	rm -rf $(VENV) dist build .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,142 @@
+"""Trains every bundled task with several seeds, and writes the tables of scores in the plugins' READMEs: `make train-all`.
+
+What is trained already stays, what was stopped goes on. The numbers come from the runs: means over seeds of the best
+policies' scores, over 100 episodes that their training has not seen, and the spread over seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rlctl import registry
+from rlctl.eval.evaluate import EvalRequest
+from rlctl.eval.group import as_json, evaluate_group
+from rlctl.run import files
+from rlctl.run.directory import GROUP_FILE
+from rlctl.run.group import Group, parse_seeds, read_group
+
+BEGIN, END = "<!-- scores: make train-all -->\n", "<!-- end of scores -->\n"
+HEAD = """\
+| task | algorithm | steps | minutes | success | return | action change | ended early |
+|---|---|---|---|---|---|---|---|
+"""
+
+
+def list_tasks() -> list[str]:
+    """Return the bundled tasks."""
+    return [each.name for each in registry.list_installed() if each.distribution == registry.OURS]
+
+
+def find_group(task: str, seeds: Sequence[int], root: Path) -> Group | None:
+    """Return the newest group of a task's runs, or its runs of these seeds outside of groups, if there are all."""
+    groups = sorted((root / registry.make_slug(task)).glob(f"*_seeds/{GROUP_FILE}"))
+    if groups:
+        return read_group(groups[-1].parent)
+    alone = Group(root / registry.make_slug(task), task, list(seeds), [])
+    return alone if all(alone.is_done(seed) for seed in seeds) else None
+
+
+def train(task: str, seeds: str, root: Path) -> int:
+    """Train what is missing of a task; return the exit code."""
+    group = find_group(task, parse_seeds(seeds), root)
+    if group is not None and all(group.is_done(seed) for seed in group.seeds):
+        return 0
+    what = ["--resume", str(group.path)] if group is not None else [task, "--seeds", seeds, "--output", str(root)]
+    return subprocess.run([sys.executable, "-m", "rlctl", "train", *what], check=False).returncode
+
+
+def read_scores(group: Group) -> dict[str, Any]:
+    """Return the scores of a group, from its file if that is newer than its runs; else they are measured."""
+    runs = [run for seed in group.seeds if (run := group.find_run(seed)) is not None]
+    file = group.scores_file
+    newest = max((run.status_file.stat().st_mtime for run in runs), default=0.0)
+    if not file.is_file() or file.stat().st_mtime < newest:
+        files.write_json(file, as_json(evaluate_group(group, EvalRequest(None))))
+    content: dict[str, Any] = json.loads(file.read_text())
+    return content
+
+
+def format_row(scores: dict[str, Any]) -> str:
+    """Return a task's row of the table; one of a task without a score says why."""
+    known = [each for each in scores["seeds"] if each["score"] is not None]
+    if not known:
+        return f"| `{scores['task']}` | | | | {scores['seeds'][0]['problem']} | | | |\n"
+    measured = [each["score"] for each in known]
+    success, returns = ([each[key] for each in measured] for key in ("success", "mean_return"))
+    early = [each["ended_early"] for each in measured if each["ended_early"] is not None]
+    cells = [
+        f"`{scores['task']}`",
+        known[0]["algo"],
+        _format([each["steps"] for each in known if each["steps"] is not None], ",.0f"),
+        _format([each["seconds"] / 60 for each in known if each["seconds"] is not None], ".1f"),
+        "" if None in success else _format([100 * each for each in success], ".1f", " %", spread=True),
+        _format(returns, ".4g", spread=True),
+        _format([each["action_change"] for each in measured], ".3f"),
+        _format([100 * each for each in early], ".0f", " %"),
+    ]
+    return f"| {' | '.join(cells)} |\n"
+
+
+def _format(values: list[float], form: str, unit: str = "", *, spread: bool = False) -> str:
+    if not values:
+        return ""
+    text = f"{statistics.fmean(values):{form}}"
+    if spread:
+        text += f" ± {statistics.stdev(values):{form}}" if len(values) > 1 else " (one seed)"
+    return text + unit
+
+
+def format_table(scores: Sequence[dict[str, Any]]) -> str:
+    """Return the table of some tasks, with what its numbers are."""
+    first = next((each["score"] for one in scores for each in one["seeds"] if each["score"] is not None), None)
+    seeds = sorted({each["seed"] for one in scores for each in one["seeds"]})
+    numbers = ", ".join(map(str, seeds))
+    note = f"Means over the training seeds {numbers}, ± the standard deviation between them"
+    if first is not None:
+        note += f"; {first['episodes']} episodes each, which no training has seen"
+    return HEAD + "".join(map(format_row, scores)) + f"\n{note}.\n"
+
+
+def write_table(readme: Path, table: str) -> None:
+    """Put a table between the marks of a README, which get their place at its end if there are none."""
+    text = readme.read_text()
+    if BEGIN not in text:
+        text = f"{text.rstrip()}\n\n## Scores\n\n{BEGIN}{END}"
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    readme.write_text(f"{before}{BEGIN}\n{table}\n{END}{after}")
+
+
+def main() -> int:
+    """Train what is missing and write the tables; return the highest exit code of a training."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tasks", nargs="*", help="these tasks only; default: all")
+    parser.add_argument("--seeds", default="1-3", help="training seeds of what is begun")
+    parser.add_argument("--root", type=Path, default=Path("runs"), help="where run folders are")
+    parser.add_argument("--table-only", action="store_true", help="train nothing")
+    options = parser.parse_args()
+    worst, by_readme = 0, {}
+    for task in list_tasks():
+        if not options.table_only and (not options.tasks or task in options.tasks):
+            code = train(task, options.seeds, options.root)
+            if code in (129, 130, 143):
+                return code
+            worst = max(worst, code)
+        group = find_group(task, parse_seeds(options.seeds), options.root)
+        entry = registry.find(task)
+        if group is not None and entry is not None and entry.module_file is not None:
+            by_readme.setdefault(entry.module_file.with_name("README.md"), []).append(read_scores(group))
+    for readme, scores in by_readme.items():
+        write_table(readme, format_table(scores))
+    return worst
+
+
+if __name__ == "__main__":
+    sys.exit(main())
