@@ -1,4 +1,4 @@
-"""Trains every bundled task with several seeds and writes the tables of scores in the plugins' READMEs: `make train-all`.
+"""Trains every bundled task with several seeds, and writes the score tables of the plugins' READMEs: `make train-all`.
 
 What is trained already stays, what was stopped goes on. The numbers come from the runs: means over seeds of the best
 policies' scores, over 100 episodes that their training has not seen, and the spread over seeds.

@@ -110,6 +110,7 @@ def test_what_is_done_stays_and_a_damaged_run_stops_no_other(group, tmp_path):
     assert group.find_run(4).last_policy.stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_a_signal_stops_all_with_checkpoints(tmp_path):
     """In a thread the signal is sent; the handler is in the main thread, as on the command line."""
     settings = {**TINY, "total_timesteps": 10_000_000}
