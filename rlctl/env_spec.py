@@ -45,6 +45,8 @@ class EnvSpec:
     """Events that act, with the parameters that differ from the task's."""
     frame_stack: Annotated[int, Ge(1)] = 1
     """How many of the last observations make one."""
+    time_feature: bool = False
+    """Whether the part of the episode that is left is observed."""
     stage: Annotated[int, Ge(0)] = 0
     """Stage of the curriculum, from 1; 0 where there is none."""
     level: Annotated[float, Ge(0), Le(1)] = 1.0
@@ -66,13 +68,15 @@ class EnvSpec:
                 if getattr(self, key) != getattr(EnvSpec(self.task), key):
                     raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
             env = self._make_plain_env(constructor, render_mode)
-        if self.frame_stack > 1:
-            try:
-                return _stack_frames(env, self.frame_stack)
-            except RecipeError:
-                env.close()
-                raise
-        return env
+        try:
+            if self.time_feature:
+                from rlctl.time_feature import TimeFeature
+
+                env = TimeFeature(env)
+            return _stack_frames(env, self.frame_stack) if self.frame_stack > 1 else env
+        except RecipeError:
+            env.close()
+            raise
 
     def _make_task_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
         from rlctl.task.env import TaskEnv

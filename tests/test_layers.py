@@ -22,7 +22,7 @@ LAYERS = [
     {"run"},
     {"gym"},
     {"env_spec"},
-    {"dict_spaces"},
+    {"dict_spaces", "time_feature"},
     {"named_task"},
     {"registry"},
     {"plugin_code"},

@@ -58,8 +58,8 @@ def _ask_server(address: str) -> None:
 def choose_task(request: EvalRequest) -> EnvSpec:
     """Return the task of a request as its recipe would train it, in the last stage; observations are not stacked."""
     if request.spec is not None:
-        return dataclasses.replace(request.spec, frame_stack=1)
+        return dataclasses.replace(request.spec, frame_stack=1, time_feature=False)
     if request.run is None:
         raise UsageError(f"--policy {request.baseline}: give the task to play: rlctl eval reach --policy zero")
     spec = resolve_packaged(request.run).env_specs(request.run)[-1]
-    return request.changes.apply(dataclasses.replace(spec, frame_stack=1, stage=0))
+    return request.changes.apply(dataclasses.replace(spec, frame_stack=1, time_feature=False, stage=0))

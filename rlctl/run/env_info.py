@@ -64,6 +64,7 @@ def _shorten(space: spaces.Space[Any]) -> str:
 def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
     """Describe an environment; for a task with its names, units and timing."""
     from rlctl.task.env import TaskEnv
+    from rlctl.time_feature import find_time_feature
 
     inner = env.unwrapped
     common: dict[str, Any] = {
@@ -72,10 +73,11 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
         "has_compute_reward": callable(getattr(inner, "compute_reward", None)),
     }
     if isinstance(inner, TaskEnv):
-        task = inner.task
+        task, time = inner.task, find_time_feature(env)
+        sizes = inner.observation_sizes
         return EnvInfo(
             **common,
-            observation_sizes=inner.observation_sizes,
+            observation_sizes=sizes if time is None else time.extend_sizes(sizes),
             observation_units=dict(task.observation_units),
             action_meaning=task.action_meaning,
             control_dt=task.control_dt,

@@ -109,6 +109,8 @@ class Recipe(_Section):
     """Running normalisation of observations and rewards."""
     frame_stack: Whole = Field(1, ge=1, le=1000)
     """How many of the last observations the policy gets."""
+    time_feature: Switch = False
+    """Whether the policy also observes the part of the episode that is left, from 1 to 0, as rl-zoo3's agents do."""
     overlap: Switch = True
     """Whether off-policy algorithms learn while environments play, with a policy one chunk of `train_freq` older."""
     n_envs: Whole = Field(8, ge=1, le=_MOST_ENVS)
@@ -172,7 +174,14 @@ class Recipe(_Section):
         `named_by` is the kind of file that names the task, if no person does.
         """
         base = EnvSpec(
-            task, self.task, self.reward_weights, self.randomize, self.events, self.frame_stack, named_by=named_by
+            task,
+            self.task,
+            self.reward_weights,
+            self.randomize,
+            self.events,
+            self.frame_stack,
+            self.time_feature,
+            named_by=named_by,
         )
         return [
             dataclasses.replace(

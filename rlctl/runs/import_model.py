@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.run.env_info import EnvInfo, describe
 from rlctl.run.policy import PolicyInfo, collect_versions, load_policy, save_policy
 from rlctl.runs.sb3_model import SavedModel, SavedNormalization, read_model, read_normalization
 
@@ -42,7 +43,6 @@ def import_model(request: ImportRequest) -> ImportedPolicy:
 
     Raises `ArtifactError` for a file that is not a model, or one for other spaces than the task has.
     """
-    from rlctl.run.env_info import describe
     from rlctl.run.torch_policy import ALGORITHMS, build_network, describe_network, policy_name
 
     if request.algo is not None and request.algo not in ALGORITHMS:
@@ -50,11 +50,10 @@ def import_model(request: ImportRequest) -> ImportedPolicy:
     model = read_model(request.model, request.algo)
     normalization = read_normalization(request.normalization) if request.normalization else None
     spec = request.changes.apply(EnvSpec(request.task))
-    env = spec.make()
-    try:
-        env_info = describe(env)
-    finally:
-        env.close()
+    env_info = _describe_env(spec)
+    if _has_time_feature(model, env_info):
+        spec = dataclasses.replace(spec, time_feature=True)
+        env_info = _describe_env(spec)
     _check_spaces(request, model, *env_info.spaces())
     info = PolicyInfo(
         algo=model.algo,
@@ -77,6 +76,28 @@ def import_model(request: ImportRequest) -> ImportedPolicy:
     return ImportedPolicy(output, info, normalization is not None)
 
 
+def _describe_env(spec: EnvSpec) -> EnvInfo:
+    env = spec.make()
+    try:
+        return describe(env)
+    finally:
+        env.close()
+
+
+def _has_time_feature(model: SavedModel, env: EnvInfo) -> bool:
+    """Say whether a model observes one number more than a task gives, the last one, which is in [0, 1]."""
+    ours, theirs = (_flat_part(space) for space in (env.spaces()[0], model.observation_space))
+    if ours is None or theirs is None or theirs.shape[0] != ours.shape[0] + 1:
+        return False
+    return bool(theirs.low[-1] == 0.0 and theirs.high[-1] == 1.0)
+
+
+def _flat_part(space: spaces.Space[Any]) -> spaces.Box | None:
+    """Return what the time feature is appended to, if the space has it: itself, or its entry `observation`."""
+    part = space.spaces.get("observation") if isinstance(space, spaces.Dict) else space
+    return part if isinstance(part, spaces.Box) and len(part.shape) == 1 else None
+
+
 def _check_spaces(
     request: ImportRequest, model: SavedModel, observation: spaces.Space[Any], action: spaces.Space[Any]
 ) -> None:
@@ -85,23 +106,15 @@ def _check_spaces(
 
     seen = network_space(observation)
     if _describe_shape(seen) != _describe_shape(model.observation_space):
-        hint = _hint_of_sizes(seen, model.observation_space)
         raise ArtifactError(
             f"{request.model}: it observes {_describe_shape(model.observation_space)}, "
-            f"{request.task} gives {_describe_shape(seen)}{hint}"
+            f"{request.task} gives {_describe_shape(seen)}"
         )
     same = _describe_shape(action) == _describe_shape(model.action_space)
     if same and isinstance(action, spaces.Box) and isinstance(model.action_space, spaces.Box):
         same = np.allclose(action.low, model.action_space.low) and np.allclose(action.high, model.action_space.high)
     if not same:
         raise ArtifactError(f"{request.model}: its actions are {model.action_space}, those of {request.task} {action}")
-
-
-def _hint_of_sizes(ours: spaces.Space[Any], theirs: spaces.Space[Any]) -> str:
-    sizes = [space.shape for space in (ours, theirs) if isinstance(space, spaces.Box) and len(space.shape) == 1]
-    if len(sizes) == 2 and sizes[1][0] == sizes[0][0] + 1:
-        return "; the one more may be the time feature of rl-zoo3, which this task does not have"
-    return ""
 
 
 def _describe_shape(space: spaces.Space[Any]) -> Any:
@@ -147,12 +160,15 @@ def show(result: ImportedPolicy, json: str | None) -> None:
             "algo": info.algo,
             "task": info.spec.task,
             "normalizes": result.normalizes,
+            "time_feature": info.spec.time_feature,
         }
         output.write_result_json(json, {**content, "training_steps": info.training_steps, "versions": info.versions})
         return
     out = output.out()
     normalization = "with" if result.normalizes else "without"
     out.print(f"{result.file}: {info.algo}, step {info.training_steps:,}, {normalization} observation normalisation")
+    if info.spec.time_feature:
+        out.print("it also observes the part of the episode that is left, the time feature of rl-zoo3")
     out.print("next:")
     for command in (f"rlctl eval {result.file}", f"rlctl export {result.file} --onnx", f"rlctl replay {result.file}"):
         out.print(f"  {command}", markup=False)

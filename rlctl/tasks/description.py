@@ -78,7 +78,7 @@ def describe(task: str) -> Description:
     constructor: Any = registry.load(task)
     recipe = recipes.resolve_packaged(task)
     # The last stage is what is wanted. The parts of stacked observations have no names.
-    spec = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1)
+    spec = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1, time_feature=False)
     env = spec.make()
     # Guarded: attributes of an environment are a plugin's code too.
     try:
