@@ -67,7 +67,8 @@ class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
 def _append_bounds(space: spaces.Space[Any]) -> spaces.Box:
     if not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.dtype.kind != "f":
         raise RecipeError(f"time_feature: only flat observations of real numbers can have it, this task has {space}")
-    return spaces.Box(np.append(space.low, 0.0), np.append(space.high, 1.0), dtype=space.dtype.type)
+    low, high = (np.append(bounds, end).astype(space.dtype) for bounds, end in ((space.low, 0), (space.high, 1)))
+    return spaces.Box(low, high, dtype=space.dtype.type)
 
 
 def find_time_feature(env: gymnasium.Env[Any, Any]) -> TimeFeature | None:
