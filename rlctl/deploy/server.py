@@ -27,7 +27,7 @@ from rlctl.dict_spaces import split
 from rlctl.errors import RlctlError, short_repr
 
 _HEARTBEAT_S = 30.0
-_AT_ONCE_S = 20e-6
+_AT_ONCE_S = 50e-6
 _SHORTEST_TICK_S = 0.01
 
 
@@ -92,7 +92,6 @@ class PolicyServer:
         session = Session(next(self._numbers), lambda: self.policy, self._limits)
         session.safety.on_event = lambda event: self._take_event(session, event)
         self._sessions[session.number] = session
-        self.measurements.connections += 1
         self._log.write("connected", session.number)
         if self._order is not None:
             session.order(self._order)
@@ -135,6 +134,7 @@ class PolicyServer:
             self.measurements.refused += 1
             return web.Response(status=503, text=f"{self.settings.max_clients} clients are connected, which is all\n")
         session = self._open_session()
+        self.measurements.connections += 1
         try:
             socket = web.WebSocketResponse(
                 compress=False, max_msg_size=self.largest_message, heartbeat=_HEARTBEAT_S, timeout=1.0
@@ -155,20 +155,16 @@ class PolicyServer:
         ready = time.perf_counter()
         async for message in socket:
             begin = time.perf_counter()
-            if begin - ready < _AT_ONCE_S:
-                await asyncio.sleep(
-                    0
-                )  # it was there already, as those of a flood are: the others have their turn first
-            ready = time.perf_counter()
-            if message.type is not aiohttp.WSMsgType.BINARY:
-                await self._send_error(socket, session, "a text frame; requests are binary frames of msgpack")
-                continue
+            if begin - ready < _AT_ONCE_S:  # it was there already, as those of a flood are: the others come first
+                await asyncio.sleep(0)
             try:
-                request = messages.unpack(message.data)
+                if message.type is not aiohttp.WSMsgType.BINARY:
+                    raise messages.MessageError("a text frame; requests are binary frames of msgpack")
+                answer = self.answer(session, messages.unpack(message.data))
             except messages.MessageError as error:
                 await self._send_error(socket, session, str(error))
+                ready = time.perf_counter()
                 continue
-            answer = self.answer(session, request)
             if before_s is not None:
                 answer["server_timing"]["prev_total_ms"] = before_s * 1000.0
             await socket.send_bytes(messages.pack(answer))

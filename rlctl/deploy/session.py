@@ -109,10 +109,10 @@ class Session:
         self._by_watchdog = False
         self._actor.reset()
         self.safety.reset()
-        self._last_s = None
 
     def order(self, what: str) -> None:
         """Follow an operator: stop, home, hold or resume."""
+        self._by_watchdog = False  # what a person has ordered, a client does not leave
         {
             "stop": lambda: self.safety.stop("stopped by hand"),
             "home": lambda: self.safety.home("sent home by hand"),
@@ -121,6 +121,5 @@ class Session:
         }[what]()
 
     def _resume(self) -> None:
-        self._by_watchdog = False
         self._last_s = None
         self.safety.resume()

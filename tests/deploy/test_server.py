@@ -184,6 +184,10 @@ def test_the_watchdog(serve, tmp_path):
         assert "watchdog: no observation for" in answer["reason"]
         assert answer["actions"].tolist() == [[0.0, 0.0]]
         assert client.act({**OBSERVATION, "reset": True})["state"] == "running"
+        time.sleep(0.2)  # silent after a request that began an episode
+        assert client.act(OBSERVATION)["state"] == "stopped"
+        server.post("/stop")  # now a person has stopped it
+        assert client.act({**OBSERVATION, "reset": True})["reason"] == "stopped by hand"
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert ("state", "stopped") in [(line["kind"], line.get("name")) for line in lines]
 
