@@ -14,7 +14,7 @@ from rlctl.check_env.actions import actions, build_action
 from rlctl.check_env.episode import Episode, Moment
 from rlctl.check_env.finding import NotJudged
 from rlctl.check_env.instance import Context, Instance
-from rlctl.check_env.leaves import Leaf, element_name, flat_action, flat_numbers, pick
+from rlctl.check_env.leaves import Leaf, flatten_action, flatten_numbers, name_element, pick
 from rlctl.check_env.messages import FIRST_SEED
 
 Frame = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Dimension:
     @property
     def name(self) -> str:
         """How to write it: `action[2]`."""
-        return element_name(self.leaf, self.index, "action")
+        return name_element(self.leaf, self.index, "action")
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -67,7 +67,7 @@ def is_float_box(leaf: Leaf) -> bool:
     return leaf.kind == "Box" and leaf.dtype.startswith("float")
 
 
-def dimensions(leaves: list[Leaf]) -> list[Dimension]:
+def find_dimensions(leaves: list[Leaf]) -> list[Dimension]:
     """Return the numbers of an action that can be varied."""
     flat = [(leaf, i) for leaf in leaves if leaf.supported for i in range(int(np.prod(leaf.shape)))]
     found = [Dimension(leaf, index, column) for column, (leaf, index) in enumerate(flat)]
@@ -141,7 +141,7 @@ class Trials:
     def copies(self, dimension: Dimension, seed: int, steps: int, longest_delay: int) -> list[int]:
         """Return the columns of a frame that only repeat this number of an earlier action."""
         rows = [frame[:REWARD] for frame in self.plain(seed, steps)[1:]]
-        given = [flat_action(self.instance.action_leaves, each) for each in self.actions(seed, len(rows))]
+        given = [flatten_action(self.instance.action_leaves, each) for each in self.actions(seed, len(rows))]
         values = np.array([each[dimension.column] for each in given])
         if not rows or len({row.shape for row in rows}) > 1:
             return []
@@ -159,7 +159,7 @@ def to_frame(moment: Moment) -> Frame:
         reward = float(moment.reward)
     except Exception:  # its type is another rule's matter
         reward = float("nan")
-    return np.concatenate([flat_numbers(moment.observation).astype(np.float64), [reward, *moment.flags]])
+    return np.concatenate([flatten_numbers(moment.observation).astype(np.float64), [reward, *moment.flags]])
 
 
 def find_differences(one: Sequence[Frame], two: Sequence[Frame]) -> dict[int, NDArray[np.intp]]:
@@ -181,6 +181,6 @@ def observations_differ(one: Sequence[Frame], two: Sequence[Frame], besides: Seq
     return any(not {REWARD, *besides}.issuperset(each.tolist()) for each in find_differences(one, two).values())
 
 
-def steps_of_other_rewards(one: Sequence[Frame], two: Sequence[Frame]) -> list[int]:
+def find_other_rewards(one: Sequence[Frame], two: Sequence[Frame]) -> list[int]:
     """Return the steps at which the rewards differ."""
     return [step for step, columns in find_differences(one, two).items() if REWARD in columns]

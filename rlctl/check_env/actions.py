@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.leaves import Leaf, Path, leaves_of
+from rlctl.check_env.leaves import Leaf, Path, find_leaves
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -51,7 +51,7 @@ def build_action(space: spaces.Space[Any], value_of: Callable[[Leaf], Any], path
         return {key: build_action(each, value_of, (*path, key)) for key, each in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
         return tuple(build_action(each, value_of, (*path, i)) for i, each in enumerate(space.spaces))
-    (leaf,) = leaves_of(space, path)
+    (leaf,) = find_leaves(space, path)
     value = value_of(leaf)
     if value is None:
         return space.sample()

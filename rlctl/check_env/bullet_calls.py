@@ -54,13 +54,10 @@ class BulletCalls:
         """Per client and body that was loaded from a URDF: its file and the flags."""
         self._known: set[tuple[CodeType, int]] = set()
 
-    def add(self, name: str, value: Any, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
-        """Record a call: what it was given, what it returned, and the frame that made it."""
-        client = int(keywords.get("physicsClientId", 0))
-        if name == "loadURDF":
-            file = str(arguments[0] if arguments else keywords.get("fileName", ""))
-            self.models[client, int(value)] = file, int(keywords.get("flags", 0))
-        elif name == "resetSimulation":
+    def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
+        """Note a call that a frame is about to make, if it leaves the client out."""
+        if name == "resetSimulation":
+            client = keywords.get("physicsClientId", 0)
             self.models = {key: model for key, model in self.models.items() if key[0] != client}
         where = frame.f_code, frame.f_lasti
         if "physicsClientId" not in keywords and where not in self._known:
@@ -69,6 +66,11 @@ class BulletCalls:
             has_client = bool(arguments) if name in FIRST_IS_CLIENT else CLIENT_WORDS.search(_read_arguments(frame))
             if not is_library and not has_client:
                 self.without_client.add(BulletCall(frame.f_code.co_filename, frame.f_lineno, name))
+
+    def note_model(self, body: int, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
+        """Note what loadURDF was given, and the body that it returned."""
+        file = str(arguments[0] if arguments else keywords.get("fileName", ""))
+        self.models[keywords.get("physicsClientId", 0), body] = file, int(keywords.get("flags", 0))
 
 
 def _read_arguments(frame: FrameType) -> str:
@@ -89,17 +91,15 @@ class _RecordedFunction:
     def __init__(self, name: str, function: Any, calls: BulletCalls) -> None:
         self._name, self._function, self._calls = name, function, calls
 
-    @property
+    @property  # type: ignore[misc]
     def __class__(self) -> type:  # BulletClient adds the client to builtins only
         return types.BuiltinFunctionType
 
-    @__class__.setter
-    def __class__(self, value: type) -> None:
-        raise AttributeError("__class__")
-
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        self._calls.note_call(self._name, sys._getframe(1), arguments, keywords)
         value = self._function(*arguments, **keywords)
-        self._calls.add(self._name, value, sys._getframe(1), arguments, keywords)
+        if self._name == "loadURDF":
+            self._calls.note_model(value, arguments, keywords)
         return value
 
 

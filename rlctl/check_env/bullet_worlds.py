@@ -44,7 +44,7 @@ def bullet() -> Any:
     return sys.modules["pybullet"]
 
 
-def connected() -> list[int]:
+def find_clients() -> list[int]:
     """Return the ids of the clients that are connected, whoever did it; empty where PyBullet is not loaded."""
     if "pybullet" not in sys.modules:
         return []
@@ -174,7 +174,7 @@ def read_contacts(client: int) -> dict[Pair, float]:
     return deepest
 
 
-def thickness(client: int, link: Link) -> float:
+def measure_thickness(client: int, link: Link) -> float:
     """Return the smallest extent of the box around a link [m]."""
     low, high = bullet().getAABB(*link, physicsClientId=client)
     return float(min(b - a for a, b in zip(low, high, strict=True)))

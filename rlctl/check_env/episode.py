@@ -10,7 +10,7 @@ from rlctl.check_env.actions import actions
 from rlctl.check_env.clock import read_clock
 from rlctl.check_env.failures import EnvironmentRaised
 from rlctl.check_env.instance import Instance
-from rlctl.check_env.leaves import truth, type_name
+from rlctl.check_env.leaves import name_type, read_flag
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Moment:
     @property
     def flags(self) -> tuple[bool, bool]:
         """What `terminated` and `truncated` mean, whatever their types."""
-        return truth(self.terminated), truth(self.truncated)
+        return read_flag(self.terminated), read_flag(self.truncated)
 
 
 class Episode:
@@ -132,4 +132,4 @@ class Episode:
 
 
 def _form(returned: Any) -> str:
-    return type_name(returned) + (f" of {len(returned)}" if isinstance(returned, tuple) else "")
+    return name_type(returned) + (f" of {len(returned)}" if isinstance(returned, tuple) else "")

@@ -67,14 +67,14 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}{place}"
 
 
-def lost_display(failure: Failure) -> bool:
+def lacks_display(failure: Failure) -> bool:
     """Say whether a process ended for want of a display."""
     return failure.kind == "died" and NO_DISPLAY.search(failure.details or "") is not None
 
 
 def missing_file(error: BaseException | None) -> dict[str, Any] | None:
     """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
-    for each in chain(error):
+    for each in iterate_causes(error):
         if isinstance(each, FileNotFoundError):
             return _describe(str(each.filename or each), [])
         if type(each).__module__ == "pybullet" and "load" in str(each).lower():
@@ -83,7 +83,7 @@ def missing_file(error: BaseException | None) -> dict[str, Any] | None:
     return None
 
 
-def chain(error: BaseException | None) -> Iterator[BaseException]:
+def iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
     """Yield an exception and those behind it."""
     while error is not None:
         yield error

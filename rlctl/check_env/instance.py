@@ -11,7 +11,7 @@ from typing import Any, Literal
 from rlctl import env_spec, registry
 from rlctl.check_env.clock import read_clock
 from rlctl.check_env.failures import EnvironmentRaised, describe, describe_failure
-from rlctl.check_env.leaves import leaves_of
+from rlctl.check_env.leaves import find_leaves
 from rlctl.check_env.messages import Failure
 from rlctl.check_env.progress import Progress
 from rlctl.errors import TaskError
@@ -52,11 +52,11 @@ class Instance:
     def __init__(self, env: Any, progress: Progress) -> None:
         """Raises `TaskError` where its observation space cannot be read."""
         try:
-            self.leaves = leaves_of(getattr(env, "observation_space", None))
+            self.leaves = find_leaves(getattr(env, "observation_space", None))
         except Exception as error:
             raise TaskError(f"observation_space raises {describe(error)}") from error
         self.env = env
-        self.action_leaves = leaves_of(getattr(env, "action_space", None))
+        self.action_leaves = find_leaves(getattr(env, "action_space", None))
         self.accepts_seed = _accepts_seed(env)
         self.progress = progress
 

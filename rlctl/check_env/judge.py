@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from rlctl.check_env import families
 from rlctl.check_env.experiment import Experiment
 from rlctl.check_env.finding import RULES, Finding, NotApplicable, NotJudged, Severity
-from rlctl.check_env.leaves import leaf_name
+from rlctl.check_env.leaves import name_leaf
 from rlctl.check_env.messages import GYMNASIUM, SB3, Complaint, Failure
 from rlctl.check_env.records import Records
 from rlctl.errors import UsageError, did_you_mean
@@ -71,7 +71,7 @@ def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> Verdict:
         _waive(verdict, records.built.waivers)
         for leaf in records.built.leaves:
             if not leaf.supported:
-                verdict.not_judged[leaf_name(leaf)] = f"no rule can look into a {leaf.kind} space"
+                verdict.not_judged[name_leaf(leaf)] = f"no rule can look into a {leaf.kind} space"
     verdict.findings.sort(key=lambda each: (each.severity.rank, each.rule))
     return verdict
 

@@ -33,28 +33,28 @@ class Leaf:
         return self.low is not None
 
 
-def leaf_name(leaf: Leaf, of: str = "observation") -> str:
+def name_leaf(leaf: Leaf, of: str = "observation") -> str:
     """Return how to write the leaf of an observation or an action: `observation['camera'][0]`."""
     return of + "".join(f"[{key!r}]" for key in leaf.path)
 
 
-def element_name(leaf: Leaf, index: int, of: str = "observation") -> str:
+def name_element(leaf: Leaf, index: int, of: str = "observation") -> str:
     """Return how to write one number of a leaf, given by its flat index: `observation['camera'][3, 0, 2]`."""
-    where = leaf_name(leaf, of)
+    where = name_leaf(leaf, of)
     if not leaf.shape:
         return where
     position = np.unravel_index(index, leaf.shape)
     return f"{where}[{', '.join(str(int(i)) for i in position)}]"
 
 
-def leaves_of(space: Any, path: Path = ()) -> list[Leaf]:
+def find_leaves(space: Any, path: Path = ()) -> list[Leaf]:
     """Take a space apart; what is not a known space becomes a leaf that is not supported."""
     from gymnasium import spaces
 
     if isinstance(space, spaces.Dict):
-        return [leaf for key, value in space.spaces.items() for leaf in leaves_of(value, (*path, key))]
+        return [leaf for key, value in space.spaces.items() for leaf in find_leaves(value, (*path, key))]
     if isinstance(space, spaces.Tuple):
-        return [leaf for i, value in enumerate(space.spaces) for leaf in leaves_of(value, (*path, i))]
+        return [leaf for i, value in enumerate(space.spaces) for leaf in find_leaves(value, (*path, i))]
     bounds = _bounds(space)
     kind = type(space).__name__
     if bounds is None:
@@ -85,18 +85,18 @@ def pick(value: Any, path: Path) -> Any:
     return value
 
 
-def flat_action(leaves: list[Leaf], action: Any) -> NDArray[np.float64]:
+def flatten_action(leaves: list[Leaf], action: Any) -> NDArray[np.float64]:
     """Return an action's numbers in the order of the action space's leaves; those of unknown kinds are left out."""
     parts = [np.ravel(pick(action, leaf.path)).astype(np.float64) for leaf in leaves if leaf.supported]
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def flat_numbers(observation: Any) -> NDArray[Any]:
+def flatten_numbers(observation: Any) -> NDArray[Any]:
     """Return a copy of all numbers of an observation; those that are in no array of numbers are left out."""
     if isinstance(observation, dict):
         observation = tuple(observation.values())
     if isinstance(observation, (tuple, list)) and any(isinstance(each, (np.ndarray, dict)) for each in observation):
-        parts = [flat_numbers(value) for value in observation]
+        parts = [flatten_numbers(value) for value in observation]
         return np.concatenate(parts) if parts else np.zeros(0)
     try:
         array = np.array(observation)
@@ -105,7 +105,7 @@ def flat_numbers(observation: Any) -> NDArray[Any]:
     return array.ravel() if array.dtype.kind in "biuf" else np.zeros(0)
 
 
-def numbers_in(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
+def find_numbers(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
     """Yield the numbers of an info by name; those in a dictionary of it as `reward_terms/distance`."""
     for key, value in info.items():
         if isinstance(value, dict):
@@ -123,13 +123,13 @@ def _is_number(value: Any) -> bool:
     )
 
 
-def type_name(value: Any) -> str:
+def name_type(value: Any) -> str:
     """Return a type as a user would write it: `numpy.bool`, `list`."""
     kind = type(value)
     return kind.__qualname__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__qualname__}"
 
 
-def truth(flag: Any) -> bool:
+def read_flag(flag: Any) -> bool:
     """Return what a flag means, whatever its type; False for what has no truth."""
     if isinstance(flag, bool):  # nearly always; asking numpy takes a tenth of a robot's step
         return flag

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.finding import Finding
-from rlctl.check_env.leaves import Leaf, element_name
+from rlctl.check_env.leaves import Leaf, name_element
 
 FIRST_SEED = 1000
 SECOND_SEED = 1001
@@ -58,7 +58,7 @@ class Built:
                 if offset < size:
                     return f"{name}[{offset}]" if size > 1 else name
                 offset -= size
-        return element_name(self.leaves[leaf], index)
+        return name_element(self.leaves[leaf], index)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rlctl.check_env.episode import Episode, Moment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.instance import Budget
-from rlctl.check_env.leaves import Leaf, flat_action, numbers_in, pick, type_name
+from rlctl.check_env.leaves import Leaf, find_numbers, flatten_action, name_type, pick
 from rlctl.check_env.messages import MOST_INFOS, Failure, Form, Series, Trajectory
 
 
@@ -88,9 +88,9 @@ class Recording:
         if not moment.is_readable:
             return 0
         if moment.step:
-            self._actions.append(flat_action(self.episode.instance.action_leaves, moment.action))
-            self._count_form("terminated", type_name(moment.terminated))
-            self._count_form("truncated", type_name(moment.truncated))
+            self._actions.append(flatten_action(self.episode.instance.action_leaves, moment.action))
+            self._count_form("terminated", name_type(moment.terminated))
+            self._count_form("truncated", name_type(moment.truncated))
             self._flags.append(moment.flags)
             self._add_reward(moment.reward)
         self._add_info(moment.info)
@@ -101,16 +101,16 @@ class Recording:
         form[1] += 1
 
     def _add_info(self, info: Any) -> None:
-        self._count_form("info", type_name(info))
+        self._count_form("info", name_type(info))
         if isinstance(info, dict):
-            for name, value in numbers_in(info):
+            for name, value in find_numbers(info):
                 if name in self._infos or len(self._infos) < MOST_INFOS:
                     steps, values = self._infos.setdefault(name, ([], []))
                     steps.append(self._step)
                     values.append(value)
 
     def _add_reward(self, reward: Any) -> None:
-        self._count_form("reward", type_name(reward))
+        self._count_form("reward", name_type(reward))
         try:
             self._rewards.append(float(reward))
             self._is_number.append(True)
@@ -137,9 +137,9 @@ class Recording:
         try:
             array = np.array(value)  # a copy: an environment may write into what it returned
         except Exception:  # a ragged list, or an object of its own kind; its type is noted, and is a finding
-            self._count_form("observation", type_name(value), index, None, None)
+            self._count_form("observation", name_type(value), index, None, None)
             return 0
-        self._count_form("observation", type_name(value), index, array.dtype, array.shape)
+        self._count_form("observation", name_type(value), index, array.dtype, array.shape)
         self._compare_memory(index, value, array)
         if array.shape != leaf.shape or array.dtype.kind not in "biuf":
             return 0

@@ -59,7 +59,7 @@ def has_terms(episode: Trajectory) -> bool:
     return any(name.startswith(TERMS) for name in episode.infos)
 
 
-def terms_of(episode: Trajectory) -> dict[str, NDArray[np.float64]]:
+def find_terms(episode: Trajectory) -> dict[str, NDArray[np.float64]]:
     """Return the reward terms of an episode by name; NaN where one is not in info. Shape (T,) each."""
     terms = {}
     for name, series in episode.infos.items():
@@ -71,11 +71,11 @@ def terms_of(episode: Trajectory) -> dict[str, NDArray[np.float64]]:
     return terms
 
 
-def constant_terms(episodes: Sequence[Trajectory]) -> dict[str, float]:
+def find_constant_terms(episodes: Sequence[Trajectory]) -> dict[str, float]:
     """Return the terms that have one value at all steps of all episodes."""
     by_name: dict[str, list[NDArray[np.float64]]] = {}
     for episode in episodes:
-        for name, values in terms_of(episode).items():
+        for name, values in find_terms(episode).items():
             by_name.setdefault(name, []).append(values)
     return {
         name: float(parts[0][0])

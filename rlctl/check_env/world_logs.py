@@ -19,13 +19,13 @@ from rlctl.check_env.bullet_worlds import (
     Pair,
     World,
     bullet,
-    connected,
+    find_clients,
     find_jumps,
+    measure_thickness,
     read_contacts,
     read_gravity,
     read_states,
     read_world,
-    thickness,
     weight_matters,
 )
 from rlctl.check_env.episode import Episode
@@ -98,7 +98,7 @@ class Log:
 
 
 def _limit(client: int, pair: Pair) -> float:
-    thinner = min(thickness(client, link) for link in pair)
+    thinner = min(measure_thickness(client, link) for link in pair)
     return min(DEEPEST_FINE, max(LEAST_LIMIT, PART_OF_LINK * thinner))
 
 
@@ -158,7 +158,7 @@ class WorldLogger:
 
     def _read(self) -> list[World]:
         """Return the worlds of the clients that came with the instance, or of all where it shares older ones."""
-        ids = connected()
+        ids = find_clients()
         own = [read_world(each) for each in ids if each not in self._older]
         if not any(world.bodies for world in own):
             own = [read_world(each) for each in ids]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pybullet
 
 from rlctl.check_env import child, families
-from rlctl.check_env.bullet_worlds import connected
+from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.finding import RULES
 from rlctl.check_env.judge import judge
 from rlctl.check_env.messages import Finished
@@ -75,7 +75,7 @@ def _play(task, experiment):
 
 def _run(task, process, experiments, seconds=families.PROCESS_S):
     """Run experiments of a process, which begins with nothing that an earlier one left."""
-    for client in connected():  # of an environment that was not closed
+    for client in find_clients():  # of an environment that was not closed
         pybullet.disconnect(client)
     for module in [module for module in sys.modules if module.startswith("broken_")]:
         del sys.modules[module]

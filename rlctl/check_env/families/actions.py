@@ -17,11 +17,11 @@ from rlctl.check_env.action_trials import (
     Frame,
     OutOfTime,
     Trials,
-    dimensions,
     find_differences,
+    find_dimensions,
+    find_other_rewards,
     is_float_box,
     observations_differ,
-    steps_of_other_rewards,
     to_frame,
 )
 from rlctl.check_env.episode import Episode
@@ -63,7 +63,7 @@ class _Effect:
 def compare_actions(context: Context) -> Iterator[Message]:
     """Play the same episode with each number of the action at other values."""
     with context.fresh() as instance:
-        every = dimensions(instance.action_leaves)
+        every = find_dimensions(instance.action_leaves)
         if not every:
             raise NotJudged("no number of the action can be varied")
         trials = Trials(context, instance)
@@ -92,7 +92,7 @@ def _effect(trials: Trials, dimension: Dimension) -> _Effect:
             if observations_differ(plain, played, copies):
                 saturates = _saturates(trials, dimension, copies) if dimension.is_continuous else ""
                 return _Effect(dimension.name, "lasting", saturates)
-            if steps_of_other_rewards(plain, played):
+            if find_other_rewards(plain, played):
                 kind = "cost"
             elif kind == "none" and observations_differ(plain, played):
                 kind = "copy"
@@ -107,7 +107,7 @@ def _lasts(trials: Trials, dimension: Dimension) -> bool:
         for end in dimension.ends:
             played = trials.with_value(seed, steps, dimension, end, at)
             # The action of index `at` gives frame `at + 1`.
-            if any(step > at + 1 + LONGEST_DELAY for step in steps_of_other_rewards(plain, played)):
+            if any(step > at + 1 + LONGEST_DELAY for step in find_other_rewards(plain, played)):
                 return True
     return False
 
@@ -168,7 +168,7 @@ def _finding(rule: str, names: list[str], message: str, severity: Severity) -> F
 def exceed_bounds(context: Context) -> Iterator[Message]:
     """Play an episode at the corners of the action space, and again with twice these actions."""
     with context.fresh() as instance:
-        if not any(each.is_continuous for each in dimensions(instance.action_leaves)):
+        if not any(each.is_continuous for each in find_dimensions(instance.action_leaves)):
             raise NotApplicable("no continuous action with finite bounds")
         trials = Trials(context, instance, "extreme")
         trials.require_repeatable()

@@ -12,12 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.check_env.bullet_worlds import connected
+from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.experiment import RECORDING, check, experiment
-from rlctl.check_env.failures import NO_DISPLAY, EnvironmentRaised, chain, describe, lost_display, missing_file
+from rlctl.check_env.failures import (
+    NO_DISPLAY,
+    EnvironmentRaised,
+    describe,
+    iterate_causes,
+    lacks_display,
+    missing_file,
+)
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.instance import Context, RenderMode
-from rlctl.check_env.leaves import type_name
+from rlctl.check_env.leaves import name_type
 from rlctl.check_env.messages import FIRST_SEED, Fact, Message, Skipped
 from rlctl.check_env.records import Records
 
@@ -61,7 +68,7 @@ def _count_windows() -> int:
     pybullet = sys.modules.get("pybullet")
     if pybullet is None:
         return 0
-    methods = [pybullet.getConnectionInfo(physicsClientId=each)["connectionMethod"] for each in connected()]
+    methods = [pybullet.getConnectionInfo(physicsClientId=each)["connectionMethod"] for each in find_clients()]
     return methods.count(pybullet.GUI)
 
 
@@ -85,7 +92,7 @@ def _attribute_problems(env: Any) -> Iterator[Finding]:
         return
     # Gymnasium's own older environments hand out a subclass of the Generator.
     if generator is not None and not isinstance(generator, np.random.Generator):
-        yield _problem(f"np_random is a {type_name(generator)}, not a numpy.random.Generator")
+        yield _problem(f"np_random is a {name_type(generator)}, not a numpy.random.Generator")
 
 
 def _problem(text: str, severity: Severity | None = None) -> Finding:
@@ -128,33 +135,20 @@ def _shared(names: list[str], message: str) -> Finding:
 
 def read_truncation(env: Any) -> str:
     """Return what the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
-    step = getattr(type(env), "step", None)
     try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(step)))  # type: ignore[arg-type]
-    except (OSError, TypeError, SyntaxError):
+        nodes = list(ast.walk(ast.parse(textwrap.dedent(inspect.getsource(type(env).step)))))
+    except (AttributeError, OSError, TypeError, SyntaxError):
         return "unknown"
-    returned = [
-        node.value.elts[3]
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple) and len(node.value.elts) == 5
-    ]
-    if not returned:
+    returned = [node.value for node in nodes if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple)]
+    flags = [ast.unparse(each.elts[3]) for each in returned if len(each.elts) == 5]
+    assigned: dict[str, set[str]] = {}
+    for node in nodes:
+        if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign) and node.value is not None:
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                assigned.setdefault(ast.unparse(target), set()).add(ast.unparse(node.value))
+    if not flags:
         return "unknown"
-    return "never" if all(_is_false(tree, each) for each in returned) else "computed"
-
-
-def _is_false(tree: ast.AST, value: ast.expr) -> bool:
-    if isinstance(value, ast.Constant):
-        return value.value is False
-    if not isinstance(value, ast.Name):
-        return False
-    assigned = [
-        node.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Assign)
-        and any(isinstance(each, ast.Name) and each.id == value.id for each in node.targets)
-    ]
-    return bool(assigned) and all(isinstance(each, ast.Constant) and each.value is False for each in assigned)
+    return "never" if all(assigned.get(flag, {flag}) == {"False"} for flag in flags) else "computed"
 
 
 @experiment("rendering", "RL215", provokes="rendering without a window")
@@ -202,7 +196,9 @@ def _of_mode(mode: RenderMode, what: str, value: str, severity: Severity | None 
 
 def _lacks_library(error: BaseException) -> bool:
     """Say whether a library is missing: that is this machine's fault, not the environment's."""
-    return any(isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in chain(error))
+    return any(
+        isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in iterate_causes(error)
+    )
 
 
 def _describe_wrong_picture(mode: RenderMode, picture: Any) -> str:
@@ -219,7 +215,7 @@ def _describe_wrong_picture(mode: RenderMode, picture: Any) -> str:
 @check("RL216", *RECORDING)
 def _find_lost_display(records: Records) -> Iterator[Finding]:
     for failure in records.failures:
-        if lost_display(failure):
+        if lacks_display(failure):
             line = next(line for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)).strip()
             doing = {"load": "the import", "build": "the constructor"}.get(failure.call, failure.call)
             message = f"the process {failure.error} in {doing}, for want of a display: {line!r}"

@@ -20,10 +20,11 @@ from rlctl.check_env.rewarded import (
     DISCOUNT,
     SUCCESS,
     WITH_SEARCH,
-    constant_terms,
     discounted_steps,
     discounted_sum,
     ends_in_success,
+    find_constant_terms,
+    find_terms,
     has_succeeded,
     has_terms,
     longest_episode,
@@ -31,7 +32,6 @@ from rlctl.check_env.rewarded import (
     require_readable,
     require_rewarded,
     summarize,
-    terms_of,
 )
 
 LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5
@@ -209,11 +209,11 @@ def _find_paid_idleness(records: Records) -> Iterator[Finding]:
 
 def _bonus(idle: Sequence[Trajectory]) -> tuple[str | None, float]:
     """Return the constant positive term that is most of the reward, if there is one, and its share."""
-    total = sum(float(np.nansum(np.abs(values))) for each in idle for values in terms_of(each).values())
+    total = sum(float(np.nansum(np.abs(values))) for each in idle for values in find_terms(each).values())
     if total <= 0 or not all(has_terms(each) for each in idle):
         return None, 0.0
     steps = sum(each.steps for each in idle)
-    shares = {name: value * steps / total for name, value in constant_terms(idle).items() if value > 0}
+    shares = {name: value * steps / total for name, value in find_constant_terms(idle).items() if value > 0}
     largest = max(shares, key=lambda name: shares[name], default=None)
     return (largest, shares[largest]) if largest is not None and shares[largest] >= MOST_OF else (None, 0.0)
 

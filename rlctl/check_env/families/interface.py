@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rlctl.check_env.experiment import PROVOKING, RECORDING, check
-from rlctl.check_env.failures import lost_display
+from rlctl.check_env.failures import lacks_display
 from rlctl.check_env.finding import Finding, Severity
 from rlctl.check_env.messages import Failure, Form, Trajectory
 from rlctl.check_env.records import Records
@@ -90,7 +90,7 @@ def _find_exceptions(records: Records) -> Iterator[Finding]:
 @check("RL208")
 def _find_ends_of_process(records: Records) -> Iterator[Finding]:
     for failure in select_failures(records, "died"):
-        if not lost_display(failure):  # RL216 says why
+        if not lacks_display(failure):  # RL216 says why
             yield Finding("RL208", f"the process {failure.error} in {failure.in_call}", failure.place)
 
 

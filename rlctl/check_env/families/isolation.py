@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from rlctl.check_env.bullet_worlds import connected
+from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
@@ -180,7 +180,7 @@ class Counts:
 
     def count(self) -> None:
         """Count what is there now."""
-        clients = connected()
+        clients = find_clients()
         self.clients.append(len(clients))
         pybullet = sys.modules.get("pybullet")
         self.bodies.append(sum(pybullet.getNumBodies(physicsClientId=each) for each in clients) if pybullet else 0)

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rlctl import registry
-from rlctl.check_env.bullet_worlds import connected
+from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.experiment import RECORDING, check, experiment
-from rlctl.check_env.failures import chain, lost_display, missing_file
+from rlctl.check_env.failures import iterate_causes, lacks_display, missing_file
 from rlctl.check_env.finding import Finding
 from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.messages import Built, Failure, Message
@@ -64,7 +64,7 @@ def _explain(context: Context, error: RlctlError) -> Finding:
 
 
 def _imports_old_gym(error: BaseException | None) -> bool:
-    missing = [str(each.name) for each in chain(error) if isinstance(each, ModuleNotFoundError)]
+    missing = [str(each.name) for each in iterate_causes(error) if isinstance(each, ModuleNotFoundError)]
     return any(name.partition(".")[0] == "gym" for name in missing)
 
 
@@ -103,7 +103,7 @@ def _judge_metadata(metadata: Any) -> Iterator[Finding]:
 def _find_end_while_loading(records: Records) -> Iterator[Finding]:
     if records.built is None:
         for failure in records.failures:
-            if failure.process == "probe" and failure.call in ("load", "build") and not lost_display(failure):
+            if failure.process == "probe" and failure.call in ("load", "build") and not lacks_display(failure):
                 evidence = {"last_output": failure.details} if failure.details else {}
                 yield Finding("RL004", _while_loading(failure), evidence)
 
@@ -146,7 +146,7 @@ def describe_built(instance: Instance) -> Built:
         max_steps=inner.max_steps if is_task(env) else getattr(spec, "max_episode_steps", None),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         accepts_seed=instance.accepts_seed,
-        uses_pybullet=bool(connected()),
+        uses_pybullet=bool(find_clients()),
         waivers=_waivers(author),
         file=file,
         line=line,

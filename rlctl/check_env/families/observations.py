@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rlctl.check_env.experiment import RECORDING, check
 from rlctl.check_env.finding import Finding, Severity
-from rlctl.check_env.leaves import Leaf, leaf_name
+from rlctl.check_env.leaves import Leaf, name_leaf
 from rlctl.check_env.messages import Form, Series, Trajectory
 from rlctl.check_env.records import Records
 
@@ -43,7 +43,7 @@ def find_wrong_shape(records: Records) -> Iterator[Finding]:
         for trajectory, form in forms:
             if what := _wrong_shape(leaf, form):
                 shape = None if form.shape is None else list(form.shape)
-                message = f"{leaf_name(leaf)} {_when(form.step)} {what}"
+                message = f"{name_leaf(leaf)} {_when(form.step)} {what}"
                 evidence = trajectory.at(form.step, type=form.type, shape=shape, expected=list(leaf.shape))
                 yield Finding("RL101", message, evidence)
                 break
@@ -72,7 +72,7 @@ def _find_wrong_dtype(records: Records) -> Iterator[Finding]:
     parts = len({leaf.path for leaf, *_ in wrong})
     for leaf, trajectory, form in wrong[:1]:
         more = f"; {parts - 1} other parts differ too" if parts > 1 else ""
-        message = f"{leaf_name(leaf)} {_when(form.step)} is {form.dtype}; the space is {leaf.dtype}{more}"
+        message = f"{name_leaf(leaf)} {_when(form.step)} is {form.dtype}; the space is {leaf.dtype}{more}"
         is_number = np.dtype(form.dtype).kind in "biuf"
         evidence = trajectory.at(form.step, dtype=form.dtype, expected=leaf.dtype)
         yield Finding("RL102", message, evidence, Severity.WARNING if is_number else Severity.ERROR)
@@ -175,7 +175,7 @@ def find_not_finite(records: Records) -> Iterator[Finding]:
 @check("RL105")
 def _find_shared_memory(records: Records) -> Iterator[Finding]:
     for trajectory, form in records.forms("memory")[:1]:
-        name = leaf_name(records.require_built().leaves[form.leaf or 0])
+        name = name_leaf(records.require_built().leaves[form.leaf or 0])
         message = f"step {form.step} wrote into the memory of the {name} returned before it"
         yield Finding("RL105", message, trajectory.at(form.step, steps=form.count))
 
@@ -213,7 +213,7 @@ def _find_unusual_images(records: Records) -> Iterator[Finding]:
     for index, leaf in enumerate(records.require_built().leaves):
         if leaf.kind != "Box":
             continue
-        name, shape = leaf_name(leaf), list(leaf.shape)
+        name, shape = name_leaf(leaf), list(leaf.shape)
         if problem := _image_problem(leaf):
             evidence = {"element": name, "value": shape, "dtype": leaf.dtype}
             severity = Severity.WARNING if _looks_like_image(leaf) else Severity.INFO
@@ -268,7 +268,7 @@ def _find_unsupported_spaces(records: Records) -> Iterator[Finding]:
                 kind = "nested Dict" if depth else "Dict"
             else:
                 continue
-            name = leaf_name(leaf, what)
+            name = name_leaf(leaf, what)
             message = f"{name} is {'part ' if leaf.supported else ''}of a {kind} space; SB3 has no network for it"
             yield Finding("RL109", message, {"element": name, "value": kind})
             break

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.bullet_calls import BulletCall, BulletCalls, record_calls
-from rlctl.check_env.bullet_worlds import ANGULAR, HEIGHT, JOINTS, VELOCITY, Body, Joint, Jump, Pair, connected
+from rlctl.check_env.bullet_worlds import ANGULAR, HEIGHT, JOINTS, VELOCITY, Body, Joint, Jump, Pair, find_clients
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
@@ -51,7 +51,7 @@ def watch_worlds(context: Context) -> Iterator[Message]:
             pass  # what it imports is imported now
     if "pybullet" not in sys.modules:
         raise NotApplicable("no PyBullet world")
-    older = set(connected())
+    older = set(find_clients())
     with record_calls() as calls, context.fresh() as instance:
         with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
             instance.reset(FIRST_SEED)

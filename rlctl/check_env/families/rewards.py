@@ -18,12 +18,12 @@ from rlctl.check_env.messages import FIRST_SEED, MOST_INFOS, Message, Trajectory
 from rlctl.check_env.records import Records
 from rlctl.check_env.rewarded import (
     WITH_SEARCH,
-    constant_terms,
+    find_constant_terms,
+    find_terms,
     has_succeeded,
     require_rewarded,
     require_terms,
     summarize,
-    terms_of,
 )
 
 LARGE = 10.0
@@ -100,7 +100,7 @@ def _find_wrong_sum(records: Records) -> Iterator[Finding]:
     worst: tuple[float, Trajectory, int, float] | None = None
     wrong = steps = 0
     for each in episodes:
-        values = np.stack(list(terms_of(each).values()))
+        values = np.stack(list(find_terms(each).values()))
         is_known = ~np.isnan(values).all(axis=0)
         sums, sizes = np.nansum(values, axis=0), np.nansum(np.abs(values), axis=0)
         off = np.where(is_known, np.abs(sums - each.rewards), 0.0)
@@ -111,7 +111,9 @@ def _find_wrong_sum(records: Records) -> Iterator[Finding]:
     if worst is not None:
         _, episode, step, total = worst
         reward = float(episode.rewards[step])
-        terms = {name: None if np.isnan(each[step]) else float(each[step]) for name, each in terms_of(episode).items()}
+        terms = {
+            name: None if np.isnan(each[step]) else float(each[step]) for name, each in find_terms(episode).items()
+        }
         yield Finding(
             "RL607",
             f"the terms add up to {total:.6g} at step {step + 1}, the reward is {reward:.6g}; they differ at {wrong:,} "
@@ -123,7 +125,7 @@ def _find_wrong_sum(records: Records) -> Iterator[Finding]:
 @check("RL612", *WITH_SEARCH)
 def _find_constant_penalty(records: Records) -> Iterator[Finding]:
     episodes = require_terms(records)
-    for name, value in constant_terms(episodes).items():
+    for name, value in find_constant_terms(episodes).items():
         if value < 0 and not MEANT_CONSTANT.search(name):
             message = f"reward term {name!r} is {value:.6g} at every step of {summarize(episodes)}"
             yield Finding("RL612", message, {"term": name, "value": value, "episodes": len(episodes)})

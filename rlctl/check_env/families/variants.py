@@ -15,7 +15,7 @@ from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
 from rlctl.check_env.instance import Context, Instance
-from rlctl.check_env.leaves import flat_numbers
+from rlctl.check_env.leaves import flatten_numbers
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
@@ -112,7 +112,7 @@ def _describe(context: Context, spec: EnvSpec) -> EnvInfo:
 
 def _record(context: Context, instance: Instance) -> NDArray[np.float64]:
     episode = Episode(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
-    return np.concatenate([flat_numbers(moment.observation) for moment in episode])
+    return np.concatenate([flatten_numbers(moment.observation) for moment in episode])
 
 
 def _explain(error: EnvironmentRaised) -> str:

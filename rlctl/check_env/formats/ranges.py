@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.leaves import Leaf, leaf_name
+from rlctl.check_env.leaves import Leaf, name_leaf
 from rlctl.check_env.messages import Built
 from rlctl.check_env.records import Records
 
@@ -43,7 +43,7 @@ def observation_rows(records: Records) -> list[Row]:
 def action_rows(records: Records) -> list[Row]:
     """Return the parts of the action, in order, without the values that were played: a learner plays others."""
     leaves = records.built.action_leaves if records.built else []
-    named = [(leaf_name(leaf, "action"), leaf) for leaf in leaves if leaf.supported]
+    named = [(name_leaf(leaf, "action"), leaf) for leaf in leaves if leaf.supported]
     return [_row(name, leaf, slice(None), []) for name, leaf in named]
 
 
@@ -58,7 +58,7 @@ def _parts(built: Built, leaf: Leaf) -> Iterator[tuple[str, slice]]:
         for i in range(size):
             yield built.element(0, i), slice(i, i + 1)
     else:
-        yield leaf_name(leaf), slice(0, size)
+        yield name_leaf(leaf), slice(0, size)
 
 
 def _row(name: str, leaf: Leaf, part: slice, values: list[NDArray[np.float64]]) -> Row:
