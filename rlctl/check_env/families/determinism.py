@@ -7,9 +7,11 @@ simplest cause to the farthest; where a nearer one explains a difference, the fa
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 import random
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -240,41 +242,33 @@ def _plain(value: float) -> float | str:
 
 def find_difference(built: Built, one: Trajectory, two: Trajectory) -> Difference | None:
     """Compare two trajectories bit for bit as far as both go; NaN equals NaN."""
-    found = []
-    for index, _ in enumerate(built.leaves):
-        a, b = one.observations.get(index), two.observations.get(index)
-        if a is None or b is None:
-            continue
-        rows = min(len(a.values), len(b.values))
-        found.append(_compare(a.values[:rows], b.values[:rows], a.steps[:rows], built, index))
-    steps = min(one.steps, two.steps)
-    after = np.arange(1, steps + 1)
-    for name in ("rewards", "terminated", "truncated"):
-        a_, b_ = getattr(one, name)[:steps], getattr(two, name)[:steps]
-        found.append(_compare(a_, b_, after, None, 0, "reward" if name == "rewards" else name))
+    found: list[Difference] = []
+    for index in sorted(one.observations.keys() & two.observations.keys()):
+        a, b = one.observations[index], two.observations[index]
+        found += _compare(a.values, b.values, a.steps, functools.partial(built.element, index))
+    after = np.arange(1, one.steps + 1)
+    found += _compare(one.rewards, two.rewards, after, lambda _: "reward")
+    found += _compare(one.terminated, two.terminated, after, lambda _: "terminated")
+    found += _compare(one.truncated, two.truncated, after, lambda _: "truncated")
     if one.has_ended and two.has_ended and one.steps != two.steps:
-        found.append(Difference(steps, "length", one.steps, two.steps, 1.0, 1.0))
-    differences = [each for each in found if each is not None]
-    if not differences:
+        found.append(Difference(min(one.steps, two.steps), "length", one.steps, two.steps, 1.0, 1.0))
+    if not found:
         return None
-    earliest = min(differences, key=lambda each: (each.step, -each.size))
-    return dataclasses.replace(earliest, largest=max(each.largest for each in differences))
+    earliest = min(found, key=lambda each: (each.step, -each.size))
+    return dataclasses.replace(earliest, largest=max(each.largest for each in found))
 
 
 def _compare(
-    a: NDArray[Any], b: NDArray[Any], steps: NDArray[np.int64], built: Built | None, leaf: int, name: str = ""
-) -> Difference | None:
-    if not a.size:
-        return None
-    a, b = a.reshape(len(a), -1).astype(np.float64), b.reshape(len(b), -1).astype(np.float64)
+    a: NDArray[Any], b: NDArray[Any], steps: NDArray[np.int64], name_of: Callable[[int], str]
+) -> Iterator[Difference]:
+    rows = min(len(a), len(b))
+    a, b = (each[:rows].reshape(rows, math.prod(each.shape[1:])).astype(np.float64) for each in (a, b))
     unequal = (a != b) & ~(np.isnan(a) & np.isnan(b))
-    if not unequal.any():
-        return None
-    row = int(unequal.any(axis=1).argmax())
-    with np.errstate(invalid="ignore", over="ignore"):
-        relative = np.where(unequal, np.abs(a - b), 0.0) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 1.0)
-    relative = np.nan_to_num(relative, nan=np.inf, posinf=np.inf)
-    flat = int(np.where(unequal[row], relative[row], -1.0).argmax())
-    size, largest = float(relative[row, flat]), float(relative.max())
-    element = built.element(leaf, flat) if built else name
-    return Difference(int(steps[row]), element, float(a[row, flat]), float(b[row, flat]), size, largest)
+    if unequal.any():
+        row = int(unequal.any(axis=1).argmax())
+        with np.errstate(invalid="ignore", over="ignore"):
+            relative = np.where(unequal, np.abs(a - b), 0.0) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 1.0)
+        relative = np.nan_to_num(relative, nan=np.inf, posinf=np.inf)
+        flat = int(np.where(unequal[row], relative[row], -1.0).argmax())
+        values, largest = (float(a[row, flat]), float(b[row, flat])), float(relative.max())
+        yield Difference(int(steps[row]), name_of(flat), *values, float(relative[row, flat]), largest)

@@ -12,7 +12,7 @@ from rlctl import output
 from rlctl.check_env.check import Report
 from rlctl.check_env.families.speed import format_speed
 from rlctl.check_env.finding import FAMILIES, RULES, Finding, Severity
-from rlctl.check_env.formats.ranges import Row, action_rows, observation_rows
+from rlctl.check_env.formats.structured import Row, action_rows, observation_rows
 
 if TYPE_CHECKING:
     from rich.console import Console
