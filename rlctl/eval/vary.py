@@ -17,6 +17,7 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval import axes as axes_of
 from rlctl.eval.evaluate import EvalRequest, Gates, LoadedPolicy, choose_specs, load_player, start_workers
 from rlctl.eval.statistics import mean_interval, mean_return, success_interval, success_rate
+from rlctl.registry import is_task
 from rlctl.rollout.acting import Exploration
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
@@ -48,6 +49,7 @@ class CellPlayer:
         self._policy = policy
         self._seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
         self._exploration = Exploration(stochastic=not request.deterministic)
+        self._has_events = is_task(workers.spec.constructor())
 
     def play(self, spec: EnvSpec, push: dict[str, object] | None = None) -> list[EpisodeResult]:
         """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`."""
@@ -55,7 +57,7 @@ class CellPlayer:
         if spec.parameters != workers.spec.parameters:
             workers.rebuild(spec)
             self._policy.give_to(workers)
-        if workers.info.reward_weights:  # a plain environment has no events
+        if self._has_events:
             workers.set_events(spec, push)
         return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration)]
 

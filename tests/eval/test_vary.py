@@ -12,7 +12,7 @@ from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.eval.statistics import mean_interval
 from rlctl.eval.vary import RobustnessRequest, check_gates, format_duration, measure_robustness
 from rlctl.run.robustness import read
-from tests.eval.conftest import ENVS
+from tests.eval.conftest import ENVS, write_run
 
 BLOCK = EnvSpec(f"{ENVS}:Block")
 
@@ -168,6 +168,20 @@ def test_plain_environments_have_parameters_only():
     assert (axis.setting, axis.nominal) == ("task.g", None)
     with pytest.raises(UsageError, match="Pendulum-v1 offers no events; name one of its parameters"):
         read_axes(["all"], EnvSpec("Pendulum-v1"))
+
+
+def test_map_of_a_plain_environment(tmp_path, rlctl):
+    run = write_run(tmp_path / "run", "Pendulum-v1")
+    done = rlctl("eval", run.path, "--episodes", 2, "--vary", "g=5:10:2")
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[4].split() == ["g", "return", "95", "%", "interval"]
+    assert [line.split()[0] for line in lines[5:7]] == ["5", "10"]
+    low, high = (cell.mean_return for cell in read(run.robustness_file).maps[0].cells)
+    assert low != high
+    refused = rlctl("eval", run.path, "--episodes", 2, "--vary", "g=5:10:2", "--min-success", "0.5")
+    assert refused.returncode == 2
+    assert "--min-success: this task reports no success" in refused.stderr
 
 
 def test_too_many_cells(block_run):
