@@ -39,5 +39,6 @@ def test_the_wheel_trains_reach_from_an_empty_folder(tmp_path):
     assert result["steps"] >= 8000
     report = json.loads(call(scripts / "rlctl", "export", "reach", "--onnx", "--json", "-", cwd=empty))
     assert Path(empty, report["path"]).is_file()
+    call(scripts / "rlctl", "eval", "reach", "--pretrained", "--episodes", "5", "--min-success", "1", cwd=empty)
     call(scripts / "rlctl", "replay", "reach", cwd=empty)
     assert list(empty.glob("runs/reach/*/episodes/*.rrd"))
