@@ -94,11 +94,6 @@ class Follower:
         )
         return errors
 
-    def windows(self) -> list[slice]:
-        """Return the rows of each window in what `compare` returns."""
-        ends = np.cumsum([len(self._measured[start + 1 : start + 1 + self.steps]) for start in self.starts])
-        return [slice(low, high) for low, high in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)]
-
     def _play(self, start: int, delay: int) -> Array:
         env = self._env
         env.reset(seed=0)

@@ -176,10 +176,10 @@ def _judge(unknowns: Unknowns, fit: Fit) -> list[Found]:
     # As changes of the values' logarithms (or of the values themselves), not of positions in their ranges.
     information = fit.information / np.outer(spans, spans)
     regular = information + 1e-9 * np.trace(information) * np.eye(len(spans)) + 1e-12 * np.eye(len(spans))
-    inverse = np.linalg.inv(regular)
-    by_window = inverse @ (fit.spread_by_window / np.outer(spans, spans)) @ inverse
-    deviations = np.sqrt(np.maximum(np.diag(inverse) * fit.cost, np.diag(by_window)))
-    alone = np.sqrt(fit.cost / np.diag(regular))  # if all others were known
+    # What the model leaves out, and where a window begins, shifts all rows of a window alike: they count as one.
+    variance = fit.cost * fit.rows_per_window
+    deviations = np.sqrt(variance * np.diag(np.linalg.inv(regular)))
+    alone = np.sqrt(variance / np.diag(regular))  # if all others were known
     return [
         _judge_one(unknowns, index, fit, float(deviations[index]), float(alone[index]), regular)
         for index in range(len(spans))

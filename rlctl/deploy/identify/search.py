@@ -34,14 +34,13 @@ class Fit:
     """Mean of the squared weighted errors."""
     information: Array
     """J'J of the weighted errors, shape (unknowns, unknowns)."""
-    spread_by_window: Array
     errors: Array
     """Root mean square per measured position, then velocity, in their units."""
-    rows: int
+    rows_per_window: float
 
     @classmethod
     def from_answer(cls, answer: dict[str, Any]) -> Fit:
-        arrays = {key: np.array(answer[key], np.float64) for key in ("at", "information", "spread_by_window", "errors")}
+        arrays = {key: np.array(answer[key], np.float64) for key in ("at", "information", "errors")}
         return cls(**{**answer, **arrays})
 
 

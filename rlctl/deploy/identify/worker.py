@@ -85,17 +85,6 @@ def _fit(follower: Follower, at: Array, delay: int, weights: Array, evaluations:
         "delay": delay,
         "cost": float(np.square(errors).mean()),
         "information": (derivatives.T @ derivatives).tolist(),
-        "spread_by_window": _sum_over_windows(follower, by_row, derivatives).tolist(),
         "errors": np.sqrt(np.square(by_row / weights).mean(axis=0)).tolist(),
-        "rows": int(errors.size),
+        "rows_per_window": len(by_row) / len(follower.starts),
     }
-
-
-def _sum_over_windows(follower: Follower, by_row: Array, derivatives: Array) -> Array:
-    """Return the sum of the squares of each window's gradient: errors within a window are not independent."""
-    if not derivatives.size:
-        return np.zeros((0, 0))
-    shaped = derivatives.reshape(len(by_row), -1, derivatives.shape[1])
-    gradients = np.stack([np.einsum("rc,rcp->p", by_row[part], shaped[part]) for part in follower.windows()])
-    result: Array = gradients.T @ gradients
-    return result

@@ -92,6 +92,7 @@ def test_all_hidden_values_are_found_within_5_percent(tmp_path):
     for each in found.values:
         assert each.known
         assert each.value == pytest.approx(HIDDEN[each.event]["factor"], rel=0.05)
+        assert each.low < HIDDEN[each.event]["factor"] < each.high
     assert (found.delay, found.delay_known) == (1, True)
     assert found.position_error[1] < 2 * 0.002
 
