@@ -2,8 +2,8 @@
 
     cli           the command line: parse, call one function, print
     check_env  train  eval  export  replay    the five verbs, a folder each
-    tasks         list, show and begin tasks
-    deploy        what comes after: a safety filter, a policy server
+    tasks  runs   what can be asked of tasks, and of runs
+    deploy        what comes after: a safety filter, a policy server, physical values of the robot
     rollout       many environments in worker processes; seeds; episodes
     run           what is on disk: recipes, run folders, policies, episodes
     task          for authors of tasks: Task, Sim, Body, Event, rewards
