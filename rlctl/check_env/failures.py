@@ -52,7 +52,7 @@ def describe_failure(error: EnvironmentRaised, progress: Progress) -> Failure:
         step=where.step,
         error=describe(cause),
         details="".join(traceback.format_exception(cause)),
-        file=missing_file(cause),
+        file=find_missing_file(cause),
     )
 
 
@@ -72,7 +72,7 @@ def lacks_display(failure: Failure) -> bool:
     return failure.kind == "died" and NO_DISPLAY.search(failure.details or "") is not None
 
 
-def missing_file(error: BaseException | None) -> dict[str, Any] | None:
+def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
     """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
     for each in iterate_causes(error):
         if isinstance(each, FileNotFoundError):

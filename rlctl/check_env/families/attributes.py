@@ -18,9 +18,9 @@ from rlctl.check_env.failures import (
     NO_DISPLAY,
     EnvironmentRaised,
     describe,
+    find_missing_file,
     iterate_causes,
     lacks_display,
-    missing_file,
 )
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.instance import Context, RenderMode
@@ -172,7 +172,7 @@ def _render_in(context: Context, mode: RenderMode) -> Iterator[Finding]:
             picture = instance.call("render", instance.env.render)
     except EnvironmentRaised as error:
         cause = error.__cause__ or error
-        if missing_file(cause) is not None:
+        if find_missing_file(cause) is not None:
             raise NotJudged("a file that the environment loads is missing (RL007)") from None
         if _lacks_library(cause):
             raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import RECORDING, check, experiment
+from rlctl.check_env.experiment import RECORDING, Check, check, experiment
 from rlctl.check_env.families import observations, rewards
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.instance import Context
@@ -184,18 +184,16 @@ def find_nonsense_after_end(records: Records) -> Iterator[Finding]:
     after = records.require_role("after the end")
     end = int((after.terminated | after.truncated).argmax()) + 1
     only = dataclasses.replace(records, trajectories=[dataclasses.replace(after, role="episodes")])
-    for each in (observations.find_wrong_shape, observations.find_not_finite, rewards.find_not_finite):
-        found = [] if list(each.run(records)) else list(each.run(only))
-        if found:
-            yield Finding("RL505", f"after the end at step {end}: {found[0].message}", found[0].evidence)
-            return
-    for finding in (
-        () if list(observations.find_out_of_range.run(records)) else observations.find_out_of_range.run(only)
-    ):
-        low, high = finding.evidence["expected"]
-        if not low - (high - low) <= finding.evidence["value"] <= high + (high - low):
-            yield Finding("RL505", f"after the end at step {end}: {finding.message}", finding.evidence)
-            return
+
+    def find_new(each: Check) -> list[Finding]:
+        return [] if list(each.run(records)) else list(each.run(only))
+
+    checks = (observations.find_wrong_shape, observations.find_not_finite, rewards.find_not_finite)
+    found = [finding for each in checks for finding in find_new(each)]
+    found += [finding for finding in find_new(observations.find_out_of_range) if _is_far_outside(finding)]
+    if found:
+        yield Finding("RL505", f"after the end at step {end}: {found[0].message}", found[0].evidence)
+        return
     largest = max(float(np.abs(np.nan_to_num(each.rewards)).max(initial=0.0)) for each in records.require_alone())
     late = np.nan_to_num(after.rewards[end:])
     if late.size and np.abs(late).max() > MUCH_LARGER * max(largest, 1.0):
@@ -206,3 +204,9 @@ def find_nonsense_after_end(records: Records) -> Iterator[Finding]:
         )
         evidence = {"seed": after.seed, "step": end + 1 + at, "value": float(late[at]), "expected": largest}
         yield Finding("RL505", message, evidence)
+
+
+def _is_far_outside(finding: Finding) -> bool:
+    """Say whether a value is outside its bounds by more than their width."""
+    low, high = finding.evidence["expected"]
+    return not low - (high - low) <= finding.evidence["value"] <= high + (high - low)

@@ -21,7 +21,7 @@ FEWEST_SEEDS = 3
 MOST_ROWS = 1_000
 """Observations that are compared element by element: more would only cost time."""
 MOST_ELEMENTS = 1_500
-"""A larger array is not a list of measurements, and its correlations would take seconds."""
+"""A larger array is not a list of measurements."""
 MOST_NAMED = 8
 APART = 1_000.0
 """Ratio of scales from which the smaller elements are invisible to a network of usual initial weights."""

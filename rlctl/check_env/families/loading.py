@@ -10,7 +10,7 @@ from typing import Any
 from rlctl import registry
 from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.experiment import RECORDING, check, experiment
-from rlctl.check_env.failures import iterate_causes, lacks_display, missing_file
+from rlctl.check_env.failures import find_missing_file, iterate_causes, lacks_display
 from rlctl.check_env.finding import Finding
 from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.messages import Built, Failure, Message
@@ -50,7 +50,7 @@ def _explain(context: Context, error: RlctlError) -> Finding:
         return Finding("RL005", str(error), details)
     if isinstance(error, OldGymError) or _imports_old_gym(cause):
         return Finding("RL008", str(error), details)
-    if (file := missing_file(cause)) is not None:
+    if (file := find_missing_file(cause)) is not None:
         return _not_found("the constructor", file, error.details)
     if context.stage == "import":
         return Finding("RL001", str(error), details)
