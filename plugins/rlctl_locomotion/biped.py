@@ -156,7 +156,7 @@ class Biped3D(Biped):
     """Walk forwards without a rail: nothing but wide feet keeps the robot from falling sideways or turning."""
 
     robot = "biped, four joints, free"
-    reward_weights = {**Biped.reward_weights, "alive": 0.2, "heading": -0.2}
+    reward_weights = {**Biped.reward_weights, "heading": -0.2}
     ground_width = 12.0
 
     def load_robot(self, sim: Sim) -> None:

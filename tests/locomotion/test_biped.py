@@ -10,7 +10,7 @@ from rlctl.task.inertia import find_inertia_faults
 from rlctl_locomotion.biped import ANGLE, STANCE, Biped, Biped3D
 
 BIPEDS = {"biped": Biped, "biped-3d": Biped3D}
-ALIVE = {"Biped": 0.05, "Biped3D": 0.2}
+ALIVE = 0.05
 STAND = (STANCE / ANGLE).astype(np.float32)
 
 
@@ -26,8 +26,8 @@ def test_it_can_stand(env):
     earned = sum(env.step(STAND)[1] for _ in range(200))
     assert not env.task.is_terminated()
     assert {"left_foot", "right_foot"} == env.task.body.links_touching(env.task.ground)
-    # 0.05, of the free biped 0.2, in each of 200 steps; the rest is small
-    assert earned == pytest.approx(200 * ALIVE[env.name], abs=0.8)
+    # In each of 200 steps; the rest is small
+    assert earned == pytest.approx(200 * ALIVE, abs=0.8)
     assert 0.56 < env.task.trunk.position[2] < 0.58  # [m]
 
 
@@ -35,14 +35,14 @@ def test_standing_earns_less_than_half_of_walking(env):
     """Walking at 0.5 m/s, upright, with a motor power of 60 W and half of each action's range changed in a step."""
     weights = env.reward_weights
     standing = weights["alive"]
-    # 0.5 * 1 + 0.5 * 1 + 0.05 (free: 0.2) - 0.0005 * 60 - 0.2 * 0.5^2 = 0.97 (1.12)
+    # 0.5 * 1 + 0.5 * 1 + 0.05 - 0.0005 * 60 - 0.2 * 0.5^2 = 0.97
     walking = (
         0.5 * (weights["progress"] + weights["forward_while_alive"])
         + weights["alive"]
         + 60 * weights["energy"]
         + 0.25 * weights["smoothness"]
     )
-    assert walking == pytest.approx(0.92 + ALIVE[env.name])
+    assert walking == pytest.approx(0.92 + ALIVE)
     assert standing < 0.5 * walking
 
 
