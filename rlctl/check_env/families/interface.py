@@ -14,6 +14,8 @@ NUMBERS = ("float", "int", "numpy.float64")
 """Reward types that both libraries accept."""
 MANY_LINES = 0.1
 """Lines printed per step from which printing is slow."""
+FEWEST_STEPS = 20
+"""With fewer, what is printed belongs to the start."""
 MOST_FAILURES = 3
 BESIDE_OTHERS = ("interleaved", "after close")
 """Where a failure is the matter of RL401 and RL402."""
@@ -106,5 +108,5 @@ def _find_prints(records: Records) -> Iterator[Finding]:
     if lines:
         steps = max(1, sum(each.steps for each in records.trajectories))
         message = f"{lines} lines on stdout in {steps} steps, the first: {records.printed_first[:80]!r}"
-        severity = Severity.WARNING if lines > MANY_LINES * steps and lines > 20 else None
+        severity = Severity.WARNING if steps >= FEWEST_STEPS and lines > max(20, MANY_LINES * steps) else None
         yield Finding("RL211", message, {"value": lines, "expected": 0}, severity)
