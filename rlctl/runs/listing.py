@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import registry
-from rlctl.errors import UsageError, did_you_mean
+from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.run.directory import ROOT
 from rlctl.runs.summary import RunSummary, find_runs, summarize
 
@@ -19,6 +19,7 @@ SORT_KEYS = {
     "minutes": lambda run: run.seconds or 0.0,
 }
 _CHANGES_SHOWN = 4
+_STATE_SHOWN = 44  # characters; `rlctl runs show` has the whole error
 
 
 def list_runs(
@@ -71,7 +72,7 @@ def _cells(run: RunSummary) -> list[Any]:
         Text(run.name),
         run.algo,
         "" if run.seed is None else str(run.seed),
-        Text(run.state_text, style=styles.get(run.state, "")),
+        Text(short_repr(run.state_text, _STATE_SHOWN), style=styles.get(run.state, "")),
         "" if run.steps is None else f"{run.steps:,}",
         "" if run.seconds is None else f"{run.seconds / 60:.1f}",
         "" if run.best_success is None else f"{run.best_success:.1%}",

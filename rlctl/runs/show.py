@@ -112,6 +112,8 @@ def plot(run: RunDescription, name: str) -> str:
     plotext.clear_figure()
     plotext.plotsize(*_PLOT_SIZE)
     plotext.title(f"{name} over steps")
+    if name == "success":
+        plotext.ylim(0, 1)
     for points, label, marker in zip(
         lines, ("training", "evaluations"), (("braille", "●") if is_utf8 else (".", "o")), strict=True
     ):
