@@ -148,7 +148,7 @@ def choose_episodes(report: Report) -> list[tuple[str, RecordedEpisode]]:
     if not last:
         return []
     ordered = sorted(last, key=lambda each: (each.info.success is True, each.info.total_reward))
-    named = [("best", ordered[-1]), ("worst", ordered[0])] if len(ordered) > 1 else [("recorded", ordered[0])]
+    named = [("best", ordered[-1]), ("worst", ordered[0])] if len(ordered) > 1 else [("one", ordered[0])]
     return [(f"The {name} recorded episode of the last evaluation: {_outcome(each)}", each) for name, each in named]
 
 
