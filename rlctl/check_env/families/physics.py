@@ -225,7 +225,8 @@ def _fast(log: Log, body: Body, states: NDArray[np.float64]) -> Iterator[tuple[f
         yield math.inf, body.name, message, {**place, "value": value, "expected": "finite"}
         return
     linear, angular = (np.linalg.norm(states[:, part], axis=1) for part in (VELOCITY, ANGULAR))
-    parts = [(body.name, "m/s", FASTEST_BASE, linear), (body.name, "rad/s", FASTEST_JOINT, angular)]
+    fastest = FASTEST_BASE + float(linear[0])  # a rocket may begin with 100
+    parts = [(body.name, "m/s", fastest, linear), (body.name, "rad/s", FASTEST_JOINT, angular)]
     for joint, speeds in zip(body.joints, np.abs(states[:, JOINTS + len(body.joints) :]).T, strict=True):
         unit, limit = ("rad/s", FASTEST_JOINT) if joint.is_angle else ("m/s", FASTEST_SLIDE)
         parts.append((f"{joint.name} of {body.name}", unit, limit, speeds))
