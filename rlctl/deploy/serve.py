@@ -129,4 +129,4 @@ async def _reload(server: PolicyServer, file: Path) -> None:
         await server.replace_policy(file)
         print(f"reloaded {file}: step {server.policy.info.training_steps:,}", file=sys.stderr)
     except RlctlError as error:
-        print(f"warning: the policy before acts on: {error}", file=sys.stderr)
+        print(f"warning: the policy was not changed: {error}", file=sys.stderr)

@@ -41,5 +41,5 @@ def take_pictures(episode: RecordedEpisode, count: int) -> list[tuple[int, bytes
     finally:
         env.close()
     if difference := find_difference(episode, rollout):
-        raise ArtifactError(f"played again, the episode is another one; {difference}")
+        raise ArtifactError(f"replayed, the episode differs from the recorded one; {difference}")
     return pictures

@@ -78,7 +78,7 @@ def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: st
     for name in chosen:
         if name not in events:
             raise UsageError(
-                f"--events: {task} has no event {name!r}.{did_you_mean(name, events)} It has: {', '.join(events)}."
+                f"--event: {task} has no event {name!r}.{did_you_mean(name, events)} It has: {', '.join(events)}."
             )
     found: list[Parameter] = []
     delayed, longest = "", 0
@@ -88,7 +88,7 @@ def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: st
         possible = is_delay or (event.when == "reset" and event.function not in (set_color, shift_gravity) and ranges)
         if name in chosen and not possible:
             raise UsageError(
-                f"--events: {name} is not a physical value that holds for an episode; those that are act at 'reset', "
+                f"--event: {name} is not a physical value that holds for an episode; those that are act at 'reset', "
                 "and the delay of actions"
             )
         if not possible or (chosen and name not in chosen):
