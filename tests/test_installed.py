@@ -44,7 +44,7 @@ def site(install):
             "some_robots/raises.py": "\nraise RuntimeError('boom\\nand more')",
             "some_robots/raises.yaml": "algo: [\n",
             "some_robots/leaves.py": "raise SystemExit(0)",
-            "some_robots/vanishes.py": "import os; os._exit(0)",
+            "some_robots/vanishes.py": "import os; os.kill(os.getpid(), 9)",
             "some_robots/unreadable.py": "",
         },
     )
@@ -100,7 +100,7 @@ def test_check_shows_what_raises_in_a_line_each(importable, monkeypatch):
     assert problems == {
         "good": None,
         "leaves": "task 'some_robots.leaves:Task': import failed: SystemExit: 0 (leaves.py:1)",
-        "vanishes": "import ended the process with exit code 0",
+        "vanishes": "import ended the process with exit code -9",
         "absent": "module 'some_robots.absent' is missing",
         "nameless": "some_robots.good has no 'Bad'. It defines: Good.",
     }
@@ -109,7 +109,7 @@ def test_check_shows_what_raises_in_a_line_each(importable, monkeypatch):
 @pytest.mark.slow
 def test_the_check_of_all_tasks(rlctl, importable):
     tasks = listed(rlctl("tasks", "--check", "--json", "-", path=importable))
-    assert tasks["vanishes", "some-robots"]["problem"] == "import ended the process with exit code 0"
+    assert tasks["vanishes", "some-robots"]["problem"] == "import ended the process with exit code -9"
     assert [name for (name, origin), task in tasks.items() if origin == "rlctl" and task["problem"]] == []
 
 

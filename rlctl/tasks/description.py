@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import registry
-from rlctl.check_env.leaves import Leaf, leaves_of
+from rlctl.check_env.leaves import Leaf, find_leaves
 from rlctl.errors import TaskError
 from rlctl.plugin_code import call_plugin
 from rlctl.run import recipe as recipes
@@ -164,7 +164,7 @@ def _list_observations(env: TaskEnv) -> list[Quantity]:
     units = env.task.observation_units
     parts = _list_quantities(env.observation_space)
     if env.task.observation_layout == "flat":
-        (whole,) = leaves_of(env.observation_space)
+        (whole,) = find_leaves(env.observation_space)
         parts, start = [], 0
         for name, size in env.observation_sizes.items():
             end = start + size
@@ -174,7 +174,7 @@ def _list_observations(env: TaskEnv) -> list[Quantity]:
 
 
 def _list_quantities(space: Any) -> list[Quantity]:
-    return [_describe_part(".".join(map(str, leaf.path)), leaf, list(leaf.shape)) for leaf in leaves_of(space)]
+    return [_describe_part(".".join(map(str, leaf.path)), leaf, list(leaf.shape)) for leaf in find_leaves(space)]
 
 
 def _describe_part(name: str, leaf: Leaf, shape: list[int], part: Any = ...) -> Quantity:
