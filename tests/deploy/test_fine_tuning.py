@@ -20,8 +20,8 @@ RECIPE = {  # of both trainings, and of docs/deploy.md
 }
 
 
-def write_real_log(folder):
-    """Write what the arm does where every action comes `DELAY` steps late."""
+def write_real_log(folder, delay=DELAY):
+    """Write what the arm does where every action comes `delay` steps late."""
     excited = write_excitation(EnvSpec("reach"), folder / "excite.csv", seconds=4.0, seed=0)
     env = open_world(EnvSpec("reach"))
     try:
@@ -29,7 +29,7 @@ def write_real_log(folder):
         actions = read_log(excited.path, expected).actions
         env.reset(seed=0)
         arm, measured = env.sim.body("arm"), []
-        for late in np.concatenate([np.zeros((DELAY, 7)), actions[:-DELAY]]):
+        for late in np.concatenate([np.zeros((delay, 7)), actions[:-delay]]):
             measured.append([arm.joint_positions.copy(), arm.joint_velocities.copy()])
             env.task.act(late.astype(np.float32))
             env.sim.step()
@@ -44,6 +44,12 @@ def train(root, events, policy=None):
     settings = {**RECIPE, "events": events, "seed": 1}
     run = run_training(TrainRequest("reach", settings=settings, root=root, initial_policy=policy)).run
     return {int(row["steps"]): (float(row["success"]), float(row["return"])) for row in rows(run.evals_file)}
+
+
+@pytest.mark.slow
+def test_a_delay_beyond_the_range_of_the_event_is_found(tmp_path):
+    found = identify(EnvSpec("reach"), write_real_log(tmp_path, 8), events=["action_delay"], n_workers=1)
+    assert (found.delay, found.delay_known) == (8, True)
 
 
 @pytest.mark.slow

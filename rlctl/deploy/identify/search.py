@@ -22,6 +22,7 @@ from rlctl.rollout.child_process import ChildProcess
 _TRIALS = 12  # per unknown, and as many again
 _STARTS = 3
 _EVALUATIONS, _LAST_EVALUATIONS = 12, 25
+_LONGEST_DELAY = 50  # steps that the search may go to from the longest that is tried first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +137,7 @@ def search(
     report(f"least squares from {len(starts)} starts")
     follow_up([_ask_fit(trial["at"], trial["delay"], weights, _EVALUATIONS) for trial in starts])
     best = _best(fits)
-    while beside := [d for d in (best.delay - 1, best.delay + 1) if 0 <= d <= unknowns.longest_delay and d not in fits]:
+    while beside := [d for d in (best.delay - 1, best.delay + 1) if 0 <= d <= _LONGEST_DELAY and d not in fits]:
         follow_up([_ask_fit(best.at.tolist(), delay, weights, _EVALUATIONS) for delay in beside])
         if _best(fits).delay == best.delay:
             break
