@@ -15,7 +15,7 @@ demo: $(VENV)/.installed
 test: $(VENV)/.dev
 	@said=$$(mktemp); $(MAKE) --no-print-directory lint > $$said 2>&1 & lint=$$!; \
 	trap 'kill $$lint 2> /dev/null; rm -f $$said' EXIT; \
-	$(BIN)/python -m pytest -n 2 --dist worksteal; tests=$$?; \
+	$(BIN)/python -m pytest -n 3 --dist worksteal; tests=$$?; \
 	wait $$lint; code=$$?; cat $$said; \
 	[ $$tests -eq 0 ] && [ $$code -eq 0 ]
 

@@ -98,6 +98,7 @@ def test_a_signal_while_the_process_starts(tmp_path, number, part):
     assert end_orphans(process.pid) == []
 
 
+@pytest.mark.crash
 def test_a_closed_terminal(tmp_path):
     process, terminal = pty.fork()
     if process == 0:

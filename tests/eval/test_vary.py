@@ -170,6 +170,7 @@ def test_plain_environments_have_parameters_only():
         read_axes(["all"], EnvSpec("Pendulum-v1"))
 
 
+@pytest.mark.slow
 def test_map_of_a_plain_environment(tmp_path, rlctl):
     run = write_run(tmp_path / "run", "Pendulum-v1")
     done = rlctl("eval", run.path, "--episodes", 2, "--vary", "g=5:10:2")

@@ -46,7 +46,7 @@ def test_a_thousand_steps_and_the_episodes_in_them(pair, seed):
             np.testing.assert_array_equal(ours.reset()[0], theirs.reset()[0])
 
 
-@pytest.mark.parametrize("robot", [Hopper, Walker2D, Humanoid])
+@pytest.mark.parametrize("robot", [Hopper, Walker2D, pytest.param(Humanoid, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_thousand_steps_without_a_new_start(robot, seed):
     """With random actions they fall in a second; what happens on the floor is long and full of contacts."""

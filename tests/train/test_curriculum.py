@@ -279,6 +279,7 @@ class NoSuccess(NearThenExact):
 """
 
 
+@pytest.mark.slow
 def test_reach_in_stages_of_its_class(write_module, tmp_path):
     task = f"{write_module('my_reach.py', REACH)}:NearThenExact"
     settings = {
