@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,23 @@ from rlctl.replay.recorder import play_episode, recorded_actions
 from rlctl.replay.scene import encode_jpeg
 from rlctl.replay.view import look_at
 from rlctl.run.episode import RecordedEpisode
+from rlctl.task import Sim
 
 _WIDTH, _HEIGHT = 240, 180  # [pixels]
 
 
-def take_pictures(episode: RecordedEpisode, count: int) -> list[tuple[int, bytes]]:
-    """Play an episode again and return `count` steps of it, the first and the last among them, as JPEG files.
+@dataclasses.dataclass(frozen=True)
+class PictureStrip:
+    """An episode in pictures."""
+
+    pictures: list[tuple[int, bytes]]
+    """Step and JPEG file."""
+    deepest_contact: float
+    """How far bodies overlapped at most [m]; 0 where they did not, or where there is no world of a task."""
+
+
+def take_pictures(episode: RecordedEpisode, count: int) -> PictureStrip:
+    """Play an episode again and return `count` steps of it, the first and the last among them.
 
     The camera follows the robot. Raises `TaskError` if the environment fails, `UsageError` if it cannot draw, and
     `ArtifactError` if it does something else than when it was recorded.
@@ -25,11 +37,16 @@ def take_pictures(episode: RecordedEpisode, count: int) -> list[tuple[int, bytes
     spec, steps = episode.info.spec, len(episode.actions)
     chosen = {int(step) for step in np.linspace(0, steps, count)} - {steps}
     pictures: list[tuple[int, bytes]] = []
+    deepest = 0.0
     env = spec.make("rgb_array")
+    sim = getattr(env.unwrapped, "sim", None)
     try:
         recorded, view = recorded_actions(episode, env), look_at(env, _WIDTH, _HEIGHT)
 
         def choose(observation: Any, step: int) -> Any:
+            nonlocal deepest
+            if isinstance(sim, Sim):
+                deepest = max(deepest, sim.deepest_contact)
             if step == 0:
                 view.begin()
             if step in chosen:
@@ -42,4 +59,4 @@ def take_pictures(episode: RecordedEpisode, count: int) -> list[tuple[int, bytes
         env.close()
     if difference := find_difference(episode, rollout):
         raise ArtifactError(f"replayed, the episode differs from the recorded one; {difference}")
-    return pictures
+    return PictureStrip(pictures, deepest)

@@ -144,6 +144,12 @@ class Sim(Constraints):
         for body in self.bodies.values():
             body._cache.clear()
 
+    @property
+    def deepest_contact(self) -> float:
+        """How far two bodies overlap at most [m], at the end of the last step; 0 where none do."""
+        points = pybullet.getContactPoints(physicsClientId=self.client)
+        return max((-float(point[8]) for point in points if point[8] < 0.0), default=0.0)
+
     def save(self) -> None:
         """Remember the world as it is now, for `restore`."""
         self._saved = pybullet.saveState(physicsClientId=self.client)

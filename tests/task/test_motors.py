@@ -123,6 +123,7 @@ def test_contact_forces(sim):
     assert set(contacts.links) == {"baseLink"}
     assert contacts.forces.sum() == pytest.approx(0.981, rel=1e-3)  # 0.1 kg * 9.81 m/s^2
     assert -1e-4 < contacts.distances.min() < 1e-4
+    assert sim.deepest_contact == pytest.approx(max(0.0, -contacts.distances.min()))
     assert cube.contacts_with(cube) == ([], pytest.approx(np.zeros(0)), pytest.approx(np.zeros(0)))
     cube.set_base((0, 0, 0.02))
     sim.step()

@@ -103,11 +103,13 @@ def _take_pictures(report: Report) -> Iterator[tuple[str, list[tuple[int, str]]]
 
     for name, episode in content.choose_episodes(report):
         try:
-            taken = take_pictures(episode, _PICTURES)
+            strip = take_pictures(episode, _PICTURES)
         except RlctlError as error:  # another task by now, or one that cannot draw
             output.print_notes([f"no pictures: {str(error).splitlines()[0]}"])
             return
-        yield name, [(step, base64.b64encode(picture).decode()) for step, picture in taken]
+        depth = 1000 * strip.deepest_contact  # [mm]
+        overlap = f"; bodies overlap by up to {depth:.0f} mm" if depth > 1 else ""
+        yield name + overlap, [(step, base64.b64encode(picture).decode()) for step, picture in strip.pictures]
 
 
 def _tabulate(run: ReportedRun) -> dict[str, Any]:
