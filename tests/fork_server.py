@@ -298,10 +298,10 @@ def _take_surroundings(request):
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])
+    signal.pthread_sigmask(signal.SIG_SETMASK, request["blocked"])  # first: what is held back must not end it
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in SIGNALS[1:]:
         signal.signal(number, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_SETMASK, request["blocked"])
     first = os.getcwd() if request["command"][1] == "-m" else ""
     given = [each for each in request["env"].get("PYTHONPATH", "").split(os.pathsep) if each]
     sys.path[:] = [first, *given, *sys.path[1:]]
