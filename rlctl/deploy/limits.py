@@ -10,10 +10,9 @@ import pydantic
 from pydantic import Field
 
 from rlctl.errors import RecipeError, did_you_mean, short_repr
-from rlctl.run import schema_text, untrusted, yaml_text
+from rlctl.run import schema_text, yaml_text
 from rlctl.run.quantities import Number, Whole
 
-_LONGEST = 2**20  # [bytes]
 _NUMBER_WITH_UNIT = re.compile(r"^\s*[-+]?\d[\d.eE+-]*\s*[^\d\s.]")
 _UNITS = {
     "position": "rad or m",
@@ -118,10 +117,7 @@ class Limits(_Section):
 
 def read_limits(path: Path) -> Limits:
     """Read a limits file; raises `ArtifactError` if it cannot be read, `RecipeError` for what is wrong in it."""
-    try:
-        text = untrusted.read_bytes(path, _LONGEST).decode()
-    except UnicodeDecodeError as error:
-        raise RecipeError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start:,}; save it as UTF-8") from None
+    text = yaml_text.read_text(path)
     content = yaml_text.load(text, str(path))
     if not isinstance(content, dict):
         raise RecipeError(f"{path}: a limits file is a mapping of keys to values, such as `limits: {{all: ...}}`")

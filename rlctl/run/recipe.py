@@ -17,7 +17,7 @@ from pydantic import Field
 from rlctl import registry
 from rlctl.env_spec import EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
-from rlctl.run import schema_text, untrusted, yaml_text
+from rlctl.run import schema_text, yaml_text
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.run.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.run.network_parameters import NETWORK_PARAMETERS
@@ -31,7 +31,6 @@ IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
 """What can learn in hindsight: what has a replay buffer, except crossq, which has no network for Dict spaces."""
 
 _DEEPEST_KEY = 20
-_LONGEST = 2**20  # [bytes] of a recipe file
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
 _QUANTILES = 25  # per critic, where a recipe does not say
 _MOST_STEPS = 10**12
@@ -204,11 +203,7 @@ def read(path: Path) -> dict[str, Any]:
     """Read a recipe file as plain data, unchecked."""
     if not path.exists():
         raise ArtifactError(f"no recipe file {path}")
-    try:
-        text = untrusted.read_bytes(path, _LONGEST).decode()
-    except UnicodeDecodeError as error:
-        raise RecipeError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start:,}; save it as UTF-8") from None
-    return _check_mapping(yaml_text.load(text, str(path)), path)
+    return _check_mapping(yaml_text.load(yaml_text.read_text(path), str(path)), path)
 
 
 def _check_mapping(content: Any, path: Path) -> dict[str, Any]:

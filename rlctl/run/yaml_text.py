@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Hashable, Sequence
+from pathlib import Path
 from typing import Any
 
 import yaml
 
 from rlctl.errors import RecipeError, short_repr
+from rlctl.run import untrusted
 
 _PREFIX = "tag:yaml.org,2002:"
 _DEEPEST = 50
+_LONGEST = 2**20  # [bytes] of a file
 
 
 class _Dumper(yaml.SafeDumper):
@@ -114,6 +117,14 @@ for _tag, _pattern, _first in (
     # Text that looks like a number in either version of YAML is written in quotes.
     for _class in (_Loader, _Dumper):
         _class.add_implicit_resolver(f"{_PREFIX}{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a YAML file; raises `ArtifactError` if it cannot be read, `RecipeError` if it is not UTF-8."""
+    try:
+        return untrusted.read_bytes(path, _LONGEST).decode()
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start:,}; save it as UTF-8") from None
 
 
 def load(text: str, source: str) -> Any:

@@ -143,13 +143,14 @@ def _show_evaluations(rows: Rows) -> None:
     for name in names:
         table.add_column(name, justify="right", header_style="bold")
     for row in shown:
-        table.add_row(*(_cell(name, row.get(name)) for name in names))
+        table.add_row(*(format_cell(name, row.get(name)) for name in names))
     if len(rows) > len(shown):
         output.out().print(f"the last {len(shown)} of {len(rows)} evaluations:")
     output.out().print(table)
 
 
-def _cell(name: str, value: float | None) -> str:
+def format_cell(name: str, value: float | None) -> str:
+    """Return a value of a table of evaluations, by its column; empty for None."""
     if value is None:
         return ""
     if name in ("steps", "episodes"):

@@ -13,6 +13,7 @@ from rlctl.errors import RlctlError, UsageError, did_you_mean
 from rlctl.run import files
 from rlctl.runs.report import content
 from rlctl.runs.report.content import Report, ReportedRun
+from rlctl.runs.show import format_cell
 
 FORMATS = ("html", "md")
 DEFAULT_FILE = Path("report.html")
@@ -115,16 +116,8 @@ def _take_pictures(report: Report) -> Iterator[tuple[str, list[tuple[int, str]]]
 def _tabulate(run: ReportedRun) -> dict[str, Any]:
     rows = run.evaluations
     columns = [name for name in (rows[0] if rows else {}) if any(row.get(name) is not None for row in rows)]
-    cells = [[_cell(name, row.get(name)) for name in columns] for row in rows]
+    cells = [[format_cell(name, row.get(name)) for name in columns] for row in rows]
     return {"name": run.summary.name, "columns": columns, "rows": cells}
-
-
-def _cell(name: str, value: float | None) -> str:
-    if value is None:
-        return ""
-    if name in ("steps", "episodes"):
-        return f"{value:,.0f}"
-    return f"{value:.1%}" if name == "success" else f"{value:.4g}"
 
 
 def _describe_robustness(report: Report) -> Iterator[str]:
