@@ -7,7 +7,7 @@ from typing import Any
 
 from rlctl.deploy.limits import Limits
 from rlctl.deploy.safety_filter import SafetyFilter
-from rlctl.rollout.acting import Exploration, Player
+from rlctl.run.acting import Exploration, Player
 from rlctl.run.env_info import EnvInfo
 
 

@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from rlctl.deploy.client import PolicyClient
 from rlctl.errors import PolicyError, UsageError, short_repr
-from rlctl.rollout.acting import Player
+from rlctl.run.acting import Player
 from rlctl.run.env_info import space_from_json
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError
-from rlctl.rollout.acting import PolicyPlayer, check_playable
+from rlctl.run.acting import PolicyPlayer, check_playable
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.numpy_policy import NumpyNetwork, select_actor_tensors
 from rlctl.run.policy import PolicyInfo, read_policy

@@ -13,12 +13,12 @@ from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.baseline import Baseline, choose_task, load_baseline
 from rlctl.eval.statistics import Spread, mean_action_change, mean_terms, success_interval, success_rate
-from rlctl.rollout.acting import Exploration, Player, PolicyPlayer, check_playable
 from rlctl.rollout.baselines import make_player
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import lookup
+from rlctl.run.acting import Exploration, Player, PolicyPlayer, check_playable
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo, load_policy, read_policy
 

@@ -18,11 +18,11 @@ from rlctl.eval import axes as axes_of
 from rlctl.eval.evaluate import EvalRequest, Gates, LoadedPolicy, choose_specs, load_player, start_workers
 from rlctl.eval.statistics import mean_interval, mean_return, success_interval, success_rate
 from rlctl.registry import is_task
-from rlctl.rollout.acting import Exploration
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import EpisodeResult, Workers
 from rlctl.run import lookup, robustness
+from rlctl.run.acting import Exploration
 from rlctl.run.policy import collect_versions
 from rlctl.run.robustness import Axis, Cell, Outcome, PushTest, Robustness, RobustnessMap
 

@@ -21,7 +21,7 @@ from rlctl.errors import (
     format_plugin_traceback,
     short_repr,
 )
-from rlctl.rollout.acting import ExportedPlayer, Player, make_generator
+from rlctl.run.acting import ExportedPlayer, Player, make_generator
 
 BASELINES = ("zero", "random")
 SERVER = ("ws://", "wss://")

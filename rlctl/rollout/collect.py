@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from rlctl.dict_spaces import Observations, join
 from rlctl.errors import EpisodeFailed
-from rlctl.rollout.acting import Exploration
 from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.run.acting import Exploration
 
 _SEGMENT = 1000
 """Steps after which the main process takes what was recorded of a long episode."""

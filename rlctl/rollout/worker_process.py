@@ -25,13 +25,13 @@ from rlctl.dict_spaces import SINGLE, split, split_space
 from rlctl.env_spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
 from rlctl.rollout import goal_rewards, messages, returned_values
-from rlctl.rollout.acting import Exploration, Player, PolicyPlayer
 from rlctl.rollout.baselines import make_player
 from rlctl.rollout.failures import FailedInEpisode, encode_error
 from rlctl.rollout.returned_values import InvalidReturn
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays, observation_fields
 from rlctl.rollout.worker_output import write_stderr
+from rlctl.run.acting import Exploration, Player, PolicyPlayer
 from rlctl.run.env_info import describe
 from rlctl.run.policy import PolicyInfo
 from rlctl.task.env import TaskEnv

@@ -27,11 +27,11 @@ from rlctl.dict_spaces import Observations, join
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import DivergedError, EpisodeFailed, PolicyError, RlctlError, TaskError
 from rlctl.rollout import goal_rewards, messages
-from rlctl.rollout.acting import Exploration
 from rlctl.rollout.child_process import ChildProcess
 from rlctl.rollout.process_start import StartProcess
 from rlctl.rollout.shared_arrays import SharedArrays, anonymous_file, map_arrays
 from rlctl.rollout.worker_output import forward
+from rlctl.run.acting import Exploration
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.numpy_policy import select_actor_tensors
 from rlctl.run.policy import PolicyInfo

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rlctl.rollout.acting import Exploration
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
+from rlctl.run.acting import Exploration
 from rlctl.run.policy import PolicyInfo
 from rlctl.run.recipe import Recipe
 from rlctl.train.snapshot import Tensors

@@ -10,7 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from rlctl.dict_spaces import join, split_space
-from rlctl.rollout.acting import Exploration
+from rlctl.run.acting import Exploration
 from rlctl.train.segments import (
     acting_statistics,
     send_policy,

@@ -17,7 +17,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from rlctl.dict_spaces import join, split, split_space
-from rlctl.rollout.acting import Exploration
+from rlctl.run.acting import Exploration
 from rlctl.train.segments import (
     Statistics,
     acting_statistics,

@@ -13,10 +13,10 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from rlctl.dict_spaces import join
 from rlctl.errors import EpisodeFailed
-from rlctl.rollout.acting import Exploration
 from rlctl.rollout.history import ActionHistory
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.run.acting import Exploration
 from rlctl.run.policy import PolicyInfo
 from rlctl.train.space_monitor import SpaceMonitor
 

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
-from rlctl.rollout.acting import Exploration
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import Workers, available_cores
+from rlctl.run.acting import Exploration
 from rlctl.run.policy import PolicyInfo
 from tests.benchmarks.row import Row, side_by_side
 

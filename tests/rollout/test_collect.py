@@ -5,8 +5,8 @@ import pytest
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import DivergedError, EpisodeFailed
-from rlctl.rollout.acting import Exploration
 from rlctl.rollout.collect import play_episodes
+from rlctl.run.acting import Exploration
 from tests.rollout.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")

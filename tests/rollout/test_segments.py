@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rlctl.errors import EpisodeFailed
-from rlctl.rollout.acting import Exploration, PolicyPlayer
 from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.run.acting import Exploration, PolicyPlayer
 from tests.rollout.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")

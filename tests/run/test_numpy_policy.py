@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.rollout.acting import Exploration, PolicyPlayer, check_playable
+from rlctl.run.acting import Exploration, PolicyPlayer, check_playable
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.numpy_policy import select_actor_tensors
 from rlctl.run.policy import PolicyInfo

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rlctl.errors import DivergedError, RecipeError, TaskError, UsageError
-from rlctl.rollout.acting import PolicyPlayer
 from rlctl.run import recipe as recipes
+from rlctl.run.acting import PolicyPlayer
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.run.policy import load_policy, read_policy
