@@ -14,6 +14,8 @@ from rlctl.errors import EpisodeFailed
 from rlctl.rollout.workers import EpisodeResult, Workers
 from rlctl.run.acting import Exploration
 
+_CONTACTS_MEASURED = 10
+"""Of recorded episodes, the first ones; it takes about 3 % of a step."""
 _SEGMENT = 1000
 """Steps after which the main process takes what was recorded of a long episode."""
 
@@ -70,7 +72,8 @@ def play_episodes(
 
     def play(env: int, seed: int) -> None:
         terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms
-        workers.start_playing({env: seed}, steps, exploration, until_end=True, record=terms)
+        contacts = terms and running[env].index < _CONTACTS_MEASURED
+        workers.start_playing({env: seed}, steps, exploration, until_end=True, record=terms, contacts=contacts)
 
     for env in workers.first_envs:
         begin(env)

@@ -90,6 +90,8 @@ class Play:
     run_seed: int = 0
     episodes_started: list[int] = dataclasses.field(default_factory=list)
     """Per environment the number of the training episode that begins where one ends; empty: none begins."""
+    contacts: bool = False
+    """Whether to measure, after every step, how far bodies overlap."""
 
 
 Message = Build | SetEvents | Attach | Reset | Step | ReplayActions | ComputeRewards | LoadPolicy | LimitActions | Play

@@ -49,10 +49,11 @@ class _Episode:
         self.active = False
         self._return = 0.0
         self._sums: dict[str, float] = {}
+        self._deepest_contact: float | None = None
 
     def start(self, seed: int) -> Any:
         self.seed, self.step, self.active = seed, 0, True
-        self._return, self._sums = 0.0, {}
+        self._return, self._sums, self._deepest_contact = 0.0, {}, None
         observation, info = returned_values.check_tuple(self.env.reset(seed=seed), returned_values.RESET, "reset")
         returned_values.check_info(info)
         return observation
@@ -65,6 +66,10 @@ class _Episode:
                 sums[name] = sums.get(name, 0.0) + value
         except (TypeError, AttributeError):
             raise InvalidReturn(f"info['reward_terms'] is {info['reward_terms']!r}, not a dict of numbers") from None
+
+    def measure_contact(self) -> None:
+        """Remember how far bodies overlap now, if it is the most so far."""
+        self._deepest_contact = max(self._deepest_contact or 0.0, self.env.unwrapped.sim.deepest_contact)
 
     def summary(self, info: dict[str, Any]) -> dict[str, Any]:
         success = info.get("is_success")
@@ -82,6 +87,7 @@ class _Episode:
                 str(name): returned_values.to_float(value, f"reward term {name}") for name, value in self._sums.items()
             },
             "final_distance": None if distance is None else float(distance),
+            "deepest_contact": self._deepest_contact,
         }
 
 
@@ -277,6 +283,8 @@ class Worker:
             segment.terminated[index, row], segment.truncated[index, row] = terminated, truncated
             if message.record:
                 segment.terms[index, row] = list(info["metrics"].values())
+            if message.contacts:
+                episode.measure_contact()
             row += 1
             if not (terminated or truncated):
                 self.store(now, row, episode, observation)

@@ -59,6 +59,8 @@ class EpisodeResult:
     """The row of the segment in which it ended."""
     report: dict[str, Any] = dataclasses.field(default_factory=dict, compare=False)
     """What the player has to say of it; see `acting.Player.report`."""
+    deepest_contact: float | None = None
+    """How far two bodies overlapped at most [m]; None where it was not measured."""
 
 
 class Workers:
@@ -270,6 +272,7 @@ class Workers:
         *,
         until_end: bool = False,
         record: bool = False,
+        contacts: bool = False,
         run_seed: int = 0,
         episodes_started: Sequence[int] = (),
     ) -> None:
@@ -277,7 +280,8 @@ class Workers:
 
         `begin` has the seed of the episode to begin with, negative to go on with the running one. Where an episode ends
         the next one begins, by its address in the training of `run_seed`, with the number that `episodes_started` has
-        for the environment; with `until_end` the environment stops there, and without numbers none begins.
+        for the environment; with `until_end` the environment stops there, and without numbers none begins. `contacts`:
+        measure how far the bodies of a task overlap.
         """
         self.make_room(steps)
         for worker, envs in self._by_worker(begin).items():
@@ -286,7 +290,7 @@ class Workers:
             self._send(
                 worker,
                 messages.Play(
-                    envs, seeds, steps, dataclasses.asdict(exploration), until_end, record, run_seed, started
+                    envs, seeds, steps, dataclasses.asdict(exploration), until_end, record, run_seed, started, contacts
                 ),
             )
 
@@ -476,6 +480,7 @@ def _results(answers: Mapping[int, Any]) -> list[EpisodeResult]:
             each["final_distance"],
             each.get("row", -1),
             each.get("report", {}),
+            each.get("deepest_contact"),
         )
         for _, answer in sorted(answers.items())
         for each in answer["ended"]

@@ -109,7 +109,7 @@ def summarize_play(play: Play | None, space: spaces.Space[Any], log: Mapping[str
         "action_saturation": None if actions is None or not limited else float((np.abs(actions) > _AT_LIMIT).mean()),
         "action_change": None if actions is None or play is None else _mean_change(actions, play),
         "exploration": _exploration(space, log.get("train/entropy_loss")),
-        "value": None if play is None or play.values is None else float(play.values.mean()),
+        "value": _expected_value(play, log),
     }
 
 
@@ -141,12 +141,40 @@ def _exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
     return math.exp(min(per_element - 0.5 * math.log(2 * math.pi * math.e), 50.0)) / half_range
 
 
+def _expected_value(play: Play | None, log: Mapping[str, Any]) -> float | None:
+    """Return what the critic expects: the mean over a rollout, or over the replay buffer's samples of an update.
+
+    The loss of an off-policy actor is minus that value, SAC's with the entropy that it is paid for.
+    """
+    if play is not None and play.values is not None:
+        return float(play.values.mean())
+    loss = log.get("train/actor_loss")
+    return None if loss is None else -float(loss)
+
+
 def _gradient_norm(model: BaseAlgorithm) -> float | None:
-    """Return the norm of the last minibatch's gradient as it was applied: not above `max_grad_norm`, if clipped."""
+    """Return the norm of the last minibatch's gradient as it was applied: not above `max_grad_norm`, if clipped.
+
+    Of an off-policy actor and critic it is the critic's root mean square over about the last thousand updates: Adam
+    keeps it, and the gradients of the last minibatch are mixed with those that passed through to the actor.
+    """
+    if (critic := getattr(model, "critic", None)) is not None:
+        return recent_gradient_norm(critic.optimizer)
     if not hasattr(model, "max_grad_norm"):
         return None
     gradients = [each.grad for each in model.policy.parameters() if each.grad is not None]
     return float(torch.nn.utils.get_total_norm(gradients)) if gradients else None
+
+
+def recent_gradient_norm(optimizer: torch.optim.Optimizer) -> float | None:
+    """Return the root mean square of a gradient's norm over some 1,000 updates, as Adam remembers it; else None."""
+    squares = [
+        state["exp_avg_sq"].sum().item() / (1 - group["betas"][1] ** float(state["step"]))
+        for group in optimizer.param_groups
+        for parameter in group["params"]
+        if "exp_avg_sq" in (state := optimizer.state.get(parameter, {}))
+    ]
+    return math.sqrt(sum(squares)) if squares else None
 
 
 def collect_histograms(play: Play, info: EnvInfo) -> dict[str, torch.Tensor]:

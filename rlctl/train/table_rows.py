@@ -41,12 +41,19 @@ def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
         "return": mean_return(results),
         "length": _mean_length(results),
         "distance": _mean_distance(results),
+        "overlap": _median_overlap(results),
         **{f"term/{name}": value for name, value in mean_terms(results).items()},
     }
 
 
 def _mean_length(results: Sequence[EpisodeResult]) -> float:
     return float(np.mean([result.length for result in results]))
+
+
+def _median_overlap(results: Sequence[EpisodeResult]) -> float | None:
+    """Return the median over episodes of how far bodies overlapped at most [m]; None where no episode was measured."""
+    depths = [result.deepest_contact for result in results if result.deepest_contact is not None]
+    return float(np.median(depths)) if depths else None
 
 
 def _mean_distance(results: Sequence[EpisodeResult]) -> float | None:

@@ -184,3 +184,21 @@ class Counting(Task):
 
     def rewards(self, action):
         return {"fixed": 2.0, "count": self.count}
+
+
+@dataclass
+class Sunk(Counting):
+    """A cube that begins 2 cm inside the floor."""
+
+    reward_weights = {"height": 1.0}
+
+    def build(self, sim):
+        super().build(sim)
+        sim.load("floor", "plane.urdf", fixed=True)
+        self.cube = sim.load("cube", "cube_small.urdf", position=(0.0, 0.0, 0.005))  # its half edge is 0.025 m
+
+    def observe(self):
+        return {"position": self.cube.base_position}
+
+    def rewards(self, action):
+        return {"height": float(self.cube.base_position[2])}

@@ -81,6 +81,16 @@ def test_terms_are_recorded(spec, start):
     assert trajectory.rewards == pytest.approx([count + 1.0] * 4, abs=1e-6)
 
 
+def test_overlapping_bodies_are_measured_in_the_first_episodes(spec, start):
+    workers = start(EnvSpec(spec("Sunk").task), 2)
+    workers.set_policy(*linear(workers.info, np.zeros((1, 3))))
+    episodes = play_episodes(workers, range(11), record=True)
+    # The cube begins 2 cm inside the floor, and each step lets it out a little.
+    assert all(0.01 < each.result.deepest_contact < 0.02 for each in episodes[:10])
+    assert episodes[10].result.deepest_contact is None
+    assert play_episodes(workers, [0])[0].result.deepest_contact is None
+
+
 def test_dict_observations_are_recorded_by_key(spec, start):
     workers = start(spec("Spaces", kind="dict"), 2)
     workers.set_policy(*linear(workers.info, np.zeros((4, 7))))  # two numbers and five alternatives

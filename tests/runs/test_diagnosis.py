@@ -40,6 +40,7 @@ HEALTHY = {
     "exploration": np.linspace(0.6, 0.4, UPDATES),
     "action_saturation": 0.13,
     "terminated": 0.0,
+    "value": RISING / 2,
     "gradient_norm": 0.5,
     "playing": 0.75,
     "fps": 3000,
@@ -131,6 +132,8 @@ def test_rare_success_at_the_beginning_has_no_finding(write_training):
         ("Q2", {"success": 0.0}, {"episodes": [make_episode(SHAKING, terms=np.eye(100, 2))]}),
         ("Q3", {"return": np.tile([0.0, 90.0, 10.0], 10), "approx_kl": 0.6, "clip_fraction": 0.7}, {}),
         ("Q3", {"approx_kl": 3.0, "clip_fraction": 0.85, "success": 0.1}, {}),
+        ("Q3", {"success": 0.0, "value": np.geomspace(1, 1e6, UPDATES)}, {"episodes": [make_episode(SMOOTH)]}),
+        ("Q3", {**FLAT, "gradient_norm": np.geomspace(0.1, 1e3, UPDATES)}, {}),
         ("Q3", {}, {"status": "diverged", "error": "training diverged: loss is not finite at step 900."}),
         ("Q5", {}, {"status": "failed", "error": "task 'arm': Cannot load URDF file arm.urdf"}),
         ("Q7", {}, {"episodes": [make_episode(SHAKING, terms=np.tile([1.0, 0.0], (100, 1)))]}),
@@ -182,6 +185,16 @@ def test_motion_that_no_robot_makes_is_found(write_training):
     (finding,) = diagnose(write_training(episodes=[make_episode(SMOOTH, flight)]))
     assert finding.id == "Q8"
     assert finding.evidence == ["position moves at up to 200 m/s in a recorded episode"]
+
+
+def test_bodies_that_stay_inside_each_other_are_found(write_training):
+    (finding,) = diagnose(write_training(evaluations={"overlap": [0.01, 0.02, 0.2, 0.06, 0.08]}))
+    assert finding.id == "Q8"
+    assert finding.evidence == ["bodies overlap by 6 cm or more in half of the episodes of the last evaluations"]
+
+
+def test_a_hard_landing_is_not_a_finding(write_training):
+    assert diagnose(write_training(evaluations={"overlap": [0.02, 0.015, 0.02, 0.07, 0.018]})) == []
 
 
 def test_badly_scaled_observations_are_found_in_a_flat_training(write_training):

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 
 from rlctl.run.env_info import EnvInfo, space_to_json
-from rlctl.train.measurements import Play, collect_histograms, summarize_play
+from rlctl.train.measurements import Play, collect_histograms, recent_gradient_norm, summarize_play
 
 
 def play(actions, done=(), terminated=()):
@@ -41,6 +42,20 @@ def test_exploration_is_the_deviation_that_has_the_entropy():
     row = summarize_play(None, spaces.Discrete(4), {"train/entropy_loss": -np.log(2)})
     assert row["exploration"] == pytest.approx(0.5)
     assert summarize_play(None, LINE, {})["exploration"] is None
+
+
+def test_an_off_policy_actors_loss_is_minus_the_value():
+    assert summarize_play(None, LINE, {"train/actor_loss": 3.0})["value"] == -3.0
+
+
+def test_adam_remembers_how_large_gradients_were():
+    parameter = torch.nn.Parameter(torch.zeros(2))
+    optimizer = torch.optim.Adam([parameter], lr=0.1)
+    assert recent_gradient_norm(optimizer) is None
+    for sign in (1.0, -1.0, 1.0):
+        parameter.grad = sign * torch.tensor([3.0, 4.0])
+        optimizer.step()
+    assert recent_gradient_norm(optimizer) == pytest.approx(5.0, rel=1e-4)
 
 
 def test_angles_have_histograms_by_name():

@@ -16,6 +16,8 @@ _LEAST_STEPS = 20
 _MOST_SPEED = {"m/s": 50.0, "rad/s": 300.0}
 """No joint or body of a robot is faster: 300 rad/s are 2,900 turns a minute."""
 _MOST_POSITION_SPEED = 50.0  # [m/s]
+_MOST_OVERLAP = 0.05
+"""[m]; feet that hit the ground reach 0.02, a fall 0.03."""
 
 
 def _actions(run: History) -> list[Array]:
@@ -92,6 +94,14 @@ def _fast(name: str, unit: str, rows: Array, control_dt: float | None) -> list[t
         return []
     kind = "m/s" if unit == "m" else unit
     return [(float(speeds.max() / limit), f"{name} moves at up to {speeds.max():,.0f} {kind} in a recorded episode")]
+
+
+def bodies_overlap(run: History) -> str | None:
+    """Bodies are far inside each other in half of the episodes that the last evaluations measured."""
+    depths = run.evaluation_curve("overlap").values[-2:]
+    if not len(depths) or (depth := float(depths.min())) < _MOST_OVERLAP:
+        return None
+    return f"bodies overlap by {100 * depth:.0f} cm or more in half of the episodes of the last evaluations"
 
 
 def badly_scaled_observations(run: History) -> str | None:

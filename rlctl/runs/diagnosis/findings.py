@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from rlctl.run.directory import RunDirectory
-from rlctl.runs.diagnosis import episode_signs, record_signs, signs
+from rlctl.runs.diagnosis import episode_signs, record_signs, signs, update_signs
 from rlctl.runs.diagnosis.history import History
 
 _NOT = "not "
@@ -71,7 +71,7 @@ def list_signs() -> dict[str, signs.Sign]:
     """Return the function of every sign that `findings.yaml` may name."""
     return {
         name: function
-        for module in (signs, episode_signs, record_signs)
+        for module in (signs, update_signs, episode_signs, record_signs)
         for name, function in inspect.getmembers(module, inspect.isfunction)
         if function.__module__ == module.__name__ and not name.startswith("_")
     }

@@ -23,6 +23,10 @@ from rlctl.runs.summary import read_table
 Array = NDArray[np.float64]
 Rows = list[dict[str, float | None]]
 
+LEAST_ROWS = 10
+"""Of `metrics.csv`; of a shorter training most signs say nothing."""
+_GOOD = 0.8
+"""From this success rate on a training has done what was wanted, whatever its records look like."""
 EPISODES = 4
 """Recorded episodes that are looked at: of the last two evaluations, as each keeps its first and its worst."""
 
@@ -96,6 +100,16 @@ class History:
     def evaluation_curve(self, name: str) -> Curve:
         """Return a column of `evals.csv`."""
         return _curve(self.evaluations, name)
+
+    @property
+    def successes(self) -> tuple[Curve, Curve]:
+        """The success rates of evaluations, and of training."""
+        return self.evaluation_curve("success"), self.curve("success")
+
+    @property
+    def is_good(self) -> bool:
+        """Whether nearly all episodes succeeded once."""
+        return any(len(each) and each.values.max() >= _GOOD for each in self.successes)
 
     @functools.cached_property
     def progress(self) -> float:

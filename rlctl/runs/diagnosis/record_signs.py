@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlctl.runs.diagnosis.history import Curve, History
-
-_LEAST_ROWS = 10
+from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
 
 
 def learner_slow(run: History) -> str | None:
     """Most of the time goes into updates."""
     playing, fps = run.curve("playing"), run.curve("fps")
-    if len(playing) < _LEAST_ROWS or (share := float(np.median(playing.values))) > 0.25:
+    if len(playing) < LEAST_ROWS or (share := float(np.median(playing.values))) > 0.25:
         return None
     return (
         f"the environments are waited for {share:.0%} of the time, updates take the rest; {_median(fps):,.0f} steps/s"
@@ -22,7 +20,7 @@ def learner_slow(run: History) -> str | None:
 def environments_slow(run: History) -> str | None:
     """Most of the time goes into slow environments, with the policy that acts in them."""
     playing, fps = run.curve("playing"), run.curve("fps")
-    if len(playing) < _LEAST_ROWS or (share := float(np.median(playing.values))) < 0.8 or _median(fps) > 300:
+    if len(playing) < LEAST_ROWS or (share := float(np.median(playing.values))) < 0.8 or _median(fps) > 300:
         return None
     return f"the environments are waited for {share:.0%} of the time; {_median(fps):,.0f} steps/s"
 

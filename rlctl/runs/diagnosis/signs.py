@@ -1,4 +1,4 @@
-"""Signs in the tables of a run. Each function returns its evidence in numbers, or None where the sign is not there."""
+"""Signs in returns, lengths and successes. Each function returns its evidence, or None where the sign is not there."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rlctl.runs.diagnosis.history import Curve, History
+from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
 
 Sign = Callable[[History], str | None]
 
-_LEAST_ROWS = 10
 _LEAST_RETURNS = 6
 _LEAST_EVALUATIONS = 4
 _NEVER = 0.02  # success rate
-_GOOD = 0.8
 
 
 def flat(run: History) -> str | None:
@@ -32,7 +30,7 @@ def flat(run: History) -> str | None:
         if _rank_correlation(evaluations) > 0.5 or _rises(run.evaluation_curve("success")):
             return None
         parts.append(f"evaluations from {evaluations.values[0]:.4g} to {evaluations.values[-1]:.4g}")
-    if not parts or len(run.metrics) < _LEAST_ROWS or _is_good(run):
+    if not parts or len(run.metrics) < LEAST_ROWS or run.is_good:
         return None
     return "; ".join(parts)
 
@@ -48,17 +46,9 @@ def _rises(success: Curve) -> bool:
     return len(success) > 1 and float(success.values[1:].max() - success.values[0]) > 0.1
 
 
-def _is_good(run: History) -> bool:
-    return any(len(each) and each.values.max() >= _GOOD for each in _successes(run))
-
-
-def _successes(run: History) -> tuple[Curve, Curve]:
-    return run.evaluation_curve("success"), run.curve("success")
-
-
 def never_succeeds(run: History) -> str | None:
     """Success is reported, and there is hardly any."""
-    found = [each for each in _successes(run) if len(each)]
+    found = [each for each in run.successes if len(each)]
     if not found or run.progress < 0.5 or (best := max(float(each.values.max()) for each in found)) > _NEVER:
         return None
     return f"success at most {best:.1%}"
@@ -77,51 +67,9 @@ def short_episodes(run: History) -> str | None:
     return f"episodes last {last:.0f} steps of {longest:.0f}, {first:.0f} in the first third"
 
 
-def critic_blind(run: History) -> str | None:
-    """The value function explains nothing of the returns."""
-    explained = run.curve("explained_variance")
-    if len(explained) < _LEAST_ROWS:
-        return None
-    median = float(np.median(explained.values[len(explained) // 2 :]))
-    return f"explained variance {median:.2f} (median of the second half)" if median < 0.1 else None
-
-
-def policy_hardly_changes(run: History) -> str | None:
-    """Updates change nothing, before a schedule has lowered the learning rate."""
-    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
-    if len(kl) < _LEAST_ROWS or np.median(kl.values) > 1e-4 or np.median(clipped.values) > 1e-3:
-        return None
-    return f"approx_kl {np.median(kl.values):.1e}, clip fraction {np.median(clipped.values):.1%} (medians)"
-
-
-def _early(curve: Curve) -> Curve:
-    """Return the first two thirds, in which schedules still have an effect."""
-    count = (2 * len(curve) + 2) // 3
-    return Curve(curve.steps[:count], curve.values[:count])
-
-
-def policy_jumps(run: History) -> str | None:
-    """Updates change the policy several times as much as PPO is made for."""
-    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
-    if len(kl) < _LEAST_ROWS or not len(clipped):
-        return None
-    median_kl, median_clipped = float(np.median(kl.values)), float(np.median(clipped.values))
-    if median_kl < 0.2 and median_clipped < 0.55:
-        return None
-    return f"approx_kl {median_kl:.2g}, clip fraction {median_clipped:.0%} (medians)"
-
-
-def policy_is_replaced(run: History) -> str | None:
-    """Each update makes another policy of it, and none of them is good."""
-    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
-    if len(kl) < _LEAST_ROWS or _is_good(run) or np.median(kl.values) < 1 or np.median(clipped.values) < 0.7:
-        return None
-    return f"approx_kl {np.median(kl.values):.2g}, clip fraction {np.median(clipped.values):.0%} (medians)"
-
-
 def swings(run: History) -> str | None:
     """The return falls again and again by a large part of its range."""
-    curve = run.curve("return") if len(run.curve("return")) >= _LEAST_ROWS else run.evaluation_curve("return")
+    curve = run.curve("return") if len(run.curve("return")) >= LEAST_ROWS else run.evaluation_curve("return")
     if len(curve) < _LEAST_RETURNS:
         return None
     spread = float(np.ptp(curve.values))
@@ -148,7 +96,7 @@ def collapsed(run: History) -> str | None:
     """The return rose and has fallen for good, in training and in evaluations."""
     parts = []
     for curve, what, least in (
-        (run.curve("return"), "training return", _LEAST_ROWS),
+        (run.curve("return"), "training return", LEAST_ROWS),
         (run.evaluation_curve("return"), "evaluations", _LEAST_EVALUATIONS),
     ):
         if len(curve):
@@ -160,12 +108,12 @@ def collapsed(run: History) -> str | None:
 
 def _find_fall(curve: Curve) -> tuple[float, float, float, float] | None:
     """Return start, peak, end and step of the peak, of a curve that lost more than half of what it had gained."""
-    window = max(2, len(curve) // 8) if len(curve) >= _LEAST_ROWS else 1
+    window = max(2, len(curve) // 8) if len(curve) >= LEAST_ROWS else 1
     smooth = np.convolve(curve.values, np.ones(window) / window, "valid")
     at = int(smooth.argmax())
-    end = float(curve.values[-max(2, window) :].max() if len(curve) < _LEAST_ROWS else curve.values[-window:].mean())
+    end = float(curve.values[-max(2, window) :].max() if len(curve) < LEAST_ROWS else curve.values[-window:].mean())
     gained, lost = float(smooth[at] - smooth[0]), float(smooth[at]) - end
-    noise = curve.noise() / window**0.5 if len(curve) >= _LEAST_ROWS else 0.0
+    noise = curve.noise() / window**0.5 if len(curve) >= LEAST_ROWS else 0.0
     if (
         gained <= max(3 * noise, 0.1 * float(np.abs(curve.values).max()))
         or lost <= max(0.5 * gained, 3 * noise)
@@ -189,48 +137,6 @@ def early_peak(run: History) -> str | None:
         f"the best evaluation, {curve.values[best]:.4g}, was at step {curve.steps[best]:,.0f} of "
         f"{curve.steps[-1]:,.0f}; the last is {curve.values[-1]:.4g}"
     )
-
-
-def exploration_gone(run: History) -> str | None:
-    """The policy has become all but deterministic with half of the training to go, or was so from the beginning."""
-    curve = _exploration(run)
-    if len(curve) < _LEAST_ROWS:
-        return None
-    half = curve.values[max(0, len(curve) // 2 - 2) : len(curve) // 2 + 1].mean()
-    if half > 0.1 * curve.values[0] and not (curve.values[0] < 0.02 and half < 0.02):
-        return None
-    return f"exploration {curve.values[0]:.2g} at first, {half:.2g} half-way (1 is the half range of an action)"
-
-
-def _exploration(run: History) -> Curve:
-    measured = run.curve("exploration")
-    return measured if len(measured) else run.curve("std")
-
-
-def exploration_does_not_fall(run: History) -> str | None:
-    """The policy is as random at the end as at the beginning, or more so."""
-    curve = _exploration(run)
-    if len(curve) < _LEAST_ROWS or run.progress < 0.5:
-        return None
-    first, last = curve.thirds()
-    return f"exploration {first:.2g} in the first third, {last:.2g} in the last" if last >= 0.97 * first else None
-
-
-def exploration_explodes(run: History) -> str | None:
-    """The policy becomes far more random than the actions' range."""
-    curve = _exploration(run)
-    if len(curve) < _LEAST_ROWS:
-        return None
-    first, last = curve.thirds()
-    return f"exploration grows from {first:.2g} to {last:.2g} half ranges" if last > max(2 * first, 2.0) else None
-
-
-def saturated(run: History) -> str | None:
-    """Nearly all actions are at a limit, in the training and where the best of them is taken."""
-    curve = run.curve("action_saturation")
-    if len(curve) < _LEAST_ROWS or (last := curve.thirds()[1]) < 0.8:
-        return None
-    return f"{last:.0%} of the actions are at a limit in the last third"
 
 
 def penalties_dominate(run: History) -> str | None:

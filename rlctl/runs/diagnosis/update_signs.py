@@ -1,0 +1,118 @@
+"""Signs in what SB3 logs of updates, and in what is measured after them. Functions as in `signs`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
+
+_MOST_NORMALIZED_REWARD = 10.0
+"""Where SB3's `VecNormalize` clips."""
+
+
+def critic_blind(run: History) -> str | None:
+    """The value function explains nothing of the returns."""
+    explained = run.curve("explained_variance")
+    if len(explained) < LEAST_ROWS:
+        return None
+    median = float(np.median(explained.values[len(explained) // 2 :]))
+    return f"explained variance {median:.2f} (median of the second half)" if median < 0.1 else None
+
+
+def values_explode(run: History) -> str | None:
+    """The critic expects several times as much as rewards can add up to."""
+    value, gamma = run.curve("value"), run.setting("gamma")
+    if len(value) < LEAST_ROWS or not run.episodes or not isinstance(gamma, float) or gamma >= 1:
+        return None
+    settings = run.recipe.get("normalize")
+    normalized = isinstance(settings, dict) and settings.get("reward", True)
+    largest = _MOST_NORMALIZED_REWARD if normalized else max(float(np.abs(each.rewards).max()) for each in run.episodes)
+    most = max(largest / (1 - gamma), float(np.abs(run.curve("return").values).max(initial=0.0)))
+    last = value.thirds()[1]
+    if abs(last) < 3 * most:
+        return None
+    return f"the critic expects {last:.3g} in the last third; rewards add up to {most:.3g} at most"
+
+
+def gradients_grow(run: History) -> str | None:
+    """Gradients become far larger than they were."""
+    norm = run.curve("gradient_norm")
+    if len(norm) < LEAST_ROWS:
+        return None
+    first, last = norm.thirds()
+    return f"the gradient's norm grows from {first:.2g} to {last:.2g}" if last > 30 * first > 0 else None
+
+
+def policy_hardly_changes(run: History) -> str | None:
+    """Updates change nothing, before a schedule has lowered the learning rate."""
+    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
+    if len(kl) < LEAST_ROWS or np.median(kl.values) > 1e-4 or np.median(clipped.values) > 1e-3:
+        return None
+    return f"approx_kl {np.median(kl.values):.1e}, clip fraction {np.median(clipped.values):.1%} (medians)"
+
+
+def _early(curve: Curve) -> Curve:
+    """Return the first two thirds, in which schedules still have an effect."""
+    count = (2 * len(curve) + 2) // 3
+    return Curve(curve.steps[:count], curve.values[:count])
+
+
+def policy_jumps(run: History) -> str | None:
+    """Updates change the policy several times as much as PPO is made for."""
+    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
+    if len(kl) < LEAST_ROWS or not len(clipped):
+        return None
+    median_kl, median_clipped = float(np.median(kl.values)), float(np.median(clipped.values))
+    if median_kl < 0.2 and median_clipped < 0.55:
+        return None
+    return f"approx_kl {median_kl:.2g}, clip fraction {median_clipped:.0%} (medians)"
+
+
+def policy_is_replaced(run: History) -> str | None:
+    """Each update makes another policy of it, and none of them is good."""
+    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
+    if len(kl) < LEAST_ROWS or run.is_good or np.median(kl.values) < 1 or np.median(clipped.values) < 0.7:
+        return None
+    return f"approx_kl {np.median(kl.values):.2g}, clip fraction {np.median(clipped.values):.0%} (medians)"
+
+
+def exploration_gone(run: History) -> str | None:
+    """The policy has become all but deterministic with half of the training to go, or was so from the beginning."""
+    curve = _exploration(run)
+    if len(curve) < LEAST_ROWS:
+        return None
+    half = curve.values[max(0, len(curve) // 2 - 2) : len(curve) // 2 + 1].mean()
+    if half > 0.1 * curve.values[0] and not (curve.values[0] < 0.02 and half < 0.02):
+        return None
+    return f"exploration {curve.values[0]:.2g} at first, {half:.2g} half-way (1 is the half range of an action)"
+
+
+def _exploration(run: History) -> Curve:
+    measured = run.curve("exploration")
+    return measured if len(measured) else run.curve("std")
+
+
+def exploration_does_not_fall(run: History) -> str | None:
+    """The policy is as random at the end as at the beginning, or more so."""
+    curve = _exploration(run)
+    if len(curve) < LEAST_ROWS or run.progress < 0.5:
+        return None
+    first, last = curve.thirds()
+    return f"exploration {first:.2g} in the first third, {last:.2g} in the last" if last >= 0.97 * first else None
+
+
+def exploration_explodes(run: History) -> str | None:
+    """The policy becomes far more random than the actions' range."""
+    curve = _exploration(run)
+    if len(curve) < LEAST_ROWS:
+        return None
+    first, last = curve.thirds()
+    return f"exploration grows from {first:.2g} to {last:.2g} half ranges" if last > max(2 * first, 2.0) else None
+
+
+def saturated(run: History) -> str | None:
+    """Nearly all actions are at a limit, in the training and where the best of them is taken."""
+    curve = run.curve("action_saturation")
+    if len(curve) < LEAST_ROWS or (last := curve.thirds()[1]) < 0.8:
+        return None
+    return f"{last:.0%} of the actions are at a limit in the last third"
