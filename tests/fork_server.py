@@ -36,7 +36,7 @@ FOR_WORKERS = (
     *("gymnasium.envs.registration", "gymnasium.utils.env_checker"),
 )
 FOR_COMMANDS = (
-    *("torch._dynamo", "torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
+    *("torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
     *("rlctl.eval.evaluate", "rlctl.run.torch_policy", "typer.rich_utils", "yaml"),
 )
 """What is imported when it is needed; one that is missing here costs time only."""

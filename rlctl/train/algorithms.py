@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -40,6 +41,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     check_spaces(recipe.algo, env.observation_space, env.action_space)
     _check_rollout(recipe, env.num_envs)
     footprint.check(recipe, env.observation_space, env.action_space, env.num_envs)
+    _keep_compiler_out()
     try:
         model: BaseAlgorithm = cls(
             name,
@@ -53,6 +55,17 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         return model
     except (AssertionError, ValueError, TypeError, RuntimeError) as error:
         raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error), 300)}") from error
+
+
+def _keep_compiler_out() -> None:
+    """Take torch's marks for its compiler off the optimisers: nothing is compiled here, and to honour them imports it.
+
+    That takes 1.6 s, more than torch itself.
+    """
+    for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
+        setattr(torch.optim.Optimizer, name, inspect.unwrap(getattr(torch.optim.Optimizer, name)))
+    for optimizer in (torch.optim.Adam, torch.optim.RMSprop):
+        setattr(optimizer, "step", torch.no_grad()(inspect.unwrap(optimizer.step)))  # noqa: B010
 
 
 def _use_fused_adam(model: BaseAlgorithm) -> None:

@@ -1,6 +1,7 @@
 import csv
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from rlctl.run.episode import load_episode
 from rlctl.run.policy import load_policy, read_policy
 from rlctl.train import checkpoint
 from rlctl.train.request import TrainRequest, TrainResult, run_training
+from tests import fork_server
 from tests.train.conftest import ENVS, SMALL, SMALL_PPO
 
 
@@ -270,3 +272,22 @@ def test_live_policy_and_saved_policy_act_the_same(finished):
 def test_a_device_that_is_not_there(train, small_ppo, device, message):
     with pytest.raises(UsageError, match=message):
         train("Line", small_ppo, device=device)
+
+
+@pytest.mark.parametrize(
+    "algo", ["ppo", pytest.param("sac", marks=pytest.mark.slow), pytest.param("a2c", marks=pytest.mark.slow)]
+)
+def test_torch_compiler_is_not_imported(algo, tmp_path):
+    # It takes longer than the rest of the start.
+    code = """
+import sys
+from rlctl.cli import app
+try:
+    app()
+finally:
+    assert "torch._dynamo" not in sys.modules
+"""
+    command = [sys.executable, "-c", code, "train", f"{ENVS}:Line", "--no-check", "-o", str(tmp_path)]
+    command += ["--algo", algo, "-n", "200", "--set", "n_envs=2", "--set", "eval.episodes=1"]
+    done = fork_server.for_commands().run(command, timeout=120)
+    assert done.returncode == 0, done.stderr
