@@ -7,7 +7,9 @@ policies' scores, over 100 episodes that their training has not seen, and the sp
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
+import re
 import statistics
 import subprocess
 import sys
@@ -23,9 +25,10 @@ from rlctl.run.directory import GROUP_FILE
 from rlctl.run.group import Group, parse_seeds, read_group
 
 BEGIN, END = "<!-- scores: make train-all -->\n", "<!-- end of scores -->\n"
+_SEED = re.compile(r"_s(\d+)(_\d+)?$")  # of a run folder's name
 HEAD = """\
-| task | algorithm | steps | minutes | success | return | action change | ended early |
-|---|---|---|---|---|---|---|---|
+| task | algorithm | seeds | steps | minutes | success | return | action change | ended early |
+|---|---|---|---|---|---|---|---|---|
 """
 
 
@@ -41,6 +44,15 @@ def find_group(task: str, seeds: Sequence[int], root: Path) -> Group | None:
         return read_group(groups[-1].parent)
     alone = Group(root / registry.make_slug(task), task, list(seeds), [])
     return alone if all(alone.is_done(seed) for seed in seeds) else None
+
+
+def find_finished(task: str, root: Path) -> Group | None:
+    """Return the finished runs of a task outside of groups, a run per seed; None if there are none."""
+    folder = root / registry.make_slug(task)
+    seeds = {int(match[1]) for file in folder.glob("*/run.json") if (match := _SEED.search(file.parent.name))}
+    alone = Group(folder, task, [], [])
+    finished = sorted(seed for seed in seeds if alone.is_done(seed))
+    return dataclasses.replace(alone, seeds=finished) if finished else None
 
 
 def train(task: str, seeds: str, root: Path) -> int:
@@ -67,13 +79,14 @@ def format_row(scores: dict[str, Any]) -> str:
     """Return a task's row of the table; one of a task without a score says why."""
     known = [each for each in scores["seeds"] if each["score"] is not None]
     if not known:
-        return f"| `{scores['task']}` | | | | {scores['seeds'][0]['problem']} | | | |\n"
+        return f"| `{scores['task']}` | | | | | {scores['seeds'][0]['problem']} | | | |\n"
     measured = [each["score"] for each in known]
     success, returns = ([each[key] for each in measured] for key in ("success", "mean_return"))
     early = [each["ended_early"] for each in measured if each["ended_early"] is not None]
     cells = [
         f"`{scores['task']}`",
         known[0]["algo"],
+        ", ".join(str(each["seed"]) for each in known),
         _format([each["steps"] for each in known if each["steps"] is not None], ",.0f"),
         _format([each["seconds"] / 60 for each in known if each["seconds"] is not None], ".1f"),
         "" if None in success else _format([100 * each for each in success], ".1f", " %", spread=True),
@@ -96,9 +109,7 @@ def _format(values: list[float], form: str, unit: str = "", *, spread: bool = Fa
 def format_table(scores: Sequence[dict[str, Any]]) -> str:
     """Return the table of some tasks, with what its numbers are."""
     first = next((each["score"] for one in scores for each in one["seeds"] if each["score"] is not None), None)
-    seeds = sorted({each["seed"] for one in scores for each in one["seeds"]})
-    numbers = ", ".join(map(str, seeds))
-    note = f"Means over the training seeds {numbers}, ± the standard deviation between them"
+    note = "Means over the training seeds, ± the standard deviation between them"
     if first is not None:
         note += f"; {first['episodes']} episodes each, which no training has seen"
     return HEAD + "".join(map(format_row, scores)) + f"\n{note}.\n"
@@ -129,7 +140,7 @@ def main() -> int:
             if code in (129, 130, 143):
                 return code
             worst = max(worst, code)
-        group = find_group(task, parse_seeds(options.seeds), options.root)
+        group = find_group(task, parse_seeds(options.seeds), options.root) or find_finished(task, options.root)
         entry = registry.find(task)
         if group is not None and entry is not None and entry.module_file is not None:
             by_readme.setdefault(entry.module_file.with_name("README.md"), []).append(read_scores(group))
