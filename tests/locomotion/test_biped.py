@@ -113,6 +113,20 @@ def test_the_rail_keeps_a_plane():
     env.close()
 
 
+@pytest.mark.parametrize(("support", "stays_up"), [(0.0, False), (50.0, True)])
+def test_a_support_holds_the_free_biped(support, stays_up):
+    env = TaskEnv(Biped3D(support=support))
+    env.reset(seed=0)
+    terminated, step = False, 0
+    while not terminated and step < 100:
+        if step < 5:
+            env.task.body.apply_torque((20.0, 0.0, 0.0))  # [N m], for 0.1 s: feet 0.3 m wide give 10
+        terminated = env.step(STAND)[2]
+        step += 1
+    assert terminated is not stays_up
+    env.close()
+
+
 def rows(env, seed, steps=150):
     observations = [env.reset(seed=seed)[0]]
     rng = np.random.default_rng(seed)
@@ -181,6 +195,11 @@ def test_mistakes(parameters, message):
     with pytest.raises(TaskError) as caught:
         TaskEnv(Biped(**parameters))
     assert str(caught.value) == message
+
+
+def test_a_support_that_pushes():
+    with pytest.raises(TaskError, match=r"^support: -1 N m/rad would turn the robot over\. Give 0 or more\.$"):
+        TaskEnv(Biped3D(support=-1.0))
 
 
 def test_nothing_is_wrong_with_the_models(env):
