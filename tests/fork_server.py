@@ -33,7 +33,7 @@ from rlctl.rollout.process_start import set_default_start
 ROOT = Path(__file__).parents[1]
 FOR_WORKERS = (
     *("rlctl.rollout.worker_process", "rlctl.task.env", "rlctl.run.env_info", "rlctl.check_env.child"),
-    *("gymnasium.envs.registration", "gymnasium.utils.env_checker"),
+    "gymnasium.envs.registration",
 )
 FOR_COMMANDS = (
     *("torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),

@@ -45,7 +45,6 @@ NOT_AMONG_VERBS = {("export", "check_env"), ("replay", "check_env"), ("replay", 
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 MAY_IMPORT_TORCH = {  # besides train/
     "rlctl/run/torch_policy.py",
-    "rlctl/check_env/families/library_checkers.py",  # SB3's own checker, which is a finding's source
     "rlctl/eval/evaluate.py",  # seeds torch's generator where torch is there already
 }
 

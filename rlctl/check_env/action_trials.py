@@ -77,10 +77,9 @@ def find_dimensions(leaves: list[Leaf]) -> list[Dimension]:
 class Trials:
     """Plays episodes of one instance, each with a seed and with changed actions; equal ones are played once."""
 
-    def __init__(self, context: Context, instance: Instance, kind: str = "random") -> None:
+    def __init__(self, context: Context, instance: Instance) -> None:
         self.instance = instance
         self.deadline = context.budget.deadline
-        self.kind = kind
         self._plain: dict[tuple[int, int], list[Frame]] = {}
 
     def require_repeatable(self) -> None:
@@ -100,7 +99,7 @@ class Trials:
 
     def actions(self, seed: int, steps: int) -> list[Any]:
         """Return the actions of an episode before they are changed."""
-        chosen = actions(self.instance.env.action_space, self.kind, seed)
+        chosen = actions(self.instance.env.action_space, "random", seed)
         return self.instance.call("sample", lambda: list(itertools.islice(chosen, steps)))  # type: ignore[no-any-return]
 
     def plain(self, seed: int, steps: int) -> list[Frame]:

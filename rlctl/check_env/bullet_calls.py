@@ -9,7 +9,7 @@ import linecache
 import re
 import sys
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
@@ -85,15 +85,19 @@ def _read_arguments(frame: FrameType) -> str:
     return "".join(lines).partition("(")[2]
 
 
-class _RecordedFunction:
-    """A function of PyBullet whose calls are recorded."""
-
-    def __init__(self, name: str, function: Any, calls: BulletCalls) -> None:
-        self._name, self._function, self._calls = name, function, calls
+class _Replacement:
+    """Something in the place of a function of PyBullet."""
 
     @property  # type: ignore[misc]
     def __class__(self) -> type:  # BulletClient adds the client to builtins only
         return types.BuiltinFunctionType
+
+
+class _RecordedFunction(_Replacement):
+    """A function of PyBullet whose calls are recorded."""
+
+    def __init__(self, name: str, function: Any, calls: BulletCalls) -> None:
+        self._name, self._function, self._calls = name, function, calls
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         self._calls.note_call(self._name, sys._getframe(1), arguments, keywords)
@@ -104,19 +108,40 @@ class _RecordedFunction:
 
 
 @contextlib.contextmanager
-def record_calls() -> Iterator[BulletCalls]:
-    """Record the calls of PyBullet, which is loaded, inside the `with` block."""
-    pybullet = sys.modules["pybullet"]
-    functions = {
-        name: function
-        for name, function in vars(pybullet).items()
-        if inspect.isbuiltin(function) and not NO_CLIENT.fullmatch(name)
-    }
-    calls = BulletCalls()
+def _replace_functions(replace: Callable[[str, Any], Any]) -> Iterator[None]:
+    """Replace each function of PyBullet, if it is loaded, inside the `with` block."""
+    pybullet = sys.modules.get("pybullet")
+    functions = {name: each for name, each in vars(pybullet).items() if inspect.isbuiltin(each)} if pybullet else {}
     for name, function in functions.items():
-        setattr(pybullet, name, _RecordedFunction(name, function, calls))
+        setattr(pybullet, name, replace(name, function))
     try:
-        yield calls
+        yield
     finally:
         for name, function in functions.items():
             setattr(pybullet, name, function)
+
+
+@contextlib.contextmanager
+def record_calls() -> Iterator[BulletCalls]:
+    """Record the calls of PyBullet inside the `with` block."""
+    calls = BulletCalls()
+
+    def replace(name: str, function: Any) -> Any:
+        return function if NO_CLIENT.fullmatch(name) else _RecordedFunction(name, function, calls)
+
+    with _replace_functions(replace):
+        yield calls
+
+
+def visible_to_profilers() -> contextlib.AbstractContextManager[None]:
+    """Let Python's profiler see functions of PyBullet inside the `with` block also where a `functools.partial` calls
+    them, as BulletClient does. Each has a code object of this file, of its own and with its name."""
+
+    def replace(name: str, function: Any) -> Any:
+        def call(self: Any, *arguments: Any, **keywords: Any) -> Any:
+            return function(*arguments, **keywords)
+
+        call.__code__ = call.__code__.replace(co_name=name, co_qualname=name)
+        return type(name, (_Replacement,), {"__call__": call})()
+
+    return _replace_functions(replace)

@@ -39,8 +39,7 @@ class Moment:
 class Episode:
     """One episode. Iterating over it resets, and steps until it ends or must end; each call is a `Moment`.
 
-    Where the environment raises, iterating raises `EnvironmentRaised`. `reset` and `step` may be called directly too:
-    also after the end, for whoever wants to see what comes then.
+    Where the environment raises, iterating raises `EnvironmentRaised`. `reset` and `step` may be called directly too.
     """
 
     def __init__(
@@ -78,14 +77,12 @@ class Episode:
         while not self.ended:
             yield self.step()
 
-    def reset(self, *, then_unseeded: bool = False) -> Moment:
-        """Begin the episode; `then_unseeded` resets once more, without a seed."""
+    def reset(self) -> Moment:
+        """Begin the episode."""
         self.steps, self.ended = 0, "" if self.max_steps else "steps"
         self._next = self._choose_actions()
         try:
             returned = self.instance.reset(self.seed, self.number, timer=self._timer)
-            if then_unseeded:
-                returned = self.instance.call("reset", self.instance.env.reset)
         except EnvironmentRaised:
             self.ended = "raised"
             raise

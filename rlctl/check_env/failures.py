@@ -6,6 +6,7 @@ import difflib
 import inspect
 import itertools
 import linecache
+import os
 import re
 import sys
 import traceback
@@ -27,8 +28,8 @@ NO_DISPLAY = re.compile(
 )
 """What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
-_MOST_FILES = 5_000
-"""Files that are looked through for a similar name."""
+_MOST_FOLDERS = 2_000
+"""Folders that are looked through for a similar name."""
 
 
 class EnvironmentRaised(Exception):
@@ -118,7 +119,10 @@ def _similar(wanted: Path, searched: list[Path]) -> str | None:
     """Return a file of nearly the same name in the folders that were searched, or in the one that was named."""
     folders = searched or [next((parent for parent in wanted.parents if parent.is_dir()), Path("/nowhere"))]
     for folder in folders:
-        paths = {path.name: path for path in itertools.islice(folder.rglob(f"*{wanted.suffix}"), _MOST_FILES)}
+        paths = {}
+        for parent, inner, files in itertools.islice(os.walk(folder), _MOST_FOLDERS):
+            inner[:] = [each for each in inner if not each.startswith(".") and each != "site-packages"]
+            paths.update({name: Path(parent, name) for name in files if name.endswith(wanted.suffix)})
         if close := difflib.get_close_matches(wanted.name, paths, n=1, cutoff=0.8):
             return str(paths[close[0]])
     return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,22 +40,13 @@ class Rule:
     meaning: str
     """What it means and why it matters."""
     fix: str
-    complaints: tuple[re.Pattern[str], ...]
-    """What the libraries' own checkers say about the same thing."""
-
-    def owns(self, complaint: str) -> bool:
-        """Say whether a complaint of a library's checker is about this."""
-        return any(pattern.search(complaint) for pattern in self.complaints)
 
 
 def _load() -> tuple[dict[str, str], dict[str, Rule]]:
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where PyYAML has it
     content = yaml.load(Path(__file__).with_name("rules.yaml").read_text(encoding="utf-8"), loader)  # noqa: S506
-    rules = {}
-    for text in content["rules"]:
-        patterns = tuple(re.compile(each, re.IGNORECASE) for each in text.pop("complaints", ()))
-        rules[text["id"]] = Rule(**{**text, "severity": Severity(text["severity"])}, complaints=patterns)
-    return content["families"], rules
+    rules = [Rule(**{**text, "severity": Severity(text["severity"])}) for text in content["rules"]]
+    return content["families"], {rule.id: rule for rule in rules}
 
 
 FAMILIES, RULES = _load()

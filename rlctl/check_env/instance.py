@@ -57,7 +57,7 @@ class Instance:
             raise TaskError(f"observation_space raises {describe(error)}") from error
         self.env = env
         self.action_leaves = find_leaves(getattr(env, "action_space", None))
-        self.accepts_seed = _accepts_seed(env)
+        self.accepts_seed, self.accepts_options = (_accepts(env, name) for name in ("seed", "options"))
         self.progress = progress
 
     @property
@@ -102,19 +102,15 @@ class Context:
     def __init__(self, spec: env_spec.EnvSpec, progress: Progress | None = None) -> None:
         self.spec = spec
         self.progress = progress or Progress()
-        self.stage = "import"
-        """How far the last attempt to build an instance came: `import` or `constructor`."""
         self.budget = Budget(read_clock())
         """What the experiment that is running may use."""
         self._instance: Instance | None = None
 
     def make(self, render_mode: RenderMode | None = None) -> Any:
         """Return a new environment; whatever the environment raises is an `RlctlError`."""
-        self.stage = "import"
         # Loaded before it is built, to distinguish an import error from a constructor's.
         self.progress.enter("load")
         registry.load(self.spec.task)
-        self.stage = "constructor"
         self.progress.enter("build")
         env = self.spec.make(render_mode)
         self.progress.leave()
@@ -166,9 +162,10 @@ class Context:
             yield describe_failure(error, self.progress)
 
 
-def _accepts_seed(env: Any) -> bool:
+def _accepts(env: Any, name: str) -> bool:
+    """Say whether reset has a parameter of that name."""
     try:
         parameters = inspect.signature(env.reset).parameters.values()
     except ValueError:  # not written in Python
         return True
-    return any(each.name == "seed" or each.kind is each.VAR_KEYWORD for each in parameters)
+    return any(each.name == name or each.kind is each.VAR_KEYWORD for each in parameters)

@@ -1,48 +1,21 @@
-"""From records to a verdict: every rule's check is applied, and the libraries' complaints are added."""
+"""From records to a verdict: what the experiments have found, and what the checks find in the records."""
 
 from __future__ import annotations
 
 import dataclasses
-import re
 import traceback
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping
 
 from rlctl.check_env import families
 from rlctl.check_env.experiment import Experiment
 from rlctl.check_env.finding import RULES, Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.leaves import name_leaf
-from rlctl.check_env.messages import GYMNASIUM, SB3, Complaint, Failure
+from rlctl.check_env.messages import Failure
 from rlctl.check_env.records import Records
 from rlctl.errors import UsageError, did_you_mean
 
 LOADING = ("RL0", "RL216")
 """What is judged even where no instance could be built: loading, and windows that end it."""
-NOISE = tuple(
-    re.compile(pattern)
-    for pattern in (
-        # Positions and velocities have no natural bound; every bundled task would have this finding.
-        r"Box observation space (minimum|maximum) value is -?infinity",
-        # Wrappers are what the user trains on, so they are checked as they are.
-        r"is different from the unwrapped version",
-        r"Not able to test alternative render modes",
-        # RL108 judges this; measurements in rows and columns are no mistake.
-        r"unconventional shape",
-        # RL614 judges this with a tolerance: float rounding, which SB3's checker does not forgive, harms nobody.
-        r"The reward was not computed with `compute_reward",
-        r"computation of reward differs",
-        r"reward == env\.compute_reward",
-    )
-)
-"""Complaints that say nothing about an environment's quality."""
-EXPLAINED = (
-    (re.compile(r"support for the `seed` function is dropped"), {"RL202", "RL210", "RL301", "RL302", "RL308"}),
-    (re.compile(r"precision lowered by casting"), {"RL102", "RL103", "RL106"}),
-    (re.compile(r"Box observation space maximum and minimum values are equal"), {"RL103"}),
-)
-"""Complaints that no rule owns, and rules that name the cause of one where they have found something."""
-UNOWNED = {GYMNASIUM: "RL290", SB3: "RL291"}
-"""The rule that owns what no other rule does, per checker."""
-EXPERIMENTS = {GYMNASIUM: "gymnasium checker", SB3: "sb3 checker"}
 
 
 @dataclasses.dataclass
@@ -67,7 +40,6 @@ def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> Verdict:
     for rule in rules:
         _apply(rule, records, verdict)
     if records.built is not None:
-        verdict.findings += judge_complaints(records, rules, {finding.rule for finding in verdict.findings})
         _waive(verdict, records.built.waivers)
         for leaf in records.built.leaves:
             if not leaf.supported:
@@ -106,8 +78,6 @@ def _findings(rule: str, records: Records) -> list[Finding]:
         found += check.run(records)
     if experiment is not None and not found:
         _require_complete(records, experiment, rule)
-    if check is None and experiment is None:
-        require_checker(records, rule)
     return found
 
 
@@ -147,46 +117,3 @@ def _waive(verdict: Verdict, waivers: Mapping[str, str]) -> None:
             raise UsageError(f"rlctl_ignore: {rule} is waived without a reason. Say why this is meant.")
     verdict.waived = [each for each in verdict.findings if each.rule in waivers]
     verdict.findings = [each for each in verdict.findings if each.rule not in waivers]
-
-
-def require_checker(records: Records, rule: str) -> None:
-    """Raise `NotJudged` if no checker that could break a rule came to its end."""
-    experiments = [
-        EXPERIMENTS[name] for name, owner in UNOWNED.items() if rule not in UNOWNED.values() or rule == owner
-    ]
-    if not records.complete.intersection(experiments):
-        raise NotJudged(records.why_missing(experiments[0]))
-
-
-def judge_complaints(records: Records, rules: Collection[str], found: Collection[str]) -> Iterator[Finding]:
-    """Yield a finding per rule that owns complaints, of some `rules`; none where an owner has `found` it already."""
-    owned: dict[str, list[Complaint]] = {}
-    for complaint in records.complaints:
-        if any(pattern.search(complaint.text) for pattern in NOISE):
-            continue
-        owners = [rule.id for rule in RULES.values() if rule.owns(complaint.text)]
-        if any(owner in found for owner in owners):
-            continue
-        owner = owners[0] if owners else UNOWNED[complaint.checker]
-        if owner in rules:
-            owned.setdefault(owner, []).append(complaint)
-    for rule, complaints in owned.items():
-        if rule in UNOWNED.values():  # unrelated complaints of one checker
-            yield from (_finding(rule, [each]) for each in complaints if not _is_explained(each, {*found, *owned}))
-        else:
-            yield _finding(rule, complaints)
-
-
-def _is_explained(complaint: Complaint, found: set[str]) -> bool:
-    return any(pattern.search(complaint.text) and causes & found for pattern, causes in EXPLAINED)
-
-
-def _finding(rule: str, complaints: Sequence[Complaint]) -> Finding:
-    severity = RULES[rule].severity
-    refused = any(each.kind == "error" for each in complaints)
-    if rule in UNOWNED.values() and refused:
-        severity = Severity.ERROR
-    elif severity is Severity.ERROR and not refused:
-        severity = Severity.WARNING  # the library only warns, and the rule itself has found nothing
-    said_by = " and ".join(dict.fromkeys(each.checker for each in complaints))
-    return Finding(rule, complaints[0].text, {"said_by": said_by}, severity)

@@ -15,10 +15,6 @@ from rlctl.check_env.leaves import Leaf, name_element
 FIRST_SEED = 1000
 SECOND_SEED = 1001
 
-GYMNASIUM, SB3 = "Gymnasium", "Stable-Baselines3"
-RAISED = "the environment raised "
-"""How a complaint of a library's checker begins that is the environment's own exception."""
-
 MOST_INFOS = 100
 """So many numbers of info are recorded per episode, by name."""
 ENDS = ("terminated", "truncated", "both")
@@ -42,6 +38,7 @@ class Built:
     nondeterministic: bool = False
     """Whether its Gymnasium registration says that equal seeds may give unequal episodes."""
     accepts_seed: bool = True
+    accepts_options: bool = True
     uses_pybullet: bool = False
     """Whether a PyBullet client was connected once it was built."""
     waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -130,7 +127,7 @@ class Failure:
     kind: str
     """`raised`, `hung` or `died`."""
     call: str
-    """`load`, `build`, `reset`, `step`, `close`, `sample`, `check`, `render` or `compute_reward`."""
+    """`load`, `build`, `reset`, `step`, `close`, `sample`, `render` or `compute_reward`."""
     phase: str
     """The experiment, or the part of one."""
     episode: int
@@ -142,7 +139,7 @@ class Failure:
     file: Mapping[str, Any] | None = None
     """A file that was not found: its name, the folders that were searched, and a similar file."""
     process: str = ""
-    """Which child process: `probe`, `instances` or `checkers`."""
+    """Which child process: `probe` or `instances`."""
 
     @property
     def in_call(self) -> str:
@@ -156,17 +153,6 @@ class Failure:
         if self.details:
             place["traceback" if self.kind == "raised" else "last_output"] = self.details
         return place
-
-
-@dataclasses.dataclass(frozen=True)
-class Complaint:
-    """What a library's own checker said."""
-
-    checker: str
-    """`Gymnasium` or `Stable-Baselines3`."""
-    kind: str
-    """`error` (it refused the environment) or `warning`."""
-    text: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,4 +198,4 @@ class End:
     """The process has done all it was asked for."""
 
 
-Message = Built | Trajectory | Failure | Complaint | Finding | Fact | Skipped | Finished | Mistake | End
+Message = Built | Trajectory | Failure | Finding | Fact | Skipped | Finished | Mistake | End

@@ -9,7 +9,7 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-CALLS = ("", "load", "build", "reset", "step", "close", "sample", "check", "render", "compute_reward")
+CALLS = ("", "load", "build", "reset", "step", "close", "sample", "render", "compute_reward")
 _NUMBERS = 6
 _PHASE_BYTES = 64
 _SIZE = 8 * _NUMBERS + _PHASE_BYTES

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from rlctl.check_env.messages import MOST_INFOS, Failure, Form, Series, Trajecto
 
 
 class Recording:
-    """An episode that is written down while it is played. `reset`, then `step` while `running`; `run` does all."""
+    """An episode that is written down while it is played: `advance` while `running`, or `run`."""
 
     def __init__(self, role: str, episode: Episode, budget: Budget) -> None:
         """`role` is what it is recorded for; `budget` is charged with its memory."""
@@ -24,6 +23,7 @@ class Recording:
         self.episode = episode
         self.budget = budget
         self.failure: Failure | None = None
+        self._moments = iter(episode)
         self._ended = ""
         self._step = 0
         self._rewards: list[float] = []
@@ -37,22 +37,14 @@ class Recording:
 
     def run(self) -> list[Trajectory | Failure]:
         """Play the episode to its end; return what to send."""
-        self.reset()
         while self.running:
-            self.step()
+            self.advance()
         return self.messages()
 
-    def reset(self, *, then_unseeded: bool = False) -> None:
-        """Begin the episode; `then_unseeded` resets once more, without a seed."""
-        self._note(lambda: self.episode.reset(then_unseeded=then_unseeded))
-
-    def step(self) -> None:
-        """Take one step."""
-        self._note(self.episode.step)
-
-    def _note(self, call: Callable[[], Moment]) -> None:
+    def advance(self) -> None:
+        """Begin the episode, or take its next step."""
         try:
-            moment = call()
+            moment = next(self._moments)
         except EnvironmentRaised as error:
             self._ended = "raised"
             self.failure = describe_failure(error, self.episode.instance.progress)
@@ -63,7 +55,7 @@ class Recording:
 
     @property
     def running(self) -> bool:
-        """Whether there is another step to take."""
+        """Whether it has not begun, or there is another step to take."""
         return not self._ended
 
     @property

@@ -9,7 +9,6 @@ from typing import Any
 from rlctl.check_env.finding import Finding, NotJudged
 from rlctl.check_env.messages import (
     Built,
-    Complaint,
     Fact,
     Failure,
     Finished,
@@ -20,8 +19,8 @@ from rlctl.check_env.messages import (
     Trajectory,
 )
 
-OTHERS_MATTER = ("interleaved", "interleaved second", "after close", "after the end")
-"""Roles of episodes beside another instance, and of steps that no learner takes: rules of their own judge them."""
+OTHERS_MATTER = ("interleaved", "interleaved second", "after close")
+"""Roles of episodes beside another instance: rules of their own judge them."""
 
 
 @dataclasses.dataclass
@@ -34,7 +33,6 @@ class Records:
     failures: list[Failure] = dataclasses.field(default_factory=list)
     findings: list[Finding] = dataclasses.field(default_factory=list)
     """Those of the experiments."""
-    complaints: list[Complaint] = dataclasses.field(default_factory=list)
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
     """Experiments, roles and rules that were left out, and why."""
@@ -73,8 +71,6 @@ class Records:
                     self.complete.add(message.experiment)
                 if message.crash:
                     self.crashes[message.experiment] = message.crash
-            case Complaint():
-                self.complaints.append(message)
 
     def role(self, role: str) -> list[Trajectory]:
         """Return what was recorded for one purpose."""

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 
 from rlctl.check_env import families
 from rlctl.check_env.clock import read_clock_of
-from rlctl.check_env.messages import Built, End, Failure, Finished, Message, Mistake, Skipped
+from rlctl.check_env.messages import Built, End, Failure, Finished, Message, Mistake
 from rlctl.check_env.progress import Position, Progress
 from rlctl.check_env.wire import decode
 from rlctl.env_spec import EnvSpec
@@ -22,19 +21,12 @@ from rlctl.rollout.child_process import ChildProcess, LineReader
 from rlctl.rollout.shared_arrays import anonymous_file
 
 AT_ONCE = 2
-"""So many processes at once; the libraries' checkers wait for a place."""
-TOTAL_S = 26.0
-"""What is left of this is for the libraries' checkers, the last to start [s]."""
-LEAST_CHECKERS_S = 8.0
-"""They get this much in any case; Stable-Baselines3's may have to load torch [s]."""
 LEAST_REST_S = 4.0
 """A process that goes on for another one gets this much in any case [s]."""
 BUILD_TIMEOUT_S = 60.0
 """How long importing and building may take, unless a step may take longer."""
 FIRST_CALL_TIMEOUT_S = 30.0
 """How long the first reset and the first step of a process may take, where much is compiled or loaded [s]."""
-CHECKER_CALLS = 40
-"""A library's checker is one call to us; it makes at most so many calls into the environment."""
 IDLE_TIMEOUT_S = 300.0
 """How long a child may do nothing with the environment: loading libraries on a busy machine, at the worst."""
 _POLL_S = 0.1
@@ -103,11 +95,6 @@ class Child:
         return f"did not come back in {limit_s:g} s" if self._clock - self._changed[1] > limit_s else None
 
     @property
-    def is_over_time(self) -> bool:
-        """Whether it is a library's checker that takes too long: only such a one cannot be asked to stop."""
-        return self.name == "checkers" and self.seconds_left < 0
-
-    @property
     def seconds_left(self) -> float:
         """What is left of its budget [s]."""
         return self.ends_at - self._clock
@@ -148,8 +135,6 @@ def _limit_s(position: Position, env_timeout_s: float) -> float:
         return max(FIRST_CALL_TIMEOUT_S, env_timeout_s)
     if call in ("load", "build"):
         return max(BUILD_TIMEOUT_S, env_timeout_s)
-    if call == "check":
-        return CHECKER_CALLS * env_timeout_s
     return env_timeout_s if call else IDLE_TIMEOUT_S
 
 
@@ -163,7 +148,6 @@ class Supervisor:
         self._budget_s = budget_s
         self._env_timeout_s = env_timeout_s
         self._receive = receive
-        self._started = time.monotonic()
         self._waiting: dict[str, list[str]] = {}
         self._active: dict[Connection, Child] = {}
         self._has_built = False
@@ -195,8 +179,6 @@ class Supervisor:
         while self._waiting and len(self._active) < (AT_ONCE if self._has_built else 1):
             name = next(iter(self._waiting))
             seconds = self._seconds_left.get(name, self._budget_s)
-            if name == "checkers":
-                seconds = max(LEAST_CHECKERS_S, TOTAL_S - (time.monotonic() - self._started))
             child = Child(name, self._spec, self._waiting.pop(name), seconds)
             self.children.append(child)
             self._active[child.process.connection] = child
@@ -220,16 +202,8 @@ class Supervisor:
         self._receive(message)
 
     def _check(self, child: Child) -> None:
-        if child.is_over_time:
-            for name in child.experiments:
-                self._receive(Skipped(name, "the libraries' checkers took longer than the time there is for them"))
-            self._end(child)
-        elif why := child.hangs(self._env_timeout_s):
+        if why := child.hangs(self._env_timeout_s):
             self._end(child, child.fail("hung", why))
-            # The checkers would hang in the same call, for much longer.
-            self._waiting.pop("checkers", None)
-            for other in [each for each in self._active.values() if each.name == "checkers"]:
-                self._end(other)
 
     def _end(self, child: Child, failure: Failure | None = None, grace_s: float = 0.0) -> None:
         if failure is not None:
@@ -243,6 +217,6 @@ class Supervisor:
     def _start_again(self, child: Child) -> None:
         """Have a new process do what is left of one that died or hung, once, if the environment worked before."""
         rest = child.experiments[1:]
-        if rest and child.has_finished_one and child.name not in (*self._seconds_left, "checkers"):
+        if rest and child.has_finished_one and child.name not in self._seconds_left:
             self._seconds_left[child.name] = max(LEAST_REST_S, child.seconds_left)
             self._waiting = {child.name: rest, **self._waiting}

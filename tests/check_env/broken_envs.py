@@ -268,15 +268,6 @@ class Hangs(Clean):
         super().move(action)
 
 
-class NoSuperReset(Clean):
-    def reset(self, *, seed=None, options=None):
-        if seed is not None or not hasattr(self, "rng"):
-            self.rng = np.random.default_rng(seed)
-        self.steps = 0
-        self.position = self.rng.uniform(-1, 1, 2).astype(np.float32)
-        return self.observe(), {}
-
-
 class Prints(Clean):
     def move(self, action):
         print("moving", action)

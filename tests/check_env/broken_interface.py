@@ -1,4 +1,4 @@
-"""Environments that take misuse badly, promise pictures that they cannot make, or hide what wrappers read."""
+"""Environments that promise pictures that they cannot make, open windows, have no time limit, or new spaces."""
 
 import os
 
@@ -6,19 +6,6 @@ import numpy as np
 import pybullet
 from broken_envs import Clean
 from gymnasium import spaces
-
-
-class ListMetadata(Clean):
-    metadata = ["human"]
-
-
-class OldGenerator(Clean):
-    """As old code seeds."""
-
-    def reset(self, *, seed=None, options=None):
-        if seed is not None:
-            self.np_random = np.random.RandomState(seed)
-        return super().reset()
 
 
 class NewSpaces(Clean):
@@ -78,6 +65,11 @@ class RenderBlack(Renders):
         return np.zeros((20, 30, 3), np.uint8)
 
 
+class EndsInRender(Renders):
+    def render(self):
+        os._exit(9)
+
+
 class RenderWithoutLibrary(Renders):
     def draw(self):
         import library_for_pictures  # noqa: F401
@@ -93,42 +85,6 @@ class GuiInReset(Clean):
     def start(self):
         super().start()
         pybullet.connect(pybullet.GUI)
-
-
-class NanAfterEnd(Clean):
-    def observe(self):
-        return self.position * np.float32("nan" if self.steps > 50 else 1)
-
-
-class RewardAfterEnd(Clean):
-    def reward(self):
-        return -1e6 if self.steps == 52 else super().reward()
-
-
-class ShapeAfterEnd(Clean):
-    def observe(self):
-        return self.position[: 1 if self.steps > 50 else 2].copy()
-
-
-class FarAfterEnd(Clean):
-    def observe(self):
-        return self.position + np.float32(100 * (self.steps > 50))
-
-
-class DiesAfterEnd(Clean):
-    def move(self, action):
-        if self.steps > 50:
-            os.abort()
-        super().move(action)
-
-
-class RaisesAfterEnd(Clean):
-    """Refuses: nothing is wrong with it."""
-
-    def move(self, action):
-        if self.steps > 50:
-            raise RuntimeError("the episode has ended")
-        super().move(action)
 
 
 class Falls(Clean):

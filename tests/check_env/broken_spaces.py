@@ -64,3 +64,12 @@ class Tiles(Seen):
 class Dark(Seen):
     def observe(self):
         return super().observe() // 255
+
+
+class CountsFromOne(Clean):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Discrete(2, start=1)
+
+    def step(self, action):
+        return super().step(np.full(2, action - 1.5, np.float32))

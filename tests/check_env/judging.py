@@ -11,11 +11,11 @@ from rlctl.check_env import child, families
 from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.finding import RULES
 from rlctl.check_env.judge import judge
-from rlctl.check_env.messages import Finished
 from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
 
 FOLDER = Path(__file__).parent
+sys.dont_write_bytecode = False  # each experiment imports its environment's file anew
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,21 +27,14 @@ class Case:
     expected: frozenset[tuple[str, str]]
     """Every finding: rule and severity."""
     twin: str = "broken_envs.py:Clean"
-    also_needs: tuple[str, ...] = ()
-    """Experiments that find the mistake beside those that the rule needs: a library's checker."""
 
     @property
     def rules(self) -> tuple[str, ...]:
         return tuple(sorted(rule for rule, _ in self.expected))
 
 
-def case(
-    broken: str,
-    *expected: tuple[str, str],
-    twin: str = "broken_envs.py:Clean",
-    also_needs: tuple[str, ...] = (),
-) -> Case:
-    return Case(broken, frozenset(expected), twin, also_needs)
+def case(broken: str, *expected: tuple[str, str], twin: str = "broken_envs.py:Clean") -> Case:
+    return Case(broken, frozenset(expected), twin)
 
 
 def records_of(task, *experiments, seconds=families.PROCESS_S):
@@ -58,8 +51,9 @@ def shared_records_of(task, *experiments):
     """What some experiments find out, each in a process of its own, and once for all tests: many have one twin."""
     records = Records(_path(task))
     for experiment in families.EXPERIMENTS:
-        for message in _play(task, experiment) if experiment in ("build", *experiments) else ():
-            records.add(message)
+        if experiment == "build" or (experiment in experiments and records.built):
+            for message in _play(task, experiment):
+                records.add(message)
     return records
 
 
@@ -68,9 +62,7 @@ def _play(task, experiment):
     (process,) = [
         name for name, each in families.PROCESSES.items() if families.EXPERIMENTS[experiment] in each.experiments
     ]
-    messages = _run(task, process, [experiment])
-    built = [i for i, each in enumerate(messages) if isinstance(each, Finished) and each.experiment == "build"]
-    return messages[built[0] + 1 :] if built and experiment != "build" else messages
+    return _run(task, process, [experiment])
 
 
 def _run(task, process, experiments, seconds=families.PROCESS_S):
@@ -79,18 +71,16 @@ def _run(task, process, experiments, seconds=families.PROCESS_S):
         pybullet.disconnect(client)
     for module in [module for module in sys.modules if module.startswith("broken_")]:
         del sys.modules[module]
-    wanted = [*(["build"] if process == "probe" else []), *experiments]
-    return list(child.run(process, EnvSpec(_path(task)), wanted, seconds)) if wanted else []
+    return list(child.run(process, EnvSpec(_path(task)), experiments, seconds)) if experiments else []
 
 
 def _path(task):
     return str(FOLDER / task) if ".py:" in task else task
 
 
-def verdict_of(task, *rules, also_needs=()):
+def verdict_of(task, *rules):
     """The verdict by some rules, from the experiments that they need; or by all, from one process after the other."""
-    needed = {*families.find_needs(rules), *also_needs}
-    records = shared_records_of(task, *needed) if rules else _whole(task)
+    records = shared_records_of(task, *families.find_needs(rules)) if rules else _whole(task)
     verdict = judge(records, rules or tuple(RULES))
     assert verdict.crashed == {}
     return verdict
@@ -101,21 +91,21 @@ def _whole(task):
     return records_of(task)
 
 
-def findings(task, *rules, **settings):
-    return verdict_of(task, *rules, **settings).findings
+def findings(task, *rules):
+    return verdict_of(task, *rules).findings
 
 
-def found(task, *rules, **settings):
-    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules, **settings)}
+def found(task, *rules):
+    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules)}
 
 
 def rules_of(family):
-    """The rules of a family that need no library's checker, which costs seconds."""
-    return [rule for rule in RULES if rule.startswith(family) and rule in {**families.CHECKS, **families.DECIDED_BY}]
+    """The rules of a family."""
+    return [rule for rule in RULES if rule.startswith(family)]
 
 
 def check_case(case):
     """The mistake is found by its rules, and nothing by them in the twin. That no other rule finds anything in it is
     tested in test_all_rules.py."""
-    assert found(case.broken, *case.rules, also_needs=case.also_needs) == case.expected
+    assert found(case.broken, *case.rules) == case.expected
     assert found(case.twin, *case.rules) == set()

@@ -1,21 +1,20 @@
 """The family RL9: what is slow is measured, and named."""
 
 import dataclasses
-import functools
 import os
-import signal
 import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from rlctl.check_env.families.speed import Speed, format_speed, typical
 from rlctl.check_env.finding import choose_rules
 from rlctl.check_env.judge import judge
 from rlctl.check_env.own_code import kind_of
+from rlctl.check_env.profiling import Profiler, Stopwatch, TimedCall
 from rlctl.check_env.records import Records
-from rlctl.check_env.sampling import Sampler, Samples, Stopwatch, TimedCall
 from tests.check_env.judging import case, check_case, shared_records_of
 
 CASES = [
@@ -173,45 +172,32 @@ def twice():
     sorted([2, 1], key=lambda each: time.sleep(0.01) or each)
 
 
-def sampled(function, repetitions=20):
-    sampler = Sampler(lambda file: file == __file__, kind_of)
-    samples = Samples(sampler)
-    with sampler.running():
-        for _ in range(repetitions):
-            samples(function)
-    return samples
+def profiled(function, repetitions=20):
+    profiler = Profiler()
+    for _ in range(repetitions):
+        profiler(function)
+    return profiler.profile(lambda file: file == __file__, kind_of)
 
 
 def test_time_is_booked_on_who_takes_it():
-    samples = sampled(twice)
-    (sleep,) = samples.suspicious()
+    profile = profiled(twice)
+    (sleep,) = profile.suspicious()
     # 20 ms in pause and 10 ms twice in the key function, each by time.sleep.
     assert (sleep.name, sleep.kind) == ("time.sleep", "sleeping")
     assert 0.8 <= sleep.share <= 1
     assert sleep.place.startswith("test_speed.py:")
-    assert samples.slowest()[0] == dataclasses.replace(sleep, kind="sleeping")
+    assert profile.slowest()[0].name == "time.sleep"
 
 
 def test_builtins_are_named_by_what_is_called():
-    assert sampled(lambda: bytes(20_000_000)).slowest()[0].name == "bytes"
-    name = functools.partial(sorted, range(300_000), key=float)
-    assert sampled(lambda: name()).slowest()[0].name == "sorted"
+    assert profiled(lambda: sorted(range(300_000), key=float)).slowest()[0].name == "sorted"
+    assert profiled(lambda: np.linalg.norm(np.ones(1_000_000))).slowest()[0].name.startswith("numpy.")
 
 
-def test_an_exception_in_what_is_sampled_reaches_the_caller():
+def test_an_exception_in_what_is_profiled_reaches_the_caller():
     with pytest.raises(ValueError, match="not in list"):
-        sampled(lambda: [].index(1))
-
-
-def test_an_alarm_of_the_environment_goes_on():
-    handler = signal.getsignal(signal.SIGALRM)
-    before = signal.setitimer(signal.ITIMER_REAL, 1000.0)
-    try:
-        sampled(pause)
-        assert signal.getsignal(signal.SIGALRM) is handler
-        assert 900 < signal.getitimer(signal.ITIMER_REAL)[0] <= 1000
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, *before)
+        profiled(lambda: [].index(1))
+    assert sys.getprofile() is None
 
 
 def test_waiting_for_a_processor_does_not_count():

@@ -26,7 +26,7 @@ It names the experiments that it needs (by default those that record the common 
 experiment besides episodes is a `Fact`: `yield Fact("truncation", "never")`, then `records.require_fact("truncation",
 "attributes")`. A recording experiment yields what `Recording.run()` returns.
 
-**Texts** (name, severity, meaning, fix, what the libraries' checkers say about it) are in `rules.yaml`, not here. A
+**Texts** (name, severity, meaning, fix) are in `rules.yaml`, not here. A
 finding gives its own severity or fix only where they differ from the rule's. Every check and experiment of a module in
 `MODULES` counts; the order of experiments is that of `PROCESSES`.
 """
@@ -46,12 +46,12 @@ from rlctl.check_env.families import (
     incentives,
     interface,
     isolation,
-    library_checkers,
     loading,
     observations,
     physics,
     rewards,
     search,
+    seeding,
     speed,
     variants,
 )
@@ -74,39 +74,33 @@ PROCESSES = {
         (
             loading.build,
             determinism.compare_repetitions,
-            determinism.compare_generators,
+            seeding.compare_generators,
             speed.measure_speed,
             episodes.record_episodes,
             incentives.record_starts,
             search.search,
             rewards.recompute_rewards,
             isolation.count_after_resets,
-            episodes.step_after_end,
         )
     ),
     "instances": Process(
         (
             isolation.compare_instances,
+            seeding.compare_unseeded,
             physics.watch_worlds,
             actions.compare_actions,
             attributes.read_attributes,
             variants.play_variants,
-            actions.exceed_bounds,
-            actions.give_nan,
             attributes.render,
+            isolation.build_in_worker,
         ),
         hash_seed=1,  # another one, so that hash order shows
     ),
-    "checkers": Process(
-        (library_checkers.run_gymnasium_checker, library_checkers.run_sb3_checker, isolation.build_in_worker)
-    ),
 }
-"""The child processes; the last one waits until there is a place for it."""
-
-CHECKERS = ("gymnasium checker", "sb3 checker")
+"""The child processes."""
 
 MODULES = (
-    *(loading, observations, features, interface, attributes, determinism, isolation, episodes),
+    *(loading, observations, features, interface, attributes, determinism, seeding, isolation, episodes),
     *(rewards, incentives, actions, physics, speed, variants),
 )
 
@@ -127,8 +121,6 @@ def find_needs(rules: Iterable[str]) -> set[str]:
             needed.update(CHECKS[rule].needs)
         if rule in DECIDED_BY:
             needed.add(DECIDED_BY[rule].name)
-        if rule not in CHECKS and rule not in DECIDED_BY:
-            needed.update(CHECKERS)  # only the libraries' checkers say anything about it
     return needed
 
 

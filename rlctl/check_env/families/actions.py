@@ -1,35 +1,22 @@
-"""RL7: the actions do something, in all of their range, and only there."""
+"""RL7: the actions do something, and in all of their range."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import tempfile
 from collections.abc import Iterator, Sequence
-from typing import Any
-
-import numpy as np
 
 from rlctl.check_env.action_trials import (
     REPEATED_STEPS,
-    REWARD,
     Dimension,
-    Frame,
     OutOfTime,
     Trials,
-    find_differences,
     find_dimensions,
     find_other_rewards,
-    is_float_box,
     observations_differ,
-    to_frame,
 )
-from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
-from rlctl.check_env.failures import EnvironmentRaised
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
+from rlctl.check_env.finding import Finding, NotJudged, Severity, list_names
 from rlctl.check_env.instance import Context
-from rlctl.check_env.leaves import Leaf
 from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message
 
 MOST_DIMENSIONS = 64
@@ -41,8 +28,6 @@ SATURATED = 0.2
 """The part of the range from which on nothing may change for it to be called saturated: four fifths are then lost."""
 SWITCH = 0.01
 """If even from here on nothing changes, only the sign counts: a gripper's switch, say, which may be meant."""
-TWICE = 2.0
-STEPS_AFTER_NAN = 5
 MOST_NAMES = 8
 """So many dimensions are named in a message."""
 
@@ -162,75 +147,3 @@ def _saturated(effects: Sequence[_Effect], left_out: str) -> Iterator[Finding]:
 def _finding(rule: str, names: list[str], message: str, severity: Severity) -> Finding:
     evidence = {"value": names, "seed": FIRST_SEED, "seeds": [FIRST_SEED, SECOND_SEED], "steps": STAGES[-1][1]}
     return Finding(rule, message, evidence, severity)
-
-
-@experiment("out of range", "RL703", share=0.5, provokes="an action of twice the bounds")
-def exceed_bounds(context: Context) -> Iterator[Message]:
-    """Play an episode at the corners of the action space, and again with twice these actions."""
-    with context.fresh() as instance:
-        if not any(each.is_continuous for each in find_dimensions(instance.action_leaves)):
-            raise NotApplicable("no continuous action with finite bounds")
-        trials = Trials(context, instance, "extreme")
-        trials.require_repeatable()
-        inside = trials.plain(FIRST_SEED, REPEATED_STEPS)
-        beyond = [trials.change(each, _twice) for each in trials.actions(FIRST_SEED, REPEATED_STEPS)]
-        outside, _ = _play_until_refused(Episode(instance, FIRST_SEED, given=beyond, max_steps=len(beyond)))
-        yield from _first_difference(inside, outside)
-
-
-def _play_until_refused(episode: Episode) -> tuple[list[Frame], bool]:
-    """Return the frames of an episode, and whether a step of it raised."""
-    frames: list[Frame] = []
-    try:
-        for moment in episode:
-            frames.append(to_frame(moment))
-    except EnvironmentRaised as error:
-        if error.call != "step":
-            raise
-        return frames, True
-    return frames, False
-
-
-def _twice(part: Any, leaf: Leaf) -> Any:
-    if not is_float_box(leaf):
-        return part
-    low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
-    bounded = np.isfinite(low) & np.isfinite(high)
-    middle = np.where(bounded, (low + high) / 2, 0.0)
-    return np.where(bounded, middle + TWICE * (part - middle), part)
-
-
-def _first_difference(inside: list[Frame], outside: list[Frame]) -> Iterator[Finding]:
-    for step, columns in list(find_differences(inside, outside).items())[:1]:
-        size = np.abs(np.nan_to_num(inside[step][columns]) - np.nan_to_num(outside[step][columns]))
-        column = int(columns[size.argmax()])
-        what = {REWARD: "the reward", -2: "terminated", -1: "truncated"}.get(column, "an observation")
-        expected, value = float(inside[step][column]), float(outside[step][column])
-        message = (
-            f"with twice the largest actions {what} is {value:.6g} at step {step}; with the largest {expected:.6g}"
-        )
-        yield Finding("RL703", message, {"seed": FIRST_SEED, "step": step, "value": value, "expected": expected})
-
-
-@experiment("nan action", "RL704", share=0.3, provokes="an action of NaN")
-def give_nan(context: Context) -> Iterator[Message]:
-    """Take an action of NaN, and a few good ones after it."""
-    import gymnasium
-
-    with context.fresh() as instance:
-        if not any(is_float_box(leaf) for leaf in instance.action_leaves):
-            raise NotApplicable("no continuous action")
-        if not isinstance(instance.env, gymnasium.Env):
-            raise NotJudged("it is not a gymnasium.Env (RL003)")
-        trials = Trials(context, instance)
-        first, *good = trials.actions(FIRST_SEED, 1 + STEPS_AFTER_NAN)
-        nan = trials.change(first, lambda part, leaf: np.full_like(part, np.nan) if is_float_box(leaf) else part)
-        # A simulator may write a log of what it did not like to where it is: MuJoCo does.
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-            frames, is_refused = _play_until_refused(Episode(instance, FIRST_SEED, given=[nan, *good], max_steps=6))
-    if is_refused:
-        return
-    is_finite = all(np.isfinite(each).all() for each in frames[1:])
-    value = "only finite numbers come back" if is_finite else "NaN comes back"
-    evidence = {"seed": FIRST_SEED, "step": 1, "value": value, "expected": "an exception"}
-    yield Finding("RL704", f"an action of NaN is accepted, and {value}", evidence)

@@ -24,11 +24,9 @@ from rlctl.check_env.failures import (
 )
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.instance import Context, RenderMode
-from rlctl.check_env.leaves import name_type
-from rlctl.check_env.messages import FIRST_SEED, Fact, Message, Skipped
+from rlctl.check_env.messages import FIRST_SEED, Fact, Message
 from rlctl.check_env.records import Records
 
-SPACES = ("action_space", "observation_space")
 PICTURES: dict[RenderMode, str] = {"rgb_array": "a uint8 array of shape (height, width, 3)", "ansi": "a str"}
 """The render modes that open no window, and what `render` returns in them."""
 NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)
@@ -39,7 +37,7 @@ NO_GRAPHICS_FIX = (
 )
 
 
-@experiment("attributes", "RL214", "RL404", "RL216")
+@experiment("attributes", "RL404", "RL216")
 def read_attributes(context: Context) -> Iterator[Message]:
     """Read one instance that was reset, and a second one beside it."""
     with context.fresh() as instance:
@@ -47,21 +45,9 @@ def read_attributes(context: Context) -> Iterator[Message]:
             evidence = {"value": "GUI", "expected": "DIRECT"}
             yield Finding("RL216", "PyBullet was connected with a window (p.GUI)", evidence)
         instance.reset(FIRST_SEED)
-        yield Fact("truncation", read_truncation(_inner(instance.env)))
-        if not instance.is_env:
-            for rule in ("RL214", "RL404"):
-                yield Skipped(rule, "it is not a gymnasium.Env (RL003)")
-            return
-        yield from _attribute_problems(instance.env)
+        yield Fact("truncation", read_truncation(getattr(instance.env, "unwrapped", instance.env)))
         with context.fresh() as other:
             yield from _shared_spaces(instance.env, other.env)
-
-
-def _inner(env: Any) -> Any:
-    try:
-        return env.unwrapped
-    except Exception:  # is one of the problems
-        return env
 
 
 def _count_windows() -> int:
@@ -72,37 +58,12 @@ def _count_windows() -> int:
     return methods.count(pybullet.GUI)
 
 
-def _attribute_problems(env: Any) -> Iterator[Finding]:
-    for name in ("unwrapped", "metadata", "render_mode", *SPACES):
-        try:
-            is_new = getattr(env, name) is not getattr(env, name)
-        except Exception as error:
-            yield _problem(f"{name} raises {describe(error)}")
-        else:
-            if is_new and name in SPACES:
-                problem = f"{name} is a new object each time it is read, so that seeding it has no effect"
-                yield _problem(problem, Severity.WARNING)
-    metadata = getattr(_inner(env), "metadata", {})
-    if not isinstance(metadata, dict):
-        yield _problem(f"metadata is a {type(metadata).__name__}, not a dict")
-    try:
-        generator = getattr(_inner(env), "np_random", None)
-    except Exception as error:
-        yield _problem(f"np_random raises {describe(error)}")
-        return
-    # Gymnasium's own older environments hand out a subclass of the Generator.
-    if generator is not None and not isinstance(generator, np.random.Generator):
-        yield _problem(f"np_random is a {name_type(generator)}, not a numpy.random.Generator")
-
-
-def _problem(text: str, severity: Severity | None = None) -> Finding:
-    return Finding("RL214", text, {"value": text}, severity)
-
-
 def _shared_spaces(one: Any, other: Any) -> Iterator[Finding]:
     objects, generators = [], []
-    for name in SPACES:
+    for name in ("action_space", "observation_space"):
         a, b = getattr(one, name, None), getattr(other, name, None)
+        if a is not getattr(one, name, None):
+            yield _shared([name], f"{name} is a new object each time it is read, so that seeding it has no effect")
         pairs = zip(_parts(a), _parts(b), strict=False)
         if a is not None and a is b:
             objects.append(name)

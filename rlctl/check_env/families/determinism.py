@@ -9,8 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import random
-import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -29,9 +27,8 @@ COMPARED_STEPS = 300
 """How far comparisons go."""
 DIRTY_STEPS = 37
 """How far the other episode goes, at most, that is left unfinished before a repetition."""
-WATCHED_STEPS = 30
-"""For how many steps the process's random generators are compared."""
-FEWEST_SEEDS = 4
+SECONDS = "episode/t"
+"""In info: how long an episode took, by Gymnasium's RecordEpisodeStatistics."""
 LATE = 20
 """What an unfinished episode changes only after so many steps is a residue, not the episode's start [steps]."""
 NEARLY = 1e-5
@@ -45,7 +42,7 @@ def compare_repetitions(context: Context) -> Iterator[Message]:
     instance, budget = context.instance, context.budget
     longest_s = budget.seconds_left / 4
     steps = COMPARED_STEPS
-    for number, role in enumerate(("alone", "reused", "dirty", "seeds", "unseeded", "unseeded again")):
+    for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
         instance.progress.phase(role)
         if role == "dirty":
             unfinished = min(DIRTY_STEPS, max(1, steps // 2))
@@ -58,12 +55,8 @@ def compare_repetitions(context: Context) -> Iterator[Message]:
         episode = Episode(instance, seed, number=number, action_seed=FIRST_SEED, max_steps=COMPARED_STEPS)
         episode.deadline = budget.end_within(longest_s)
         recording = Recording(role, episode, budget)
-        if role.startswith("unseeded"):
-            recording.reset(then_unseeded=True)
-            yield from recording.messages()
-        else:
-            yield from recording.run()
-            steps = min(steps, recording.steps)
+        yield from recording.run()
+        steps = min(steps, recording.steps)
 
 
 def compare(records: Records, first: str, second: str) -> tuple[Trajectory, Difference | None]:
@@ -145,56 +138,19 @@ def compare_processes(records: Records) -> Iterator[Finding]:
         yield report("RL305", records, trajectory, difference, "played by a new process")
 
 
-@check("RL308", "comparisons")
-def compare_unseeded(records: Records) -> Iterator[Finding]:
-    """Compare episodes whose reset had no seed, after a reset with one."""
-    trajectory, difference = compare(records, "unseeded", "unseeded again")
-    if difference is not None:
-        require_independent(records)
-        yield report("RL308", records, trajectory, difference, "reset with a seed and then without one, twice")
-
-
-@check("RL306", "comparisons", "episodes")
-def _compare_seeds(records: Records) -> Iterator[Finding]:
-    built = records.require_built()
-    trajectory, difference = compare(records, "alone", "seeds")
-    if difference is not None:
-        return
-    starts = [each for each in records.require_alone() if 0 in each.observations and len(each.observations[0].steps)]
-    seeds = len({each.seed for each in starts})
-    if seeds < FEWEST_SEEDS:
-        raise NotJudged(f"fewer than {FEWEST_SEEDS} seeds were tried")
-    for index, _ in enumerate(built.leaves):
-        values = [each.observations[index].values[0] for each in starts if index in each.observations]
-        if any(not np.array_equal(values[0], other) for other in values[1:]):
-            return
-    message = f"{seeds} seeds give one start, and with the same actions one trajectory of {trajectory.steps} steps"
-    yield Finding("RL306", message, {"seeds": seeds, "value": 1, "expected": seeds})
-
-
-@experiment("global random", "RL309", share=0.5)
-def compare_generators(context: Context) -> Iterator[Message]:
-    """Play the beginning of an episode, and say which generators of the whole process it moves, and where first."""
-    moved: set[str] = set()
-    episode = Episode(context.instance, FIRST_SEED, max_steps=WATCHED_STEPS, deadline=context.budget.deadline)
-    before = _generator_states()
-    for moment in episode:
-        after = _generator_states()
-        for generator, state in after.items():
-            if state != before.get(generator, state) and generator not in moved:
-                moved.add(generator)
-                call, at = ("step", f" at step {moment.step}") if moment.step else ("reset", "")
-                evidence = {"generator": generator, "call": call, "step": moment.step}
-                yield Finding("RL309", f"{call} moves the global generator {generator}{at}", evidence)
-        before = _generator_states()
-
-
-def _generator_states() -> dict[str, Any]:
-    kind, keys, position, *rest = np.random.get_state()  # noqa: NPY002 (this one is what is compared)
-    states = {"numpy.random": (kind, np.asarray(keys).tobytes(), position, *rest), "random": random.getstate()}
-    if "torch" in sys.modules:
-        states["torch"] = sys.modules["torch"].random.get_rng_state().numpy().tobytes()
-    return states
+@check("RL307", "comparisons")
+def compare_infos(records: Records) -> Iterator[Finding]:
+    """Compare the numbers in the infos of an episode and its repetition."""
+    require_repeatable(records)
+    one, two = records.require_role("alone"), records.require_role("reused")
+    found: list[Difference] = []
+    for name in sorted(one.infos.keys() & two.infos.keys() - {SECONDS}):
+        a, b = one.infos[name], two.infos[name]
+        differences = _compare(a.values, b.values, a.steps, str)
+        found += [dataclasses.replace(each, element=f"info {name!r}") for each in differences]
+    if found:
+        earliest = min(found, key=lambda each: each.step)
+        yield report("RL307", records, one, earliest, "played twice by one instance")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,15 +1,11 @@
-"""RL5: how episodes end, and what comes after the end."""
+"""RL5: how episodes end."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 
-import numpy as np
-
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import RECORDING, Check, check, experiment
-from rlctl.check_env.families import observations, rewards
+from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import ENDS, FIRST_SEED, Message, Trajectory
@@ -26,14 +22,6 @@ ENDLESS_STEPS = 10_000
 """After so many steps an episode without an end is cut."""
 LATER_ENDLESS_STEPS = 1_000
 """The same, once every kind of action was tried."""
-LONGEST_EPISODE = 2_000
-"""An episode that does not end within so many random steps is left [steps]."""
-STEPS_AFTER = 5
-"""A body that falls on for a few steps leaves its space by little; what does so by more than its width in these is not
-physics any more [steps]."""
-MUCH_LARGER = 10.0
-"""A reward so many times larger than any before, or than 1, comes from a state that no episode has."""
-
 FEWEST_EPISODES = 6
 SHORTEST_LIMIT = 5
 """Games of fewer steps that always end together are games, not time limits [steps]."""
@@ -161,52 +149,3 @@ def _find_no_time_limit(records: Records) -> Iterator[Finding]:
     evidence = {"episodes": len(episodes), "value": None, "expected": "max_episode_steps", "step": max(lengths)}
     severity = Severity.WARNING if is_continuous and truncation == "never" else Severity.INFO
     yield Finding("RL506", f"{message}{max(lengths)} steps", evidence, severity)
-
-
-@experiment("after the end", "RL505", share=0.5, provokes="a step after the episode's end")
-def step_after_end(context: Context) -> Iterator[Message]:
-    """Play an episode to its end, and step on."""
-    instance, budget = context.instance, context.budget
-    episode = Episode(instance, FIRST_SEED, max_steps=LONGEST_EPISODE, deadline=budget.deadline)
-    recording = Recording("after the end", episode, budget)
-    recording.run()
-    if episode.ended not in ENDS:
-        raise NotJudged("the episode did not come to an end")
-    end = episode.steps
-    while episode.steps < end + STEPS_AFTER and recording.failure is None:  # to refuse is what it should do
-        recording.step()
-    yield recording.trajectory
-
-
-@check("RL505", *RECORDING, "after the end")
-def find_nonsense_after_end(records: Records) -> Iterator[Finding]:
-    """Judge the steps after the end by the rules on observations and rewards that no other episode breaks."""
-    after = records.require_role("after the end")
-    end = int((after.terminated | after.truncated).argmax()) + 1
-    only = dataclasses.replace(records, trajectories=[dataclasses.replace(after, role="episodes")])
-
-    def find_new(each: Check) -> list[Finding]:
-        return [] if list(each.run(records)) else list(each.run(only))
-
-    checks = (observations.find_wrong_shape, observations.find_not_finite, rewards.find_not_finite)
-    found = [finding for each in checks for finding in find_new(each)]
-    found += [finding for finding in find_new(observations.find_out_of_range) if _is_far_outside(finding)]
-    if found:
-        yield Finding("RL505", f"after the end at step {end}: {found[0].message}", found[0].evidence)
-        return
-    largest = max(float(np.abs(np.nan_to_num(each.rewards)).max(initial=0.0)) for each in records.require_alone())
-    late = np.nan_to_num(after.rewards[end:])
-    if late.size and np.abs(late).max() > MUCH_LARGER * max(largest, 1.0):
-        at = int(np.abs(late).argmax())
-        message = (
-            f"a step after the episode's end is rewarded with {late[at]:.6g}; no step before was with more than "
-            f"{largest:.6g}"
-        )
-        evidence = {"seed": after.seed, "step": end + 1 + at, "value": float(late[at]), "expected": largest}
-        yield Finding("RL505", message, evidence)
-
-
-def _is_far_outside(finding: Finding) -> bool:
-    """Say whether a value is outside its bounds by more than their width."""
-    low, high = finding.evidence["expected"]
-    return not low - (high - low) <= finding.evidence["value"] <= high + (high - low)

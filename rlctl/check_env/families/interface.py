@@ -35,6 +35,13 @@ def _find_reset_without_seed(records: Records) -> Iterator[Finding]:
         yield Finding("RL202", "reset has no parameter `seed`")
 
 
+@check("RL203", "build")
+def _find_reset_without_options(records: Records) -> Iterator[Finding]:
+    built = records.require_built()
+    if built.accepts_seed and not built.accepts_options:  # without `seed`, RL202 says what reset has to look like
+        yield Finding("RL203", "reset has no parameter `options`")
+
+
 @check("RL204")
 def _find_wrong_types(records: Records) -> Iterator[Finding]:
     for what in ("terminated", "truncated"):
@@ -74,8 +81,6 @@ def select_failures(records: Records, kind: str) -> Iterator[Failure]:
     errors: set[tuple[str, str]] = set()
     for failure in records.failures:
         if failure.kind != kind or failure.call in ("load", "build") or failure.phase in (*BESIDE_OTHERS, *PROVOKING):
-            continue
-        if failure.process == "checkers" and errors:
             continue
         if (failure.call, failure.error) not in errors:
             errors.add((failure.call, failure.error))

@@ -43,6 +43,13 @@ MEMORY_GROWTH = 8 * 2**20
 fills the memory of 16 workers in a day."""
 LATER_SHARE = 0.4
 """Of the growth, so much must be in the second half: what fills once slows down, a leak does not."""
+LEAKS = {
+    "PyBullet clients": Severity.ERROR,
+    "bodies in the PyBullet world": Severity.ERROR,
+    "open file descriptors": Severity.WARNING,
+    "threads": Severity.WARNING,
+}
+"""What is counted; a client brings its own bodies, files, threads and memory."""
 _PROCESS = Path("/proc/self")
 
 
@@ -78,12 +85,10 @@ def compare_instances(context: Context) -> Iterator[Message]:
     survivor = context.build()
     pair = begin(survivor, "interleaved", FIRST_SEED), begin(neighbour, "interleaved second", SECOND_SEED)
     progress.phase("interleaved")
-    for recording in pair:
-        recording.reset()
     while any(recording.running for recording in pair):
         for recording in pair:
             if recording.running:
-                recording.step()
+                recording.advance()
     for recording in pair:
         yield from recording.messages()
     yield from _close_in_between(context, begin(survivor, "after close", SECOND_SEED), neighbour)
@@ -92,14 +97,14 @@ def compare_instances(context: Context) -> Iterator[Message]:
 
 def _close_in_between(context: Context, recording: Recording, neighbour: Instance) -> Iterator[Message]:
     """Play an episode, after whose first step another instance is closed."""
-    recording.reset()
+    recording.advance()
     if recording.running:
-        recording.step()
+        recording.advance()
     context.progress.phase("close")
     yield from context.close(neighbour)
     context.progress.phase("after close")
     while recording.running:
-        recording.step()
+        recording.advance()
     yield from recording.messages()
 
 
@@ -167,12 +172,9 @@ def _find_single_instance(records: Records) -> Iterator[Finding]:
 class Counts:
     """What an instance holds after each of many resets."""
 
-    clients: list[int] = dataclasses.field(default_factory=list)
-    """PyBullet clients of the process."""
-    bodies: list[int] = dataclasses.field(default_factory=list)
-    """Bodies in the worlds of all clients."""
-    descriptors: list[int] = dataclasses.field(default_factory=list)
-    threads: list[int] = dataclasses.field(default_factory=list)
+    resets: int = 0
+    series: dict[str, list[int]] = dataclasses.field(default_factory=dict)
+    """Per key of `LEAKS` that can be counted here, how many there are after each reset."""
     memory: list[int] = dataclasses.field(default_factory=list)
     """Resident memory [bytes] once the warm-up is over, half way, and at the end; empty where it is not known."""
     measured: list[int] = dataclasses.field(default_factory=list)
@@ -180,13 +182,14 @@ class Counts:
 
     def count(self) -> None:
         """Count what is there now."""
-        clients = find_clients()
-        self.clients.append(len(clients))
-        pybullet = sys.modules.get("pybullet")
-        self.bodies.append(sum(pybullet.getNumBodies(physicsClientId=each) for each in clients) if pybullet else 0)
+        clients, pybullet = find_clients(), sys.modules.get("pybullet")
+        bodies = [pybullet.getNumBodies(physicsClientId=each) for each in clients] if pybullet else []
+        numbers = [len(clients), sum(bodies)]
         if _PROCESS.exists():
-            self.descriptors.append(len(os.listdir(_PROCESS / "fd")))
-            self.threads.append(len(os.listdir(_PROCESS / "task")))
+            numbers += [len(os.listdir(_PROCESS / "fd")), len(os.listdir(_PROCESS / "task"))]
+        for what, number in zip(LEAKS, numbers, strict=False):
+            self.series.setdefault(what, []).append(number)
+        self.resets += 1
 
     def measure_memory(self) -> None:
         """Note the resident memory, without what only waits to be collected."""
@@ -198,7 +201,7 @@ class Counts:
             trim(0)
         pages = int((_PROCESS / "statm").read_text().split()[1])
         self.memory.append(pages * os.sysconf("SC_PAGE_SIZE"))
-        self.measured.append(len(self.clients))
+        self.measured.append(self.resets)
 
 
 @experiment("leaks", "RL405", share=3.0)
@@ -209,7 +212,7 @@ def count_after_resets(context: Context) -> Iterator[Message]:
     gc.freeze()  # what there is already need not be looked through again and again
     try:
         begun, planned = budget.seconds_left, MOST_RESETS
-        while (done := len(counts.clients)) < planned and budget.seconds_left > 0:
+        while (done := counts.resets) < planned and budget.seconds_left > 0:
             for _ in Episode(instance, FIRST_SEED + done, number=done, max_steps=1):
                 pass
             counts.count()
@@ -228,19 +231,14 @@ def count_after_resets(context: Context) -> Iterator[Message]:
 
 def find_growth(counts: Counts) -> Iterator[Finding]:
     """Yield what grows with every reset; raises `NotJudged` where there were too few of them."""
-    resets = len(counts.clients)
+    resets = counts.resets
     if resets < FEWEST_RESETS:
         raise NotJudged(f"there was time for only {resets} resets")
-    for what, series, severity in (
-        ("PyBullet clients", counts.clients, Severity.ERROR),
-        ("bodies in the PyBullet world", counts.bodies, Severity.ERROR),
-        ("open file descriptors", counts.descriptors, Severity.WARNING),
-        ("threads", counts.threads, Severity.WARNING),
-    ):
-        if len(series) == resets and (growth := _growth(series)):
+    for what, series in counts.series.items():
+        if growth := _growth(series):
             first, after = series[SETTLING_RESETS], resets - SETTLING_RESETS - 1
             message = f"{what} grow with every reset: from {first} to {series[-1]} in {after} resets"
-            yield _report(message, what, series[-1], first, after, growth / after, severity)
+            yield _report(message, what, series[-1], first, after, growth / after, LEAKS[what])
             return  # a client brings its own bodies, files, threads and memory
     if len(counts.memory) == 3 and counts.measured[-1] >= FEWEST_RESETS_FOR_MEMORY:
         start, middle, end = counts.memory

@@ -52,7 +52,7 @@ def _explain(context: Context, error: RlctlError) -> Finding:
         return Finding("RL008", str(error), details)
     if (file := find_missing_file(cause)) is not None:
         return _not_found("the constructor", file, error.details)
-    if context.stage == "import":
+    if context.progress.read().call == "load":
         return Finding("RL001", str(error), details)
     if isinstance(cause, TypeError) and (missing := _missing_arguments(str(cause))):
         settings = " ".join(f"--set task.{name}=..." for name in missing)
@@ -146,6 +146,7 @@ def describe_built(instance: Instance) -> Built:
         max_steps=inner.max_steps if is_task(env) else getattr(spec, "max_episode_steps", None),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         accepts_seed=instance.accepts_seed,
+        accepts_options=instance.accepts_options,
         uses_pybullet=bool(find_clients()),
         waivers=_waivers(author),
         file=file,

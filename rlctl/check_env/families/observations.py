@@ -260,15 +260,22 @@ def _find_unsupported_spaces(records: Records) -> Iterator[Finding]:
     built = records.require_built()
     for what, leaves, depth in (("observation", built.leaves, 1), ("action", built.action_leaves, 0)):
         for leaf in leaves:
-            if not leaf.supported:
-                kind = leaf.kind
-            elif any(isinstance(key, int) for key in leaf.path):
-                kind = "Tuple"
-            elif len(leaf.path) > depth:
-                kind = "nested Dict" if depth else "Dict"
-            else:
-                continue
-            name = name_leaf(leaf, what)
-            message = f"{name} is {'part ' if leaf.supported else ''}of a {kind} space; SB3 has no network for it"
-            yield Finding("RL109", message, {"element": name, "value": kind})
-            break
+            if kind := _unsupported_kind(leaf, depth):
+                name, part = name_leaf(leaf, what), "part " if leaf.supported and leaf.path else ""
+                message = f"{name} is {part}of a {kind}; SB3 has no network for it"
+                yield Finding("RL109", message, {"element": name, "value": kind})
+                break
+
+
+def _unsupported_kind(leaf: Leaf, depth: int) -> str:
+    if not leaf.supported:
+        return f"{leaf.kind} space"
+    if any(isinstance(key, int) for key in leaf.path):
+        return "Tuple space"
+    if len(leaf.path) > depth:
+        return "nested Dict space" if depth else "Dict space"
+    if leaf.kind == "MultiDiscrete" and len(leaf.shape) > 1:
+        return "MultiDiscrete space of several axes"
+    if leaf.kind in ("Discrete", "MultiDiscrete") and np.any(leaf.low):
+        return f"{leaf.kind} space that does not count from 0"
+    return ""

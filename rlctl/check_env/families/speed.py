@@ -7,6 +7,7 @@ import statistics
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from rlctl.check_env.bullet_calls import visible_to_profilers
 from rlctl.check_env.clock import read_clock
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
@@ -14,14 +15,14 @@ from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.messages import Fact, Message
 from rlctl.check_env.own_code import find_own_code, kind_of, rebuilds_world
+from rlctl.check_env.profiling import Profiler, Stopwatch, TimedCall
 from rlctl.check_env.records import Records
-from rlctl.check_env.sampling import Sampler, Samples, Stopwatch, TimedCall
 
 FIRST_SPEED_SEED = 5000
 TIMED_STEPS = 200
 TIMED_RESETS = 5
-SAMPLED_S = 0.15
-"""How long steps are sampled, and resets: some hundred samples each [s]."""
+PROFILED_S = 0.15
+"""How long steps are profiled, and resets [s]."""
 MOST_STEPS = 20_000
 """So many steps, or resets, are enough."""
 BATCH = 25
@@ -76,18 +77,19 @@ class Speed:
 
 @experiment("speed", share=1.5)
 def measure_speed(context: Context) -> Iterator[Message]:
-    """Play random episodes: first with nothing but a clock, then sampled."""
+    """Play random episodes: first with nothing but a clock, then under a profiler."""
     instance, seconds = context.instance, min(LONGEST_S, context.budget.seconds_left)
     steps, resets = Stopwatch(), Stopwatch()
     deadline = read_clock() + seconds / 2
     _play(instance, steps, resets, TIMED_STEPS, deadline)
     _play(instance, steps, resets, TIMED_RESETS, deadline, only_reset=True)
-    sampler = Sampler(find_own_code(instance.env), kind_of)
-    in_step, in_reset = Samples(sampler), Samples(sampler)
-    with sampler.running():
+    profilers = Profiler(), Profiler()
+    with visible_to_profilers():
         for only_reset in (False, True):
-            deadline = read_clock() + min(seconds / 4, SAMPLED_S)
-            _play(instance, in_step, in_reset, MOST_STEPS, deadline, only_reset=only_reset)
+            deadline = read_clock() + min(seconds / 4, PROFILED_S)
+            _play(instance, *profilers, MOST_STEPS, deadline, only_reset=only_reset)
+    is_own = find_own_code(instance.env)
+    in_step, in_reset = (each.profile(is_own, kind_of) for each in profilers)
     yield Fact(
         "speed",
         Speed(
@@ -172,10 +174,9 @@ def _find_drawing_and_waiting(records: Records) -> Iterator[Finding]:
     for call, seconds in (("step", speed.step_s), ("reset", speed.reset_s)):
         for each in _idle(records, speed, call):
             lost = _time(each.share * seconds) if seconds else "?"
-            inside = f", there {each.inside}" if each.inside else ""
             yield Finding(
                 "RL903",
-                f"{call} calls {each.name}{_at(each)}{inside}: {lost} per {call}, {each.share:.0%} of its time",
+                f"{call} calls {each.name}{_at(each)}: {lost} per {call}, {each.share:.0%} of its time",
                 {"call": call, "value": each.name, "place": each.place, "share": each.share},
             )
 

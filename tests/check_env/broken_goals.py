@@ -1,41 +1,8 @@
-"""What only the libraries' own checkers look for."""
+"""Environments with goals, whose rewards hindsight computes again."""
 
 import numpy as np
-from broken_envs import Clean, NoSuperReset
+from broken_envs import Clean
 from gymnasium import spaces
-
-
-class OwnSeed(Clean):
-    def seed(self, seed=None):
-        return [seed]
-
-
-class RewardOfNoGoal(Clean):
-    """What Stable-Baselines3 takes for a goal environment."""
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        return 0.0
-
-
-class OwnReward(Clean):
-    """A method of that name which is not for goals."""
-
-    def compute_reward(self):
-        return 0.0
-
-
-class SeedsItself(Clean):
-    """Old gym's way of seeding, which no longer reaches the environment."""
-
-    def seed(self, seed=None):
-        return [seed]
-
-    def start(self):
-        self.position = np.random.default_rng().uniform(-0.5, 0.5, 2).astype(np.float32)
-
-
-class OwnSeedAndReset(NoSuperReset, OwnSeed):
-    """What only Gymnasium's checker looks at, twice."""
 
 
 class Goal(Clean):

@@ -1,0 +1,166 @@
+"""Times calls on a busy machine, and says which functions their time goes to."""
+
+from __future__ import annotations
+
+import cProfile
+import dataclasses
+import re
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import CodeType
+from typing import Any
+
+from rlctl.check_env import bullet_calls
+from rlctl.check_env.clock import read_waited_s
+
+_BUILTIN = re.compile(
+    r"<built-in method (?P<function>.+)>|<method '(?P<method>.+)' of '(?P<of>.+)' objects>|<(?P<bare>.+)>"
+)
+"""How the profiler names functions that are not written in Python."""
+
+
+class Stopwatch:
+    """Calls functions, and keeps how long each took without the time in which it waited for a processor [s]."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+
+    def __call__(self, function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
+        """Call the function and return what it returns."""
+        waited_s, started = read_waited_s(), time.perf_counter()
+        value = function(*arguments, **keywords)
+        ended = time.perf_counter()
+        self.seconds.append(max(0.0, ended - started - (read_waited_s() - waited_s)))
+        return value
+
+
+@dataclasses.dataclass(frozen=True)
+class TimedCall:
+    """The calls of one function in all steps, or in all resets."""
+
+    name: str
+    """`pybullet.stepSimulation`."""
+    place: str
+    """The function of the environment that most of its time is spent for, `file.py:12`; empty if there is none."""
+    share: float
+    """Its part of the time of all steps, or of all resets."""
+    kind: str = ""
+    """`rendering`, `sleeping`, `loading` or `connecting`, for what is suspicious."""
+
+
+class Profiler:
+    """Calls functions under Python's profiler; use it inside `bullet_calls.visible_to_profilers`."""
+
+    def __init__(self) -> None:
+        self._profile = cProfile.Profile()
+
+    def __call__(self, function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
+        """Call the function and return what it returns."""
+        self._profile.enable()
+        try:
+            return function(*arguments, **keywords)
+        finally:
+            self._profile.disable()
+
+    def profile(self, is_own: Callable[[str], bool], kind_of: Callable[[str, bool], str]) -> Profile:
+        """Return where the time went. `is_own` says of a file whether it is the environment's own code; `kind_of` what
+        is suspicious about a function, given by its name and whether it is own code."""
+        return Profile(self._profile.getstats(), is_own, kind_of)
+
+
+@dataclasses.dataclass
+class _Function:
+    name: str
+    place: str
+    """Of the environment's own functions only."""
+    kind: str
+    own_s: float = 0.0
+    """The time in itself [s]."""
+
+
+class Profile:
+    """The functions that were called, as a graph of who calls whom."""
+
+    def __init__(self, stats: list[Any], is_own: Callable[[str], bool], kind_of: Callable[[str, bool], str]) -> None:
+        modules = {getattr(each, "__dict__", {}).get("__file__"): name for name, each in list(sys.modules.items())}
+        self._functions: dict[Any, _Function] = {}
+        self._called: dict[Any, Counter[Any]] = defaultdict(Counter)
+        """What a function calls, with the time of that and of all below [s]."""
+        self._callers: dict[Any, Counter[Any]] = defaultdict(Counter)
+        for entry in stats:
+            own = isinstance(entry.code, CodeType) and is_own(entry.code.co_filename)
+            name = _name_of(entry.code, own, modules)
+            place = f"{Path(entry.code.co_filename).name}:{entry.code.co_firstlineno}" if own else ""
+            function = self._functions.setdefault(entry.code, _Function(name, place, kind_of(name, own)))
+            function.own_s += entry.inlinetime
+            for each in entry.calls or ():
+                self._called[entry.code][each.code] += each.totaltime
+                self._callers[each.code][entry.code] += each.totaltime
+        self._seconds = sum(each.own_s for each in self._functions.values()) or 1.0
+
+    def slowest(self) -> list[TimedCall]:
+        """Return the functions by the time in themselves, the slowest first."""
+        return self._sum_up([(code, self._place(code), each.own_s) for code, each in self._functions.items()])
+
+    def suspicious(self) -> list[TimedCall]:
+        """Return the functions of a suspicious kind that no other such calls, with the time in all they call."""
+        found = []
+        for caller in self._walk():
+            for code, seconds in self._called[caller].items():
+                if self._functions[code].kind:
+                    found.append((code, self._functions[code].place or self._place(caller), seconds))
+        return self._sum_up(found)
+
+    def _walk(self) -> Iterator[Any]:
+        """Yield the functions that no suspicious one calls, from those on that nobody calls."""
+        waiting = [code for code in self._functions if not self._callers[code].keys() - {code}]
+        seen = set(waiting)
+        while waiting:
+            caller = waiting.pop()
+            yield caller
+            new = {code for code in self._called[caller] if not self._functions[code].kind} - seen
+            seen |= new
+            waiting += new
+
+    def _place(self, code: Any) -> str:
+        """Return the place of a function, or of the own function that most of its time is spent for."""
+        seen = set()
+        while code is not None and not self._functions[code].place:
+            seen.add(code)
+            callers = [each for each, _ in self._callers[code].most_common() if each not in seen]
+            code = callers[0] if callers else None
+        return "" if code is None else self._functions[code].place
+
+    def _sum_up(self, calls: Sequence[tuple[Any, str, float]]) -> list[TimedCall]:
+        """Return one call per name, with the place where most of its time goes, the slowest first."""
+        seconds: dict[str, float] = {}
+        first: dict[str, tuple[Any, str]] = {}
+        for code, place, spent in sorted(calls, key=lambda each: -each[2]):
+            name = self._functions[code].name
+            first.setdefault(name, (code, place))
+            seconds[name] = seconds.get(name, 0.0) + spent
+        timed = [
+            TimedCall(name, place, seconds[name] / self._seconds, self._functions[code].kind)
+            for name, (code, place) in first.items()
+        ]
+        return sorted(timed, key=lambda each: -each.share)
+
+
+def _name_of(code: CodeType | str, own: bool, modules: dict[Any, str]) -> str:
+    """Return a function's name without private modules: `numpy.linalg.norm`, `open`, `Ant.observe`."""
+    if isinstance(code, CodeType) and own:
+        return code.co_qualname.replace("<locals>.", "")
+    if isinstance(code, CodeType):
+        is_replaced = code.co_filename == bullet_calls.__file__
+        name = f"{'pybullet' if is_replaced else modules.get(code.co_filename, '')}.{code.co_qualname}"
+    elif (match := _BUILTIN.fullmatch(code)) is None:
+        return code
+    elif match["bare"]:  # OpenCV's functions do not say whose they are
+        name = f"cv2.{match['bare']}" if hasattr(sys.modules.get("cv2"), match["bare"]) else match["bare"]
+    else:
+        name = match["function"] or f"{match['of']}.{match['method']}"
+    *parts, function = name.replace("<locals>.", "").removeprefix("builtins.").removeprefix("io.").split(".")
+    return ".".join([*(each for each in parts if each and not each.startswith("_")), function])
