@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import sys
 from pathlib import Path
+from typing import Any
 
 import pybullet
 
@@ -27,14 +28,16 @@ class Case:
     expected: frozenset[tuple[str, str]]
     """Every finding: rule and severity."""
     twin: str = "broken_envs.py:Clean"
+    seconds: float = families.PROCESS_S
+    """What its experiments may take: less for one that would take all of it."""
 
     @property
     def rules(self) -> tuple[str, ...]:
         return tuple(sorted(rule for rule, _ in self.expected))
 
 
-def case(broken: str, *expected: tuple[str, str], twin: str = "broken_envs.py:Clean") -> Case:
-    return Case(broken, frozenset(expected), twin)
+def case(broken: str, *expected: tuple[str, str], **settings: Any) -> Case:
+    return Case(broken, frozenset(expected), **settings)
 
 
 def records_of(task, *experiments, seconds=families.PROCESS_S):
@@ -47,25 +50,25 @@ def records_of(task, *experiments, seconds=families.PROCESS_S):
     return records
 
 
-def shared_records_of(task, *experiments):
+def shared_records_of(task, *experiments, seconds=families.PROCESS_S):
     """What some experiments find out, each in a process of its own, and once for all tests: many have one twin."""
     records = Records(_path(task))
     for experiment in families.EXPERIMENTS:
         if experiment == "build" or (experiment in experiments and records.built):
-            for message in _play(task, experiment):
+            for message in _play(task, experiment, seconds):
                 records.add(message)
     return records
 
 
 @functools.cache
-def _play(task, experiment):
+def _play(task, experiment, seconds):
     (process,) = [
         name for name, each in families.PROCESSES.items() if families.EXPERIMENTS[experiment] in each.experiments
     ]
-    return _run(task, process, [experiment])
+    return _run(task, process, [experiment], seconds)
 
 
-def _run(task, process, experiments, seconds=families.PROCESS_S):
+def _run(task, process, experiments, seconds):
     """Run experiments of a process, which begins with nothing that an earlier one left."""
     for client in find_clients():  # of an environment that was not closed
         pybullet.disconnect(client)
@@ -78,9 +81,9 @@ def _path(task):
     return str(FOLDER / task) if ".py:" in task else task
 
 
-def verdict_of(task, *rules):
+def verdict_of(task, *rules, **settings):
     """The verdict by some rules, from the experiments that they need; or by all, from one process after the other."""
-    records = shared_records_of(task, *families.find_needs(rules)) if rules else _whole(task)
+    records = shared_records_of(task, *families.find_needs(rules), **settings) if rules else _whole(task)
     verdict = judge(records, rules or tuple(RULES))
     assert verdict.crashed == {}
     return verdict
@@ -91,12 +94,12 @@ def _whole(task):
     return records_of(task)
 
 
-def findings(task, *rules):
-    return verdict_of(task, *rules).findings
+def findings(task, *rules, **settings):
+    return verdict_of(task, *rules, **settings).findings
 
 
-def found(task, *rules):
-    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules)}
+def found(task, *rules, **settings):
+    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules, **settings)}
 
 
 def rules_of(family):
@@ -107,5 +110,5 @@ def rules_of(family):
 def check_case(case):
     """The mistake is found by its rules, and nothing by them in the twin. That no other rule finds anything in it is
     tested in test_all_rules.py."""
-    assert found(case.broken, *case.rules) == case.expected
+    assert found(case.broken, *case.rules, seconds=case.seconds) == case.expected
     assert found(case.twin, *case.rules) == set()

@@ -57,7 +57,7 @@ CASES = [
     case("broken_envs.py:OnlyOne", ("RL403", "error")),
     case("broken_envs.py:TimeLimitTerminates", ("RL501", "warning")),
     case("broken_envs.py:BothFlags", ("RL502", "error")),
-    case("broken_envs.py:Endless", ("RL503", "warning")),
+    case("broken_envs.py:Endless", ("RL503", "warning"), seconds=0.6),
     case("broken_envs.py:EndsAtOnce", ("RL504", "warning")),
     case("broken_envs.py:NanReward", ("RL601", "error")),
     case("broken_goals.py:OtherReward", ("RL614", "error"), twin="broken_goals.py:Goal"),

@@ -2,18 +2,18 @@
 
 **An experiment** does something with an environment in a child process and yields what it finds:
 
-    @experiment("attributes", "RL214", "RL404", share=0.5)
+    @experiment("attributes", "RL404", "RL216", share=0.5)
     def look_at_attributes(context: Context) -> Iterator[Message]:
         with context.fresh() as instance:
             instance.reset(FIRST_SEED)
-            yield Finding("RL214", "metadata is a list, not a dict", {"value": "list"})
+            yield Finding("RL216", "PyBullet was connected with a window", {"value": "GUI"})
 
 It decides the rules that it names: they are judged when it comes to its end. `raise NotJudged(why)` or
 `NotApplicable(why)` says so of all its rules without a finding, `yield Skipped("RL404", why)` of one of them. It calls
 the environment through `Instance.call`, `Instance.reset` and `Episode` only, so that what the environment raises is an
 `EnvironmentRaised`, which need not be caught, and a hang or a crash can be placed. `context.budget` is the time there
-is. One that does what no learner would (`provokes="an action of NaN"`) may crash the environment; that is then an error
-of its first rule, found by nobody else.
+is. One that does what no learner would (`provokes="rendering without a window"`) may crash the environment; that is
+then an error of its first rule, found by nobody else.
 
 **A check** judges one rule in the parent process, from recorded episodes, which many rules share:
 
@@ -26,9 +26,9 @@ It names the experiments that it needs (by default those that record the common 
 experiment besides episodes is a `Fact`: `yield Fact("truncation", "never")`, then `records.require_fact("truncation",
 "attributes")`. A recording experiment yields what `Recording.run()` returns.
 
-**Texts** (name, severity, meaning, fix) are in `rules.yaml`, not here. A
-finding gives its own severity or fix only where they differ from the rule's. Every check and experiment of a module in
-`MODULES` counts; the order of experiments is that of `PROCESSES`.
+**Texts** (name, severity, meaning, fix) are in `rules.yaml`, not here. A finding gives its own severity or fix only
+where they differ from the rule's. Every check and experiment of a module in `MODULES` counts; the order of experiments
+is that of `PROCESSES`.
 """
 
 from __future__ import annotations
