@@ -143,8 +143,16 @@ class Failure:
 
     @property
     def in_call(self) -> str:
-        """The call, in words for a message: `step 7`, `reset`."""
-        return f"step {self.step}" if self.call == "step" else self.call
+        """The call, in words for a message: `step 7`, `reset`, `the constructor`."""
+        names = {"step": f"step {self.step}", "load": "the import", "build": "the constructor"}
+        return names.get(self.call, self.call)
+
+    @property
+    def message(self) -> str:
+        """What happened, in words."""
+        if self.kind == "raised":
+            return f"{self.in_call} raised {self.error}"
+        return f"{self.in_call} {self.error}" if self.kind == "hung" else f"the process {self.error} in {self.in_call}"
 
     @property
     def place(self) -> dict[str, Any]:

@@ -178,8 +178,6 @@ def _find_lost_display(records: Records) -> Iterator[Finding]:
     for failure in records.failures:
         if lacks_display(failure):
             line = next(line for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)).strip()
-            doing = {"load": "the import", "build": "the constructor"}.get(failure.call, failure.call)
-            message = f"the process {failure.error} in {doing}, for want of a display: {line!r}"
-            yield Finding("RL216", message, failure.place)
+            yield Finding("RL216", f"{failure.message}, for want of a display: {line!r}", failure.place)
             return
     records.require_built()

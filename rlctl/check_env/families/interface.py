@@ -91,20 +91,20 @@ def select_failures(records: Records, kind: str) -> Iterator[Failure]:
 def _find_exceptions(records: Records) -> Iterator[Finding]:
     raised = [each for each in select_failures(records, "raised") if each.file is None]  # the others are RL007's
     for failure in raised[:MOST_FAILURES]:
-        yield Finding("RL207", f"{failure.in_call} raised {failure.error}", failure.place)
+        yield Finding("RL207", failure.message, failure.place)
 
 
 @check("RL208")
 def _find_ends_of_process(records: Records) -> Iterator[Finding]:
     for failure in select_failures(records, "died"):
         if not lacks_display(failure):  # RL216 says why
-            yield Finding("RL208", f"the process {failure.error} in {failure.in_call}", failure.place)
+            yield Finding("RL208", failure.message, failure.place)
 
 
 @check("RL209")
 def _find_hangs(records: Records) -> Iterator[Finding]:
     for failure in list(select_failures(records, "hung"))[:1]:
-        yield Finding("RL209", f"{failure.in_call} {failure.error}", failure.place)
+        yield Finding("RL209", failure.message, failure.place)
 
 
 @check("RL211", *RECORDING)

@@ -19,7 +19,7 @@ from rlctl.check_env.families.determinism import COMPARED_STEPS, compare, report
 from rlctl.check_env.families.interface import select_failures
 from rlctl.check_env.finding import Finding, NotJudged, Severity
 from rlctl.check_env.instance import Context, Instance
-from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Failure, Message, Skipped
+from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message, Skipped
 from rlctl.check_env.recording import Recording
 from rlctl.check_env.records import Records
 
@@ -121,14 +121,8 @@ def _failure(records: Records, rule: str, phase: str, doing: str) -> Finding | N
     for failure in records.failures:
         is_here = failure.process == "instances" and failure.phase == phase and failure.call != "build"
         if is_here and (failure.call, failure.error) not in alone:
-            return Finding(rule, f"{doing}, {_describe(failure)}", failure.place)
+            return Finding(rule, f"{doing}, {failure.message}", failure.place)
     return None
-
-
-def _describe(failure: Failure) -> str:
-    if failure.kind == "raised":
-        return f"{failure.in_call} raised {failure.error}"
-    return f"{failure.in_call} {'ended' if failure.kind == 'died' else 'hangs'}: the process {failure.error}"
 
 
 @check("RL401", "comparisons", "instances")

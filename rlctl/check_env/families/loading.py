@@ -13,7 +13,7 @@ from rlctl.check_env.experiment import RECORDING, check, experiment
 from rlctl.check_env.failures import find_missing_file, iterate_causes, lacks_display
 from rlctl.check_env.finding import Finding
 from rlctl.check_env.instance import Context, Instance
-from rlctl.check_env.messages import Built, Failure, Message
+from rlctl.check_env.messages import Built, Message
 from rlctl.check_env.own_code import find_author, is_task
 from rlctl.check_env.records import Records
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
@@ -105,12 +105,7 @@ def _find_end_while_loading(records: Records) -> Iterator[Finding]:
         for failure in records.failures:
             if failure.process == "probe" and failure.call in ("load", "build") and not lacks_display(failure):
                 evidence = {"last_output": failure.details} if failure.details else {}
-                yield Finding("RL004", _while_loading(failure), evidence)
-
-
-def _while_loading(failure: Failure) -> str:
-    doing = "the import" if failure.call == "load" else "the constructor"
-    return f"{doing} {failure.error}" if failure.kind == "hung" else f"the process {failure.error} in {doing}"
+                yield Finding("RL004", failure.message, evidence)
 
 
 @check("RL007", "build", *RECORDING)
