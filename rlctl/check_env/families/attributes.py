@@ -24,7 +24,7 @@ from rlctl.check_env.failures import (
 )
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.instance import Context, RenderMode
-from rlctl.check_env.messages import FIRST_SEED, Fact, Message
+from rlctl.check_env.messages import FIRST_SEED, Fact, Message, Skipped
 from rlctl.check_env.records import Records
 
 PICTURES: dict[RenderMode, str] = {"rgb_array": "a uint8 array of shape (height, width, 3)", "ansi": "a str"}
@@ -46,6 +46,9 @@ def read_attributes(context: Context) -> Iterator[Message]:
             yield Finding("RL216", "PyBullet was connected with a window (p.GUI)", evidence)
         instance.reset(FIRST_SEED)
         yield Fact("truncation", read_truncation(getattr(instance.env, "unwrapped", instance.env)))
+        if not instance.is_env:
+            yield Skipped("RL404", "it is not a gymnasium.Env (RL003)")
+            return
         with context.fresh() as other:
             yield from _shared_spaces(instance.env, other.env)
 
