@@ -68,7 +68,17 @@ def _read_key(file: Path | None) -> str | None:
 
 def run_server(server: PolicyServer, on_start: Callable[[str], None]) -> None:
     """Serve until SIGINT or SIGTERM; SIGHUP reads the policy file again. `on_start` is given the address."""
-    asyncio.run(serve_until(server, on_start, asyncio.Event(), handle_signals=True))
+    with asyncio.Runner(loop_factory=make_loop) as runner:
+        runner.run(serve_until(server, on_start, asyncio.Event(), handle_signals=True))
+
+
+def make_loop() -> asyncio.AbstractEventLoop:
+    """Return a loop for a server: uvloop's, which answers a quarter faster than asyncio's own, where there is one."""
+    try:
+        import uvloop
+    except ModuleNotFoundError:  # on Windows
+        return asyncio.new_event_loop()
+    return uvloop.new_event_loop()
 
 
 async def serve_until(

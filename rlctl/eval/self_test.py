@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rlctl import output
-from rlctl.deploy.serve import serve_until
+from rlctl.deploy.serve import make_loop, serve_until
 from rlctl.deploy.server import PolicyServer
 from rlctl.errors import AnswerIsNo
 from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
@@ -63,7 +63,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
     direct = run_evaluation(request, Gates())
     address: Future[str] = Future()
     end = asyncio.Event()
-    loop = asyncio.new_event_loop()
+    loop = make_loop()
 
     def serve() -> None:
         try:

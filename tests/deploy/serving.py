@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlctl.deploy.client import PolicyClient
-from rlctl.deploy.serve import make_server, serve_until
+from rlctl.deploy.serve import make_loop, make_server, serve_until
 from rlctl.env_spec import EnvSpec
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.policy import PolicyInfo, save_policy
@@ -58,9 +58,13 @@ class RunningServer:
         self.server = make_server(file, port=0, **settings)
         self._end = asyncio.Event()
         self._started = threading.Event()
-        self._thread = threading.Thread(target=asyncio.run, args=(self._serve(),))
+        self._thread = threading.Thread(target=self._run)
         self._thread.start()
         assert self._started.wait(30)
+
+    def _run(self):
+        with asyncio.Runner(loop_factory=make_loop) as runner:
+            runner.run(self._serve())
 
     async def _serve(self):
         self._loop = asyncio.get_running_loop()
