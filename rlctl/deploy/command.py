@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rlctl.deploy.bounds import Bounds
 from rlctl.deploy.fitting import FittedLimits
 from rlctl.deploy.limits import Limits
+from rlctl.deploy.safety_events import Intervention
 
 Array = NDArray[np.float64]
 
@@ -26,20 +27,23 @@ class OutsideLimits(Exception):
 
 
 class Command:
-    """The command that a robot is given, step by step. `report` is called with limit, value and bound as they act."""
+    """The command that a robot is given, step by step. `report` is called with what limits do, without its time."""
 
     def __init__(
-        self, limits: Limits, fitted: FittedLimits, bounds: Bounds, report: Callable[[str, float, float], None]
+        self, limits: Limits, fitted: FittedLimits, bounds: Bounds, report: Callable[[Intervention], None]
     ) -> None:
-        self._bounds, self._dt, self._report = bounds, fitted.control_dt or 1.0, report
+        self._bounds, self._report = bounds, report
+        self.names = bounds.names
+        """Of the joints."""
         assert isinstance(fitted.space, spaces.Box)  # what has bounds
         self._space = fitted.space
         self._safe, self._home = fitted.safe, fitted.home
         self._is_position = limits.command == "position"
-        self._blend_steps = round(limits.blend_in_s / self._dt)
+        self._blend_steps = round(limits.blend_in_s / bounds.dt)
         cutoff = limits.lowpass_hz
-        self._alpha = 1.0 if cutoff is None else 1.0 - math.exp(-2.0 * math.pi * cutoff * self._dt)
+        self._alpha = 1.0 if cutoff is None else 1.0 - math.exp(-2.0 * math.pi * cutoff * bounds.dt)
         self._zeros = np.zeros(len(self._safe))
+        self._none = bytes(len(self._safe))
         self.reset()
 
     def reset(self) -> None:
@@ -127,11 +131,11 @@ class Command:
         """Return the action for a value or motion that is wanted, within the bounds."""
         bounds, reference = self._bounds, self._reference
         if not bounds.is_value:
-            command = self._before = bounds.bound(target, self._before, reference, self._describe)
+            command = self._before = bounds.bound(target, self._before, reference, self._note)
         elif reference is None:
             command = target
         else:
-            self._before = bounds.bound(target - reference, self._before, reference, self._describe)
+            self._before = bounds.bound(target - reference, self._before, reference, self._note)
             command = np.minimum(np.maximum(reference + self._before, bounds.low), bounds.high)
             self._reference = command
         action = ((command - bounds.offset) / bounds.factor).astype(self._space.dtype)
@@ -140,20 +144,7 @@ class Command:
         result: NDArray[Any] = np.minimum(np.maximum(action, self._space.low), self._space.high)
         return result
 
-    def _describe(self, name: str, x: Array, allowed: Array, limit: Array) -> None:
-        """Report each joint that a limit acts on, in the units of the limit."""
-        bounds, dt = self._bounds, self._dt
-        with np.errstate(over="ignore"):  # a policy may want anything
-            if name in ("speed", "rate"):
-                value, at = x / dt, limit / dt
-            elif name == "acceleration":
-                value, at = (x - self._before) / dt**2, (limit - self._before) / dt**2
-            elif name == "action" and not bounds.is_value:
-                value, at = x / bounds.factor, limit / bounds.factor
-            else:
-                assert self._reference is not None  # positions are bounded from there
-                value, at = self._reference + x, self._reference + allowed
-                if name == "action":
-                    value, at = (value - bounds.offset) / bounds.factor, (at - bounds.offset) / bounds.factor
-        for index in np.flatnonzero(np.abs(allowed - x) > 1e-9).tolist():
-            self._report(f"{bounds.names[index]}.{name}", float(value[index]), float(at[index]))
+    def _note(self, limit: str, x: Array, allowed: Array, ends: tuple[Array, Array]) -> None:
+        acted = np.abs(allowed - x) > 1e-9  # bounds are reached exactly: what is less is rounding
+        if acted.tobytes() != self._none:
+            self._report(Intervention(0.0, self._bounds, limit, x, allowed, ends, self._before, self._reference, acted))

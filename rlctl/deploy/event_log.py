@@ -8,10 +8,12 @@ import logging
 import logging.handlers
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rlctl.deploy.messages import as_json
+from rlctl.deploy.safety_events import Intervention, SafetyEvent
 from rlctl.errors import ArtifactError
 
 _LARGEST = 10_000_000  # [bytes] of one file
@@ -38,29 +40,39 @@ class EventLog:
         except OSError as error:
             raise ArtifactError(f"{file}: the log cannot be written: {error.strerror or error}") from None
 
-    def write(self, kind: str, client: int | None = None, **fields: Any) -> None:
-        """Write an event."""
+    def write(self, kind: str, client: int | None = None, *, time_s: float | None = None, **fields: Any) -> None:
+        """Write what happened, now or at `time_s`."""
         if self._handler is None:
             return
-        count = self._count_repeated(client, fields["name"]) if kind in ("limit", "fault") else 1
-        if count == 0:
-            return
-        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
-        line = {"time": now, "kind": kind, "client": client, **fields, "count": count}
+        at = datetime.datetime.fromtimestamp(time.time() if time_s is None else time_s, datetime.UTC)
+        line = {"time": at.isoformat(timespec="milliseconds"), "kind": kind, "client": client, **fields}
         text = json.dumps(as_json({key: value for key, value in line.items() if value not in (None, "")}))
         self._handler.emit(logging.LogRecord("rlctl", logging.INFO, "", 0, text, None, None))
 
-    def _count_repeated(self, client: int | None, name: str) -> int:
-        """Return how often an event occurred since it was written; 0 if it is not to be written again yet."""
-        key, now = (client or 0, name), time.monotonic()
-        written, waiting = self._repeated.get(key, (-_REPEAT_S, 0))
-        if now - written < _REPEAT_S:
-            self._repeated[key] = written, waiting + 1
-            return 0
-        if len(self._repeated) >= _MOST_NAMES:
-            self._repeated.clear()
-        self._repeated[key] = now, 0
-        return waiting + 1
+    def write_event(self, client: int, event: SafetyEvent | Intervention) -> None:
+        """Write what a safety filter did."""
+        if self._handler is None:
+            return
+        counts = dict.fromkeys(event.names, 1) if event.kind == "state" else self._count(client, event.names)
+        if counts:
+            for each in event.list_events():
+                if (count := counts.get(each.name)) is not None:
+                    place = {"name": each.name, "value": each.value, "limit": each.limit}
+                    self.write(each.kind, client, time_s=each.time_s, **place, count=count)
+
+    def _count(self, client: int, names: Sequence[str]) -> dict[str, int]:
+        """Return how often each event occurred since it was written, of those that are to be written again."""
+        due, now = {}, time.monotonic()
+        for name in names:
+            written, waiting = self._repeated.get((client, name), (-_REPEAT_S, 0))
+            if now - written < _REPEAT_S:
+                self._repeated[client, name] = written, waiting + 1
+                continue
+            if len(self._repeated) >= _MOST_NAMES:
+                self._repeated.clear()
+            self._repeated[client, name] = now, 0
+            due[name] = waiting + 1
+        return due
 
     def close(self) -> None:
         """Close the file."""

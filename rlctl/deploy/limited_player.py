@@ -37,7 +37,7 @@ class LimitedPlayer(Player):
         if step == 0:
             self._safety.resume()
             self._safety.reset()
-            self._before = self._safety.counts.copy()
+            self._before = self._safety.counts
         believed = self._safety.observe(observation)
         wanted = self._player.act(observation, seed, step)[1] if believed else None
         action = self._safety.limit(wanted)

@@ -43,13 +43,11 @@ class Measurements:
         self.started_s = time.time()
         self.inference, self.request = Durations(), Durations()
         self.errors = self.deadline_misses = self.connections = self.refused = self.policy_changes = 0
-        self.counts: collections.Counter[str] = collections.Counter()
-        """How often each limit stepped in and each fault occurred."""
         self.control_error = float("nan")
         self.spread: float | None = None
 
-    def format_prometheus(self, states: collections.Counter[str]) -> str:
-        """Return everything in Prometheus' text form."""
+    def format_prometheus(self, states: collections.Counter[str], interventions: collections.Counter[str]) -> str:
+        """Return everything in Prometheus' text form, with how many clients are in each state."""
         lines: list[str] = []
 
         def add(name: str, kind: str, text: str, *samples: tuple[str, float]) -> None:
@@ -73,7 +71,7 @@ class Measurements:
         add("policy_changes_total", "counter", "Policies that took the place of another.", ("", self.policy_changes))
         states_now = [(f'{{state="{each}"}}', states[each]) for each in ("idle", "running", "holding", "stopped")]
         add("state", "gauge", "Clients by state.", *states_now)
-        counts = [(f'{{name="{_escape(name)}"}}', count) for name, count in sorted(self.counts.items())]
+        counts = [(f'{{name="{_escape(name)}"}}', count) for name, count in sorted(interventions.items())]
         add("interventions_total", "counter", "How often each limit and fault occurred.", *counts)
         add("control_error", "gauge", "Largest difference of a joint from its command.", ("", self.control_error))
         if self.spread is not None:

@@ -117,8 +117,8 @@ class _Routes:
 
     async def _serve_metrics(self, request: web.Request) -> web.Response:
         self.server.measure_spread()
-        states = self.server.count_states()
-        text = self.server.measurements.format_prometheus(states)
+        server = self.server
+        text = server.measurements.format_prometheus(server.count_states(), server.count_interventions())
         return web.Response(text=text, content_type="text/plain", charset="utf-8")
 
     async def _serve_live(self, request: web.Request) -> web.Response:

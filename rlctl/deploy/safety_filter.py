@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
-import functools
 import math
 import time
 from collections.abc import Callable
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 from rlctl.deploy.command import Command, OutsideLimits
 from rlctl.deploy.fitting import fit_limits
 from rlctl.deploy.limits import Limits, read_limits
+from rlctl.deploy.safety_events import Intervention, Kind, SafetyEvent
 from rlctl.deploy.sensors import SensorChecks
 from rlctl.errors import UsageError
 from rlctl.run.env_info import EnvInfo
@@ -25,18 +24,6 @@ Array = NDArray[Any]
 State = Literal["idle", "running", "holding", "stopped"]
 
 _NO_FILE = Limits()
-
-
-@dataclasses.dataclass(frozen=True)
-class SafetyEvent:
-    """Something that the filter did: an action limited, a fault, or another state."""
-
-    time_s: float
-    kind: Literal["limit", "fault", "state"]
-    name: str
-    """Of a limit `joint.speed` and its like, of a fault what was wrong, of a state the new one."""
-    value: float | str = ""
-    limit: float | None = None
 
 
 class SafetyFilter:
@@ -66,14 +53,13 @@ class SafetyFilter:
         self._sensors = SensorChecks(limits, fitted.layout, fitted.control_dt)
         self._command: Command | None = None
         if fitted.bounds is not None:
-            self._command = Command(limits, fitted, fitted.bounds, functools.partial(self._record, "limit"))
+            self._command = Command(limits, fitted, fitted.bounds, self._limited)
         self._clock = clock
-        self.events: collections.deque[SafetyEvent] = collections.deque(maxlen=limits.log_lines)
-        """The last events, oldest first."""
-        self.on_event: Callable[[SafetyEvent], None] = lambda event: None
-        """Called with every event."""
-        self.counts: collections.Counter[str] = collections.Counter()
-        """How often each limit stepped in and each fault occurred, since the filter was made."""
+        self._history: collections.deque[SafetyEvent | Intervention] = collections.deque(maxlen=limits.log_lines)
+        self._limits_acted: dict[str, NDArray[np.int64]] = {}
+        self._counted: collections.Counter[str] = collections.Counter()
+        self.on_event: Callable[[SafetyEvent | Intervention], None] | None = None
+        """Called with each event, those of one limit in a step together."""
         self.steps = 0
         """Actions since the filter was made."""
         self.state: State = "idle"
@@ -134,6 +120,23 @@ class SafetyFilter:
             self.begin_blend()
             self._record("state", "policy" if action is None else "override")
         self._manual = action
+
+    @property
+    def events(self) -> list[SafetyEvent]:
+        """The last events, oldest first."""
+        found = [event for each in self._history for event in each.list_events()]
+        return found[-self.limits.log_lines :]
+
+    @property
+    def counts(self) -> collections.Counter[str]:
+        """How often each limit acted on each joint and each fault occurred, since the filter was made."""
+        found: collections.Counter[str] = collections.Counter()
+        if self._command is not None:
+            for limit, times in self._limits_acted.items():
+                each = zip(self._command.names, times.tolist(), strict=True)
+                found.update({f"{joint}.{limit}": count for joint, count in each if count})
+        found.update(self._counted)
+        return found
 
     @property
     def is_overridden(self) -> bool:
@@ -239,11 +242,19 @@ class SafetyFilter:
             self.state, self.reason = state, reason
             self._record("state", state, reason)
 
-    def _record(
-        self, kind: Literal["limit", "fault", "state"], name: str, value: float | str = "", limit: float | None = None
-    ) -> None:
+    def _limited(self, intervention: Intervention) -> None:
+        intervention.time_s = self._clock()
+        if (counts := self._limits_acted.get(intervention.limit)) is None:
+            counts = self._limits_acted[intervention.limit] = np.zeros(len(intervention.acted), np.int64)
+        np.add(counts, intervention.acted, out=counts)
+        self._keep(intervention)
+
+    def _record(self, kind: Kind, name: str, value: float | str = "", limit: float | None = None) -> None:
         if kind != "state":
-            self.counts[name] += 1
-        event = SafetyEvent(self._clock(), kind, name, value, limit)
-        self.events.append(event)
-        self.on_event(event)
+            self._counted[name] += 1
+        self._keep(SafetyEvent(self._clock(), kind, name, value, limit))
+
+    def _keep(self, event: SafetyEvent | Intervention) -> None:
+        self._history.append(event)
+        if self.on_event is not None:
+            self.on_event(event)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import dataclasses
+import functools
 import itertools
 import time
 from pathlib import Path
@@ -20,7 +21,7 @@ from rlctl.deploy.limits import Limits
 from rlctl.deploy.measurements import Measurements
 from rlctl.deploy.observation import ObservationLayout
 from rlctl.deploy.rerun_log import RerunLog
-from rlctl.deploy.safety_filter import SafetyEvent
+from rlctl.deploy.safety_events import SafetyEvent
 from rlctl.deploy.served_policy import ServedPolicy, load_served_policy
 from rlctl.deploy.session import Session
 from rlctl.dict_spaces import split
@@ -57,6 +58,7 @@ class PolicyServer:
         self._recording = None if settings.rerun is None else RerunLog(settings.rerun)
         self._numbers = itertools.count(1)
         self._sessions: dict[int, Session] = {}
+        self._earlier_counts: collections.Counter[str] = collections.Counter()
         self._manual: Any | None = None
         """The action by hand."""
         self._order: str | None = None
@@ -90,7 +92,8 @@ class PolicyServer:
 
     def _open_session(self) -> Session:
         session = Session(next(self._numbers), lambda: self.policy, self._limits)
-        session.safety.on_event = lambda event: self._take_event(session, event)
+        if self.settings.log is not None:
+            session.safety.on_event = functools.partial(self._log.write_event, session.number)
         self._sessions[session.number] = session
         self._log.write("connected", session.number)
         if self._order is not None:
@@ -100,12 +103,15 @@ class PolicyServer:
 
     def _close_session(self, session: Session) -> None:
         self._sessions.pop(session.number, None)
+        self._earlier_counts.update(session.safety.counts)
         self._log.write("disconnected", session.number, name=session.safety.state, steps=session.safety.steps)
 
-    def _take_event(self, session: Session, event: SafetyEvent) -> None:
-        if event.kind != "state":
-            self.measurements.counts[event.name] += 1
-        self._log.write(event.kind, session.number, name=event.name, value=event.value, limit=event.limit)
+    def count_interventions(self) -> collections.Counter[str]:
+        """Return how often each limit acted and each fault occurred, of all clients so far."""
+        return sum((each.safety.counts for each in self._sessions.values()), self._earlier_counts)
+
+    def _write_fault(self, session: Session, name: str, value: float | str, limit: float | None = None) -> None:
+        self._log.write_event(session.number, SafetyEvent(time.time(), "fault", name, value, limit))
 
     def close(self) -> None:
         """Close the log and the recording."""
@@ -174,7 +180,7 @@ class PolicyServer:
 
     async def _send_error(self, socket: web.WebSocketResponse, session: Session, text: str) -> None:
         self.measurements.errors += 1
-        self._log.write("fault", session.number, name="message", value=text)
+        self._write_fault(session, "message", text)
         await socket.send_str(text)
 
     def answer(self, session: Session, request: Any) -> dict[str, Any]:
@@ -204,7 +210,7 @@ class PolicyServer:
         self.measurements.request.add(seconds)
         if (dt := session.safety.control_dt) is not None and seconds > dt:
             self.measurements.deadline_misses += 1
-            self._log.write("fault", session.number, name="deadline", value=seconds, limit=dt)
+            self._write_fault(session, "deadline", seconds, dt)
 
     def give_order(self, order: str) -> int:
         """Order all clients, present and future, to stop, home, hold or resume; return how many there are.
@@ -267,7 +273,7 @@ class PolicyServer:
             "deadline_misses": measured.deadline_misses,
             "errors": measured.errors,
             "spread": measured.spread,
-            "counts": dict(measured.counts.most_common(20)),
+            "counts": dict(self.count_interventions().most_common(20)),
             "clients": [_describe(session) for session in self._sessions.values() if session.safety.steps],
         }
 
@@ -286,5 +292,5 @@ def _describe(session: Session) -> dict[str, Any]:
         "observation": {
             name: [] if flat is None else flat[place][:32] for name, place in list(safety.layout.slices.items())[:16]
         },
-        "events": [dataclasses.asdict(event) for event in list(safety.events)[-8:]],
+        "events": [dataclasses.asdict(event) for event in safety.events[-8:]],
     }

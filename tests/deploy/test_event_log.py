@@ -5,6 +5,7 @@ import json
 import pytest
 
 from rlctl.deploy.event_log import EventLog
+from rlctl.deploy.safety_events import SafetyEvent
 from rlctl.errors import ArtifactError
 from tests.deploy.serving import OBSERVATION, RunningServer, write_policy
 from tests.replay.reading import column
@@ -13,14 +14,14 @@ from tests.replay.reading import column
 def test_what_repeats_is_counted(tmp_path):
     log = EventLog(tmp_path / "log.jsonl")
     for _ in range(5):
-        log.write("limit", 1, name="elbow.speed", value=2.0, limit=1.0)
-        log.write("limit", 2, name="elbow.speed", value=float("nan"), limit=1.0)
+        log.write_event(1, SafetyEvent(7.0, "limit", "elbow.speed", 2.0, 1.0))
+        log.write_event(2, SafetyEvent(7.0, "limit", "elbow.speed", float("nan"), 1.0))
     log.write("state", 1, name="stopped")
     log.close()
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [(line["kind"], line["client"]) for line in lines] == [("limit", 1), ("limit", 2), ("state", 1)]
     assert lines[0]["value"] == 2.0
-    assert "T" in lines[0]["time"]
+    assert lines[0]["time"] == "1970-01-01T00:00:07.000+00:00"
 
 
 def test_files_are_rotated(tmp_path):
