@@ -37,7 +37,10 @@ class Bounds:
         self, limits: Limits, space: spaces.Box, names: list[str], control_dt: float | None, known: Joints | None = None
     ) -> None:
         self.names = names
-        check_names("joint", [name for name in limits.limits if name != "all"], names, "limits: ")
+        given = [name for name in limits.limits if name != "all"]
+        named = limits.joints is not None or known is not None
+        hint = "" if named else " This policy does not name them: write joints: [names, in the action's order]."
+        check_names("joint", given, names, "limits: ", hint)
         each = [_merge(limits, name, _list_known(limits, known, index)) for index, name in enumerate(names)]
         for joint, name in zip(each, names, strict=True):
             _check_fitting(limits, joint, name)

@@ -150,12 +150,12 @@ def _explain(problem: Any, place: tuple[str | int, ...], schema: schema_text.Sch
     return f"{key}: expected {expected}{f' [{unit}]' if unit else ''}, got {short_repr(given)}"
 
 
-def check_names(kind: str, given: Any, known: Any, where: str = "") -> None:
+def check_names(kind: str, given: Any, known: Any, where: str = "", hint: str = "") -> None:
     """Raise `RecipeError` for a name that is not known, with the closest one."""
     known = list(known)
     for name in given:
         if name not in known:
             listed = short_repr(", ".join(known) or "none", 200)
             raise RecipeError(
-                f"{where}no {kind} {short_repr(name)!r}.{did_you_mean(str(name), known)} Known: {listed}."
+                f"{where}no {kind} {short_repr(name)!r}.{did_you_mean(str(name), known)} Known: {listed}.{hint}"
             )

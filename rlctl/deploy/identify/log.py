@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.errors import ArtifactError, UsageError, did_you_mean, short_repr
 from rlctl.run import files, untrusted
 
 Array = NDArray[np.float64]
@@ -146,7 +146,9 @@ def _read_row(path: Path, line: int, row: list[str], names: list[str]) -> list[f
 
 def _take(path: Path, columns: Mapping[str, Array], name: str) -> Array:
     if name not in columns:
-        raise ArtifactError(f"{path}: no column {name!r}.{did_you_mean(name, columns)} It has: {', '.join(columns)}.")
+        raise ArtifactError(
+            f"{path}: no column {name!r}.{did_you_mean(name, columns)} It has: {short_repr(', '.join(columns), 200)}."
+        )
     return columns[name]
 
 
