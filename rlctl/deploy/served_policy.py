@@ -7,27 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError
-from rlctl.run.acting import PolicyPlayer, check_playable
+from rlctl.run.acting import NumpyPolicy, check_playable
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.numpy_policy import NumpyNetwork, select_actor_tensors
-from rlctl.run.policy import PolicyInfo, read_policy
-
-Array = NDArray[Any]
-
-
-class Actor(abc.ABC):
-    """Acts for one client; a recurrent policy remembers."""
-
-    @abc.abstractmethod
-    def act(self, observation: Any) -> Array:
-        """Return the deterministic action for an observation."""
-
-    @abc.abstractmethod
-    def reset(self) -> None:
-        """Begin an episode."""
+from rlctl.run.network import Network, select_actor_tensors
+from rlctl.run.policy import Policy, PolicyInfo, read_policy
 
 
 class ServedPolicy(abc.ABC):
@@ -38,8 +23,8 @@ class ServedPolicy(abc.ABC):
         self.info = info
 
     @abc.abstractmethod
-    def make_actor(self) -> Actor:
-        """Return what acts for one client."""
+    def make_actor(self) -> Policy:
+        """Return what acts for one client: a recurrent policy remembers."""
 
     def measure_spread(self, observation: Any) -> float | None:
         """Return the mean standard deviation of the actions that were trained with; None where there is none."""
@@ -57,28 +42,16 @@ class ServedPolicy(abc.ABC):
             raise ArtifactError(f"{self.file.name}: this policy cannot replace the one that is served: {difference}")
 
 
-class _NumpyActor(Actor):
-    def __init__(self, player: PolicyPlayer) -> None:
-        self._player = player
-
-    def act(self, observation: Any) -> Array:
-        return np.asarray(self._player.act(observation, 0, 0)[1])
-
-    def reset(self) -> None:
-        if (state := self._player.state) is not None:
-            state[:] = 0.0
-
-
 class _NumpyPolicy(ServedPolicy):
     def __init__(self, file: Path) -> None:
         info, tensors = read_policy(file)
         check_playable(info, tensors, file)
         super().__init__(file, info)
         self._tensors = select_actor_tensors(info, tensors)
-        self._network = NumpyNetwork(info, self._tensors)
+        self._network = Network(info, self._tensors)
 
-    def make_actor(self) -> Actor:
-        return _NumpyActor(PolicyPlayer(self.info, self._tensors))
+    def make_actor(self) -> Policy:
+        return NumpyPolicy(self.info, self._tensors)
 
     def measure_spread(self, observation: Any) -> float | None:
         network, algo = self._network, self.info.algo
@@ -88,18 +61,7 @@ class _NumpyPolicy(ServedPolicy):
             return float(np.exp(network.log_std).mean())
         if network.lstm is not None or self.info.env.action_space["type"] != "Box":
             return None
-        return float(np.exp(network.compute_log_std(network.latent(observation))).mean())
-
-
-class _OnnxActor(Actor):
-    def __init__(self, policy: Any) -> None:
-        self._policy = policy
-
-    def act(self, observation: Any) -> Array:
-        return np.asarray(self._policy.predict(observation))
-
-    def reset(self) -> None:
-        self._policy.reset()
+        return float(np.exp(network.compute_log_std(network.compute_latent(observation))).mean())
 
 
 class _OnnxServedPolicy(ServedPolicy):
@@ -109,8 +71,8 @@ class _OnnxServedPolicy(ServedPolicy):
         self._policy = OnnxPolicy.load(file)
         super().__init__(file, self._policy.info)
 
-    def make_actor(self) -> Actor:
-        return _OnnxActor(type(self._policy)(self.info, self._policy.session))
+    def make_actor(self) -> Policy:
+        return type(self._policy)(self.info, self._policy.session)
 
 
 def load_served_policy(file: Path) -> ServedPolicy:

@@ -64,7 +64,7 @@ class Session:
             if self.safety.observe(observation, age_s):
                 begin = time.perf_counter()
                 try:
-                    wanted = self._actor.act(observation)
+                    wanted = self._actor.predict(observation)
                 except (RlctlError, ValueError, ArithmeticError) as problem:
                     error = f"the policy cannot act: {short_repr(str(problem), 200)}"
                 infer_s = time.perf_counter() - begin

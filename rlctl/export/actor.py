@@ -8,92 +8,73 @@ import numpy as np
 import onnx
 from gymnasium import spaces
 
+from rlctl.dict_spaces import SINGLE, split_space
 from rlctl.export.graph import BATCH, Graph, unsupported
-from rlctl.export.layers import emit, emit_lstm
+from rlctl.export.layers import concatenate, emit, emit_lstm
 from rlctl.export.metadata import describe, metadata
-from rlctl.export.observation import Observations, Tensors
-from rlctl.run.onnx_policy import ACTION, STATE_INPUTS, STATE_OUTPUTS
+from rlctl.run.layers import Lstm, Normalize, OneHot
+from rlctl.run.network import Network, Tensors
+from rlctl.run.onnx_policy import ACTION, SINGLE_INPUT, STATE_INPUTS, STATE_OUTPUTS
 from rlctl.run.policy import PolicyInfo
 
 _STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of the step before"
 
 
-def build(info: PolicyInfo, network: Any, tensors: Tensors) -> onnx.ModelProto:
-    """Write a policy as ONNX: normalisation, the deterministic actor, and SB3's clip or unscaling of its action.
+def build(info: PolicyInfo, tensors: Tensors) -> onnx.ModelProto:
+    """Write a policy file as ONNX: normalisation, the deterministic actor, and SB3's clip or unscaling of its action.
 
-    `network` is the SB3 policy with the weights of `tensors`. Raises `UsageError` for what has no translation.
+    Raises `UsageError` for what has no translation.
     """
-    graph = Graph()
-    _, action_space = info.env.spaces()
-    value, *state = _ACTORS[info.algo](graph, Observations(graph, info, tensors), network)
+    graph, network = Graph(), Network(info, tensors)
+    observation_space, action_space = info.env.spaces()
+    inputs = {key: _add_input(graph, info, key, part) for key, part in split_space(observation_space).items()}
+    value = concatenate(graph, [_emit_part(graph, inputs[key], network, key) for key in network.parts])
+    state: tuple[str, ...] = ()
+    if (lstm := network.lstm) is not None:
+        hidden, cell = (graph.input(name, np.float32, _find_state_shape(lstm), _STATE_MEANING) for name in STATE_INPUTS)
+        value, state = emit_lstm(graph, value, (hidden, cell), lstm)
+    value = emit(graph, value, [*network.trunk, *network.head])
     if isinstance(action_space, spaces.Box):
-        value, dtype = _emit_continuous(graph, value, action_space, bool(network.squash_output))
+        # Where tanh ends the network there was noise before it, of which a deterministic action has none.
+        value = graph.add("Tanh", value) if network.ends_with_tanh else value
+        value, dtype = _emit_continuous(graph, value, action_space, network.is_squashed)
     else:
         value, dtype = _emit_discrete(graph, value, action_space), np.dtype(np.int64)
     shape: tuple[int | str, ...] = (BATCH, *(action_space.shape or ()))
     graph.output(value, ACTION, dtype, shape, info.env.action_meaning or "action, as the environment takes it")
     for name, part in zip(STATE_OUTPUTS, state, strict=False):
-        graph.output(part, name, np.float32, _find_state_shape(network), "LSTM state for the next step")
+        assert lstm is not None  # which has the state
+        graph.output(part, name, np.float32, _find_state_shape(lstm), "LSTM state for the next step")
     return graph.model(metadata(info), describe(info))
 
 
-def _emit_actor_critic(graph: Graph, observations: Observations, network: Any) -> list[str]:
-    """PPO, A2C: the mean of the distribution, or the logits."""
-    value = observations.features(network.pi_features_extractor, scale_images=network.normalize_images)
-    return [_emit_action_net(graph, value, network)]
+def _find_state_shape(lstm: Lstm) -> tuple[int, str, int]:
+    return len(lstm.layers), BATCH, lstm.state.shape[2]
 
 
-def _emit_recurrent(graph: Graph, observations: Observations, network: Any) -> list[str]:
-    value = observations.features(network.pi_features_extractor, scale_images=network.normalize_images)
-    hidden, cell = (graph.input(name, np.float32, _find_state_shape(network), _STATE_MEANING) for name in STATE_INPUTS)
-    value, after = emit_lstm(graph, value, (hidden, cell), network.lstm_actor, "lstm_actor")
-    return [_emit_action_net(graph, value, network), *after]
+def _add_input(graph: Graph, info: PolicyInfo, key: str, space: spaces.Space[Any]) -> tuple[str, Any]:
+    """Add the input of a part of the observation; return its name and dtype."""
+    name = SINGLE_INPUT if key == SINGLE else key
+    if space.shape is None or space.dtype is None:
+        raise unsupported(f"observation {name!r}, a {type(space).__name__} space,")
+    meaning = _describe_input(info) if key == SINGLE else f"observation {key!r}"
+    return graph.input(name, space.dtype, (BATCH, *space.shape), meaning), space.dtype
 
 
-def _find_state_shape(network: Any) -> tuple[int, str, int]:
-    return network.lstm_actor.num_layers, BATCH, network.lstm_actor.hidden_size
+def _describe_input(info: PolicyInfo) -> str:
+    sizes, units = info.env.observation_sizes, info.env.observation_units
+    parts = [
+        f"{name} ({size}) [{units[name]}]" if name in units else f"{name} ({size})" for name, size in sizes.items()
+    ]
+    return ", ".join(parts) or "observation"
 
 
-def _emit_action_net(graph: Graph, value: str, network: Any) -> str:
-    value = emit(graph, value, network.mlp_extractor.policy_net, "mlp_extractor.policy_net")
-    value = emit(graph, value, network.action_net, "action_net")
-    # gSDE with bounded actions; the noise itself has no part in a deterministic action.
-    return graph.add("Tanh", value) if network.squash_output else value
-
-
-def _emit_squashed_gaussian(graph: Graph, observations: Observations, network: Any) -> list[str]:
-    """SAC, TQC, CrossQ, with gSDE or without: tanh of the mean."""
-    actor = network.actor
-    value = observations.features(actor.features_extractor, scale_images=actor.normalize_images)
-    value = emit(graph, value, actor.latent_pi, "actor.latent_pi")
-    return [graph.add("Tanh", emit(graph, value, actor.mu, "actor.mu"))]
-
-
-def _emit_deterministic(graph: Graph, observations: Observations, network: Any) -> list[str]:
-    """TD3, DDPG: the network ends with its own tanh."""
-    actor = network.actor
-    value = observations.features(actor.features_extractor, scale_images=actor.normalize_images)
-    return [emit(graph, value, actor.mu, "actor.mu")]
-
-
-def _emit_q_values(graph: Graph, observations: Observations, network: Any) -> list[str]:
-    q_net = network.q_net
-    value = observations.features(q_net.features_extractor, scale_images=q_net.normalize_images)
-    return [emit(graph, value, q_net.q_net, "q_net.q_net")]
-
-
-# Each returns the end of the network's own computation and, if recurrent, the next state.
-_ACTORS = {
-    "ppo": _emit_actor_critic,
-    "a2c": _emit_actor_critic,
-    "recurrent_ppo": _emit_recurrent,
-    "sac": _emit_squashed_gaussian,
-    "tqc": _emit_squashed_gaussian,
-    "crossq": _emit_squashed_gaussian,
-    "td3": _emit_deterministic,
-    "ddpg": _emit_deterministic,
-    "dqn": _emit_q_values,
-}
+def _emit_part(graph: Graph, source: tuple[str, Any], network: Network, key: str) -> str:
+    """From a part of the observation to its features."""
+    (value, dtype), layers = source, network.parts[key]
+    if dtype != np.float32 and not isinstance(layers[0], Normalize | OneHot):
+        value = graph.cast(value, np.float32)
+    return emit(graph, value, layers)
 
 
 def _emit_continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool) -> tuple[str, np.dtype[Any]]:

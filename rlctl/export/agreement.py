@@ -9,7 +9,6 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.run.policy import ROWS
 from rlctl.run.torch_policy import TorchPolicy
 
 MAX_DIFFERENCE = 1e-5
@@ -27,7 +26,8 @@ class Agreement:
     """Actions that differ by more than the limit; for discrete actions, that differ at all."""
     near_ties: int
     """Discrete actions that differ because their logits agree within the limit: either choice is right."""
-    batch_sizes: tuple[int, ...] = (1, ROWS)
+    batch_sizes: tuple[int, ...]
+    """How many observations the exported policy was given at once."""
 
     @property
     def agrees(self) -> bool:
@@ -40,6 +40,7 @@ class Comparison:
 
     def __init__(self, torch_policy: TorchPolicy) -> None:
         self.observations = 0
+        self.batch_sizes = {1}
         self._space = torch_policy.action_space
         self._max_difference = 0.0
         self._beyond_limit = 0
@@ -77,7 +78,8 @@ class Comparison:
         """Return what was seen, and stop looking."""
         if not isinstance(self._space, spaces.Box):
             self._hook.remove()
-        return Agreement(self.observations, self._max_difference, self._beyond_limit, self._near_ties)
+        batch_sizes = tuple(sorted(self.batch_sizes))
+        return Agreement(self.observations, self._max_difference, self._beyond_limit, self._near_ties, batch_sizes)
 
 
 def _list_margins(

@@ -12,6 +12,7 @@ from rlctl.export.report import CReport, ExportReport, OnnxReport, Port, format_
 from rlctl.output import print_notes
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import files, lookup, onnx_file
+from rlctl.run.acting import check_playable
 from rlctl.run.lookup import FoundPolicy
 from rlctl.run.policy import Policy, PolicyInfo, read_policy
 from rlctl.run.shipped import PRETRAINED
@@ -64,14 +65,14 @@ def export_policy(
 
 def _export(found: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
     info, tensors = read_policy(found.file)
+    check_playable(info, tensors, found.file)
     # The environments are built while torch is imported.
     with Workers(found.locate(info.spec), available_cores()) as workers:
         from rlctl.export.actor import build
         from rlctl.run.torch_policy import TorchPolicy, pin_threads
 
         pin_threads()
-        policy = TorchPolicy.load(found.file)
-        job = _Export(found.file, info, tensors, policy, build(info, policy.network, tensors), workers)
+        job = _Export(found.file, info, tensors, TorchPolicy.load(found.file), build(info, tensors), workers)
         sources = {target: _write_source(job, target) for target in targets if target.suffix == ".c"}
         _check_environment(found.file, info, workers)
         return [

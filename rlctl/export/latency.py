@@ -8,8 +8,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from rlctl.run.c_policy import CPolicy
 from rlctl.run.policy import Policy
 from rlctl.run.torch_policy import TorchPolicy
@@ -39,14 +37,11 @@ def measure(torch_policy: TorchPolicy, exported: Policy) -> Latency:
     space = torch_policy.observation_space
     space.seed(0)
     observation = space.sample()
-    normalized: Any = torch_policy.normalizer(observation)
-    state, starts = _take_state_row(torch_policy), np.array([False])
+    normalized: Any = torch_policy.normalize(observation)
     exported.reset()
     return Latency(
         exported_us=_measure_exported(exported, observation),
-        sb3_us=_measure_median_us(
-            lambda: torch_policy.network.predict(normalized, state=state, episode_start=starts, deterministic=True)
-        ),
+        sb3_us=_measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True)),
     )
 
 
@@ -54,11 +49,6 @@ def _measure_exported(exported: Policy, observation: Any) -> float:
     if isinstance(exported, CPolicy):
         return _measure_median_us(lambda: exported.repeat(observation, _CALLS)) / _CALLS
     return _measure_median_us(lambda: exported.predict(observation))
-
-
-def _take_state_row(policy: TorchPolicy) -> Any:
-    state = policy.initial_state()
-    return None if state is None else tuple(part[:, :1] for part in state)
 
 
 def _measure_median_us(call: Callable[[], Any]) -> float:

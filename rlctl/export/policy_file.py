@@ -13,7 +13,7 @@ from rlctl.eval.score import describe_score, measure_score
 from rlctl.rollout.baselines import BASELINES
 from rlctl.run import lookup
 from rlctl.run.memory import format_bytes
-from rlctl.run.numpy_policy import select_actor_tensors
+from rlctl.run.network import select_actor_tensors
 from rlctl.run.policy import PolicyInfo, read_policy, save_policy
 from rlctl.run.shipped import Provenance
 from rlctl.run.task_version import identify_task

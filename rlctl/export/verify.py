@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import stack, take_row
+from rlctl.dict_spaces import map_parts, stack, take_row
 from rlctl.export.agreement import Agreement, Comparison
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
-from rlctl.run.policy import BatchActor, Policy
+from rlctl.run.onnx_policy import OnnxPolicy
+from rlctl.run.policy import Policy
 from rlctl.run.torch_policy import TorchPolicy
 
 MAX_RETURN_DIFFERENCE = 1e-3
@@ -72,6 +74,8 @@ def verify(
     workers.set_policy(torch_policy.info, files.tensors)
     expected = play_episodes(workers, seeds, record=True)
     _compare_actions(torch_policy, exported, expected, comparison)
+    if isinstance(exported, OnnxPolicy):
+        _compare_batch(torch_policy, exported, expected, comparison)
     played = EPISODES
     while comparison.observations < min_observations:
         missing = min_observations / comparison.observations - 1.0
@@ -99,22 +103,28 @@ class PolicyFiles:
 def _compare_actions(
     torch_policy: TorchPolicy, exported: Policy, episodes: Sequence[Episode], comparison: Comparison
 ) -> None:
-    """Ask both policies on all observations of some episodes, step by step, each with its own recurrent state.
+    """Ask both policies on all observations of some episodes."""
+    for episode in episodes:
+        assert episode.trajectory is not None  # recorded
+        observations, length = episode.trajectory.observations, len(episode.trajectory.actions)
+        torch_policy.reset()
+        exported.reset()
+        rows = 1 if torch_policy.is_recurrent else length
+        for low in range(0, length, rows):
+            some = map_parts(operator.itemgetter(slice(low, low + rows)), observations)
+            actions = [exported.predict(take_row(some, row)) for row in range(rows)]
+            comparison.add(torch_policy.act(some), np.stack(actions))
+        comparison.observations += length
 
-    The exported policy runs in full batches, and for the first episode alone as well.
-    """
-    trajectories = [episode.trajectory for episode in episodes if episode.trajectory is not None]
-    of_torch, of_file = (BatchActor(policy, len(episodes)) for policy in (torch_policy, exported))
-    exported.reset()
-    for step in range(max(len(each.actions) for each in trajectories)):
-        rows = np.array([row for row, each in enumerate(trajectories) if step < len(each.actions)])
-        observations = stack([take_row(trajectories[row].observations, step) for row in rows])
-        starts = np.full(len(rows), step == 0)
-        expected = of_torch.act(observations, rows, starts)
-        comparison.add(expected, of_file.act(observations, rows, starts))
-        if rows[0] == 0:
-            comparison.add(expected[:1], exported.predict(take_row(observations, 0))[None])
-        comparison.observations += len(rows)
+
+def _compare_batch(
+    torch_policy: TorchPolicy, exported: OnnxPolicy, episodes: Sequence[Episode], comparison: Comparison
+) -> None:
+    """Ask both policies on the first observations of some episodes, all at once."""
+    first = stack([take_row(each.trajectory.observations, 0) for each in episodes if each.trajectory is not None])
+    torch_policy.reset()
+    comparison.add(torch_policy.act(first), exported.start_episodes(first))
+    comparison.batch_sizes.add(len(episodes))
 
 
 def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> ClosedLoop:

@@ -33,7 +33,7 @@ from rlctl.rollout.shared_arrays import SharedArrays, anonymous_file, map_arrays
 from rlctl.rollout.worker_output import forward
 from rlctl.run.acting import Exploration
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.numpy_policy import select_actor_tensors
+from rlctl.run.network import select_actor_tensors
 from rlctl.run.policy import PolicyInfo
 
 # A PyBullet world is one block of 28 MB, which huge pages fill in half the time. Other C libraries ignore this.

@@ -1,4 +1,4 @@
-"""Choosing actions inside a worker: a numpy network, and noise that follows from the episode's seed and the step."""
+"""Choosing actions with NumPy: a policy's network, and noise that follows from the episode's seed and the step."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 from rlctl.dict_spaces import join, split_space
 from rlctl.errors import ArtifactError, DivergedError, UsageError, short_repr
 from rlctl.run.c_policy import LIBRARY_SUFFIX, CPolicy
-from rlctl.run.numpy_policy import NumpyNetwork, Tensors
-from rlctl.run.policy import Policy, PolicyInfo
-
-Array = NDArray[Any]
+from rlctl.run.layers import Array, apply
+from rlctl.run.network import Network, Tensors, select_actor_tensors
+from rlctl.run.policy import Policy, PolicyInfo, read_policy
 
 _BLOCK = 64
 """Steps whose random numbers are drawn together."""
 _STEP_NOISE, _MATRIX = 0, 1
-_ON_POLICY = ("ppo", "a2c", "recurrent_ppo")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,12 +99,10 @@ class PolicyPlayer(Player):
 
     def __init__(self, info: PolicyInfo, tensors: Tensors) -> None:
         self.exploration = Exploration()
-        self._network = NumpyNetwork(info, tensors)
+        self._network = Network(info, tensors)
         _, self._space = info.env.spaces()
-        self._on_policy = info.algo in _ON_POLICY
         self._settings: Mapping[str, Any] = info.policy_kwargs
         self._uses_sde = bool(info.policy_kwargs.get("use_sde"))
-        self._squashed = not self._on_policy or bool(info.policy_kwargs.get("squash_output"))
         self._algo = info.algo
         self._noise = Noise(max(1, math.prod(self._space.shape or ())))
         self._matrix: Array | None = None
@@ -139,18 +135,19 @@ class PolicyPlayer(Player):
         every = exploration.sde_every
         if every and step % every == 0 and self._uses_sde and exploration.stochastic:
             self._draw_matrix(seed, step)
-        latent = self._network.latent(observation)
+        network = self._network
+        latent = network.compute_latent(observation)
+        value = apply(network.head, latent)
         if not isinstance(self._space, spaces.Box):
-            return self._act_discrete(self._network.head(latent), seed, step)
-        value = self._network.head(latent)
+            return self._act_discrete(value, seed, step)
         if exploration.stochastic and self._algo not in ("td3", "ddpg"):
             value = value + self._sample(latent, seed, step)
         if not math.isfinite(np.add.reduce(value)):
             raise DivergedError(f"the policy's action is not finite: {short_repr(value.tolist())}")
-        if not self._squashed:
+        if not network.is_squashed:
             shape = self._space.shape
             return value, np.clip(value, self._low, self._high).astype(self._space.dtype, copy=False).reshape(shape)
-        if self._algo not in ("td3", "ddpg"):  # the network of these ends with its own
+        if network.ends_with_tanh:
             value = np.tanh(value)
         if exploration.action_noise:
             noise = self._noise.draw(seed, step)[0][1]
@@ -223,21 +220,51 @@ def _expln(log_std: Array) -> Array:
     return np.where(log_std <= 0, np.exp(np.minimum(log_std, 0)), np.log1p(np.maximum(log_std, 0) + 1e-6) + 1.0)
 
 
+_MEAN, _SAMPLE = Exploration(), Exploration(stochastic=True)
+
+
+class NumpyPolicy(Policy):
+    """A policy file in this process: acts with the same bits as in workers, without torch."""
+
+    def __init__(self, info: PolicyInfo, tensors: Tensors) -> None:
+        super().__init__(info)
+        self.player = PolicyPlayer(info, tensors)
+        self.reset()
+
+    @classmethod
+    def load(cls, path: Path) -> NumpyPolicy:
+        """Read a policy file; raises `ArtifactError` if it is not one or does not fit together."""
+        info, tensors = read_policy(path)
+        check_playable(info, tensors, path)
+        return cls(info, select_actor_tensors(info, tensors))
+
+    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
+        """Return the action for one observation; `deterministic=False` samples it, otherwise in every episode."""
+        self.player.explore(_MEAN if deterministic else _SAMPLE)
+        if self._step == 0:
+            self.player.begin_segment(self._seed, 0)
+        action = self.player.act(join(self.read_observation(observation)), self._seed, self._step)[1]
+        self._step += 1
+        return np.asarray(action)
+
+    def reset(self) -> None:
+        """Begin an episode: forget the recurrent state."""
+        self._seed, self._step = int(np.random.SeedSequence().generate_state(1)[0]), 0
+        if self.player.state is not None:
+            self.player.state[:] = 0.0
+
+
 def check_playable(info: PolicyInfo, tensors: Tensors, file: Path) -> None:
-    """Act once, on made-up observations; raises `ArtifactError` if the tensors do not fit their description."""
-    space, action_space = info.env.spaces()
-    zeros = {
-        key: np.full(each.shape or (), getattr(each, "start", 0), each.dtype)
-        for key, each in split_space(space).items()
-    }
+    """Act once, on a made-up observation; raises `ArtifactError` if the tensors do not fit their description."""
     try:
+        shapes = {key: space.shape for key, space in split_space(info.env.spaces()[0]).items()}
         for key in info.normalized_keys:
             for name in (f"normalize/{key}/mean", f"normalize/{key}/var"):
-                if tensors[name].shape != zeros[key].shape:
-                    raise ValueError(f"{name} has shape {tensors[name].shape}, the observation {zeros[key].shape}")
-        _, action = PolicyPlayer(info, tensors).act(join(zeros), 0, 0)
-        if np.shape(action) != (action_space.shape or ()):
-            raise ValueError(f"its actions have shape {np.shape(action)}")
+                if tensors[name].shape != shapes[key]:
+                    raise ValueError(f"{name} has shape {tensors[name].shape}, the observation {shapes[key]}")
+        policy = NumpyPolicy(info, tensors)
+        policy.try_once()
+        policy.try_once(deterministic=False)
     except UsageError:
         raise
     except Exception as error:  # whatever numpy raises for a description that nobody has checked

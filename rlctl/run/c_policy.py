@@ -12,9 +12,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import SINGLE, Observations, split, split_space
+from rlctl.dict_spaces import SINGLE, split, split_space
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.run.policy import ROWS, Policy, PolicyInfo, State
+from rlctl.run.policy import Policy, PolicyInfo
 
 LIBRARY_SUFFIX = ".so"
 
@@ -62,30 +62,13 @@ class CPolicy(Policy):
         except OSError as error:
             raise ArtifactError(f"{path}: the compiled policy does not load: {error}") from None
 
-    def initial_state(self) -> State | None:
-        """Return zeros for `ROWS` episodes; None for a policy that remembers nothing."""
-        return (np.zeros((1, ROWS, self._memory.size), np.float32),) if self._memory.size else None
-
-    def forward(
-        self, observations: Observations, state: State | None, deterministic: bool
-    ) -> tuple[NDArray[Any], State | None]:
-        """Return the actions for `ROWS` observations, one call each, and the next state; deterministic only."""
-        parts = split(observations)
-        actions = np.empty((ROWS, *self._shape), self._dtype)
-        after = None if state is None else (np.empty_like(state[0]),)
-        own = self._memory.copy()  # of `predict`
-        for row in range(ROWS):
-            if state is not None:
-                self._memory[:] = state[0][0, row]
-            actions[row] = self._call({key: parts[key][row] for key in self._keys}, deterministic)
-            if after is not None:
-                after[0][0, row] = self._memory
-        self._memory[:] = own
-        return actions, after
-
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
         """Return the action for one observation; a policy that remembers does so until `reset`."""
-        return self._call(split(observation), deterministic).astype(self._dtype)
+        if not deterministic:
+            raise UsageError("an exported policy cannot sample: only its deterministic action is in the C file")
+        self._fill(split(observation))
+        self._act(*self._pointers)
+        return self._action.reshape(self._shape).astype(self._dtype)
 
     def reset(self) -> None:
         """Begin an episode: forget the recurrent state and earlier frames."""
@@ -95,13 +78,6 @@ class CPolicy(Policy):
         """Act `count` times on one observation, within C."""
         self._fill(split(observation))
         self.library.rlctl_repeat(*self._pointers, count)
-
-    def _call(self, parts: dict[str, Any], deterministic: bool) -> NDArray[Any]:
-        if not deterministic:
-            raise UsageError("an exported policy cannot sample: only its deterministic action is in the C file")
-        self._fill(parts)
-        self._act(*self._pointers)
-        return self._action.reshape(self._shape).copy()
 
     def _fill(self, parts: dict[str, Any]) -> None:
         if self._frames > 1:

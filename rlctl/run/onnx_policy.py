@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import onnxruntime
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import Observations, split, split_space
+from rlctl.dict_spaces import Observations, split
 from rlctl.env_spec import LARGEST_SPACE
 from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.run import memory, onnx_file, untrusted
 from rlctl.run.onnx_file import METADATA_KEY
-from rlctl.run.policy import ROWS, Policy, PolicyInfo, State, parse_info
+from rlctl.run.policy import Policy, PolicyInfo, parse_info
 
 SINGLE_INPUT = "obs"
 """Name of the input of an observation that is not a dictionary; those of a dictionary are named by their keys."""
@@ -38,11 +37,10 @@ class OnnxPolicy(Policy):
     def __init__(self, info: PolicyInfo, session: onnxruntime.InferenceSession) -> None:
         super().__init__(info)
         self.session = session
-        self._fields = _fields(self.observation_space)
         inputs = {each.name: each.shape for each in session.get_inputs()}
-        for name, (shape, _) in self._fields.items():
-            if inputs.get(name, [None])[1:] != list(shape):
-                raise ValueError(f"no input {name!r} of shape {('batch', *shape)}")
+        for key, (shape, _) in self._parts.items():
+            if inputs.get(key or SINGLE_INPUT, [None])[1:] != list(shape):
+                raise ValueError(f"no input {key or SINGLE_INPUT!r} of shape {('batch', *shape)}")
         self._recurrent = STATE_INPUTS[0] in inputs
         if self._recurrent:
             layers, _, hidden = inputs[STATE_INPUTS[0]]
@@ -50,7 +48,7 @@ class OnnxPolicy(Policy):
             if math.prod(self._state_size) > LARGEST_SPACE:
                 raise ValueError(f"a state of {layers} layers of {hidden}")
         self._outputs = [ACTION, *STATE_OUTPUTS] if self._recurrent else [ACTION]
-        self._state = self._make_state(1)
+        self._state: dict[str, NDArray[np.float32]] = self._make_state(1)
 
     @classmethod
     def load(cls, path: Path) -> OnnxPolicy:
@@ -71,56 +69,37 @@ class OnnxPolicy(Policy):
             raise ArtifactError(f"{path}: its graph does not fit its description: {problem}; export it again") from None
         return policy
 
-    def initial_state(self) -> State | None:
-        """Return zeros for `ROWS` episodes; None for a policy without a state."""
-        return self._make_state(ROWS)
-
-    def forward(
-        self, observations: Observations, state: State | None, deterministic: bool
-    ) -> tuple[NDArray[Any], State | None]:
-        """Return the actions for `ROWS` observations and the next state; deterministic only."""
-        parts = {key or SINGLE_INPUT: part for key, part in split(observations).items()}
-        batch = {name: np.asarray(parts[name], dtype) for name, (_, dtype) in self._fields.items()}
-        return self._run(batch, state, deterministic)
-
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the action for one observation, in a forward pass of one row.
+        """Return the action for one observation, the deterministic one; a recurrent policy remembers."""
+        if not deterministic:
+            raise UsageError("an exported policy cannot sample: only its deterministic action is in the ONNX file")
+        batch = {key or SINGLE_INPUT: part[None] for key, part in self.read_observation(observation).items()}
+        (action,), *after = self._run({**batch, **self._state})
+        self._state = dict(zip(self._state, after, strict=True))
+        return np.asarray(action)
 
-        A recurrent policy remembers; call `reset` when an episode begins.
-        """
-        # A row costs less than the ROWS rows that keep an evaluation independent of its width.
-        given = {key or SINGLE_INPUT: part for key, part in split(observation).items()}
-        batch = {}
-        for name, (shape, dtype) in self._fields.items():
-            value = np.asarray(given[name], dtype) if name in given else np.empty(())
-            if name not in given or value.shape != shape:
-                raise ValueError(f"observation {name!r}: shape {value.shape}, the policy expects {shape}")
-            batch[name] = value[None]
-        actions, self._state = self._run(batch, self._state, deterministic)
-        return np.asarray(actions[0])
+    def start_episodes(self, observations: Observations) -> NDArray[Any]:
+        """Return the actions for the first observations of several episodes, in one call."""
+        batch = {key or SINGLE_INPUT: part for key, part in split(observations).items()}
+        count = len(next(iter(batch.values())))
+        return np.asarray(self._run({**batch, **self._make_state(count)})[0])
 
     def reset(self) -> None:
         """Begin an episode: forget the recurrent state."""
         self._state = self._make_state(1)
 
-    def _run(
-        self, batch: dict[str, NDArray[Any]], state: State | None, deterministic: bool
-    ) -> tuple[NDArray[Any], State | None]:
-        if not deterministic:
-            raise UsageError("an exported policy cannot sample: only its deterministic action is in the ONNX file")
-        if state is not None:
-            batch.update(zip(STATE_INPUTS, state, strict=True))
+    def _run(self, feed: dict[str, NDArray[Any]]) -> list[NDArray[Any]]:
         try:
-            actions, *after = self.session.run(self._outputs, batch)
+            results: list[NDArray[Any]] = self.session.run(self._outputs, feed)
         except Exception as error:  # onnxruntime's own errors have no public base class
             raise ArtifactError(f"the exported policy cannot act: {short_repr(str(error), 200)}") from None
-        return actions, tuple(after) or None
+        return results
 
-    def _make_state(self, rows: int) -> State | None:
+    def _make_state(self, rows: int) -> dict[str, NDArray[np.float32]]:
         if not self._recurrent:
-            return None
+            return {}
         layers, hidden = self._state_size
-        return tuple(np.zeros((layers, rows, hidden), np.float32) for _ in STATE_INPUTS)
+        return {name: np.zeros((layers, rows, hidden), np.float32) for name in STATE_INPUTS}
 
 
 def _open_session(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
@@ -139,11 +118,6 @@ def _open_session(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, s
             f"{path}: damaged, or not an ONNX file that onnxruntime {onnxruntime.__version__} can read: "
             f"{short_repr(str(error), 200)}"
         ) from None
-
-
-def _fields(space: spaces.Space[Any]) -> dict[str, tuple[tuple[int, ...], Any]]:
-    """Shape and dtype of every input that is an observation."""
-    return {key or SINGLE_INPUT: (part.shape or (), part.dtype) for key, part in split_space(space).items()}
 
 
 @functools.cache

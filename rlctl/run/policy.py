@@ -23,7 +23,7 @@ from pydantic import Field
 
 import rlctl
 from rlctl import registry
-from rlctl.dict_spaces import Observations, join, map_parts, split_space
+from rlctl.dict_spaces import join, map_parts, split, split_space
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.named_task import POLICY
@@ -33,12 +33,6 @@ from rlctl.run.named_spec import PolicySpec
 from rlctl.run.shipped import Provenance, find_shipped_policy
 
 FORMAT = 1
-ROWS = 64
-"""Every forward pass has this many rows: the last bit of a result depends on the size of the batch, and an episode
-must not depend on how many others run beside it."""
-
-State = tuple[NDArray[np.float32], ...]
-"""Recurrent state: arrays of shape (layers, rows, size)."""
 
 
 class Score(pydantic.BaseModel):
@@ -182,109 +176,56 @@ def parse_info(text: str | None, path: Path) -> PolicyInfo:
 
 
 class Policy(abc.ABC):
-    """A policy that can be run."""
+    """A policy that can be run, one observation after the other."""
 
     def __init__(self, info: PolicyInfo) -> None:
         self.info = info
         self.observation_space, self.action_space = info.env.spaces()
-        self._expected = join({key: space.shape for key, space in split_space(self.observation_space).items()})
-        self._own: BatchActor | None = None
-        self._starts = True
+        self._parts = {
+            key: (space.shape or (), space.dtype) for key, space in split_space(self.observation_space).items()
+        }
 
     @abc.abstractmethod
-    def forward(
-        self, observations: Observations, state: State | None, deterministic: bool
-    ) -> tuple[NDArray[Any], State | None]:
-        """Return the actions for `ROWS` observations, as the environment takes them, and the next state."""
-
-    @abc.abstractmethod
-    def initial_state(self) -> State | None:
-        """Return the recurrent state of `ROWS` episodes that begin; None if the policy has none."""
-
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the action for one observation.
+        """Return the action for one observation, as the environment takes it.
 
-        A recurrent policy remembers; call `reset` when an episode begins.
+        A recurrent policy remembers; call `reset` when an episode begins. Raises `ValueError` for an observation of
+        another shape.
         """
-        if self._own is None:
-            self._own = BatchActor(self, 1)
-        self._own.deterministic = deterministic
-        shapes = map_parts(np.shape, observation)
-        if shapes != self._expected:
-            raise ValueError(f"observation of shape {shapes}, the policy expects {self._expected}")
-        batch = map_parts(lambda value: np.asarray(value)[None], observation)
-        action = self._own.act(batch, np.array([0]), np.array([self._starts]))[0]
-        self._starts = False
-        return np.asarray(action)
 
+    @abc.abstractmethod
     def reset(self) -> None:
-        """Begin an episode: forget the recurrent state."""
-        self._starts = True
+        """Begin an episode: forget what is remembered."""
 
-    def try_once(self) -> None:
-        """Act once, on made-up observations; raises `ValueError` for actions that the action space cannot have.
+    def read_observation(self, observation: Any) -> dict[str, NDArray[Any]]:
+        """Return the parts of an observation by key, in their dtypes; raises `ValueError` for another shape."""
+        given = split(observation)
+        parts = {}
+        for key, (shape, dtype) in self._parts.items():
+            value = np.asarray(given[key], dtype) if key in given else None
+            if value is None or value.shape != shape:
+                expected = join({key: shape for key, (shape, _) in self._parts.items()})
+                raise ValueError(
+                    f"observation of shape {map_parts(np.shape, observation)}, the policy expects {expected}"
+                )
+            parts[key] = value
+        return parts
+
+    def try_once(self, *, deterministic: bool = True) -> None:
+        """Act once, on a made-up observation; raises `ValueError` for an action that the action space cannot have.
 
         Whatever else is wrong with a file that somebody has written by hand raises here too.
         """
-        parts = {
-            key: np.full((ROWS, *(space.shape or ())), getattr(space, "start", 0), space.dtype)
-            for key, space in split_space(self.observation_space).items()
-        }
-        actions, _ = self.forward(join(parts), self.initial_state(), True)
-        wanted = (ROWS, *(self.action_space.shape or ()))
-        if actions.shape != wanted or not np.isfinite(actions).all():
-            raise ValueError(f"its actions are {actions.dtype} of shape {actions.shape[1:]}, or not finite")
-
-
-class BatchActor:
-    """Runs a policy for many environments, in forward passes of `ROWS` rows; keeps a recurrent state for each."""
-
-    def __init__(self, policy: Policy, n_envs: int, *, deterministic: bool = True) -> None:
-        self.policy = policy
-        self.deterministic = deterministic
-        initial = policy.initial_state()
-        self._state = None
-        if initial is not None:
-            self._state = tuple(np.repeat(part[:, :1], n_envs, axis=1) for part in initial)
-
-    def act(self, observations: Observations, rows: NDArray[np.int64], starts: NDArray[np.bool_]) -> NDArray[Any]:
-        """Return an action per row; see `rollout.collect.Actor`."""
-        if self._state is not None:
-            for part in self._state:
-                part[:, rows[starts]] = 0.0
-        blocks = []
-        for low in range(0, len(rows), ROWS):
-            block = rows[low : low + ROWS]
-            state = None
-            if self._state is not None:
-                state = tuple(_pad(part[:, block], axis=1) for part in self._state)
-            actions, after = self.policy.forward(
-                map_parts(functools.partial(_take_block, low), observations),
-                state,
-                self.deterministic,
-            )
-            if self._state is not None and after is not None:
-                for part, new in zip(self._state, after, strict=True):
-                    part[:, block] = new[:, : len(block)]
-            blocks.append(actions[: len(block)])
-        return np.concatenate(blocks)
-
-
-def _take_block(low: int, values: NDArray[Any]) -> NDArray[Any]:
-    return _pad(values[low : low + ROWS])
-
-
-def _pad(values: NDArray[Any], axis: int = 0) -> NDArray[Any]:
-    missing = ROWS - values.shape[axis]
-    if missing == 0:
-        return values
-    shape = list(values.shape)
-    shape[axis] = missing
-    return np.concatenate([values, np.zeros(shape, values.dtype)], axis=axis)
+        spaces = split_space(self.observation_space).items()
+        zeros = {key: np.full(space.shape or (), getattr(space, "start", 0), space.dtype) for key, space in spaces}
+        action = self.predict(join(zeros), deterministic=deterministic)
+        self.reset()
+        if action.shape != (self.action_space.shape or ()) or not np.isfinite(action).all():
+            raise ValueError(f"its actions are {action.dtype} of shape {action.shape}, or not finite")
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a policy from a `.safetensors` file, or an exported `.onnx` file (torch is then not imported).
+    """Load a policy from a `.safetensors` file, or an exported `.onnx` file; torch is not imported.
 
     `load_policy(path).predict(observation)` returns the action. The name of an installed task, `load_policy("ant")`,
     is the policy that ships with it, never that of a run. Raises `ArtifactError` for a file that is not one.
@@ -294,6 +235,6 @@ def load_policy(path: str | Path) -> Policy:
         from rlctl.run.onnx_policy import OnnxPolicy
 
         return OnnxPolicy.load(path)
-    from rlctl.run.torch_policy import TorchPolicy
+    from rlctl.run.acting import NumpyPolicy
 
-    return TorchPolicy.load(path)
+    return NumpyPolicy.load(path)

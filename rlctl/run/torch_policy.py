@@ -1,8 +1,9 @@
-"""Policies on SB3's own networks. The only place besides `train/` that imports torch and SB3."""
+"""SB3's own networks, and policies on them: what exports are compared with. Imports torch."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,11 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.vec_env import VecTransposeImage
 from torch.overrides import TorchFunctionMode
 
-from rlctl.dict_spaces import Observations, join, split, split_space
+from rlctl.dict_spaces import Observations, join, split
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
-from rlctl.run.numpy_policy import select_actor_tensors
-from rlctl.run.policy import ROWS, Policy, PolicyInfo, State, read_policy
+from rlctl.run.layers import Normalize
+from rlctl.run.network import select_actor_tensors
+from rlctl.run.policy import Policy, PolicyInfo, read_policy
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": stable_baselines3.PPO,
@@ -44,9 +46,6 @@ ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "silu": torch.nn.SiLU,
     "gelu": torch.nn.GELU,
 }
-
-NORMALIZE_EPSILON = 1e-8
-"""What SB3's VecNormalize adds to the variance."""
 
 # Of no use to a policy that is run, and no plain data.
 _NOT_KEPT = frozenset(
@@ -178,41 +177,18 @@ _NOTHING = np.zeros(0)
 _LEAST_COST = 1000  # also many small tensors take memory
 
 
-class Normalizer:
-    """The observation normalisation of a policy, in float64 as SB3's VecNormalize computes it."""
-
-    def __init__(self, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
-        self.clip = info.clip_observation
-        self._statistics = {
-            key: (tensors[f"normalize/{key}/mean"], np.sqrt(tensors[f"normalize/{key}/var"] + NORMALIZE_EPSILON))
-            for key in info.normalized_keys
-        }
-
-    def __call__(self, observations: Observations) -> Observations:
-        """Normalise a batch, shape (rows, ...)."""
-        if not self._statistics:
-            return observations
-        normalized = {
-            key: self._normalize(key, value) if key in self._statistics else value
-            for key, value in split(observations).items()
-        }
-        result: Observations = join(normalized)
-        return result
-
-    def _normalize(self, key: str, values: NDArray[Any]) -> NDArray[np.float32]:
-        mean, scale = self._statistics[key]
-        normalized: NDArray[np.float32] = np.clip((values - mean) / scale, -self.clip, self.clip).astype(np.float32)  # type: ignore[operator]
-        return normalized
-
-
 class TorchPolicy(Policy):
-    """A policy file on the network it was trained with."""
+    """A policy file on the network it was trained with. Deterministic."""
 
-    def __init__(self, info: PolicyInfo, network: BasePolicy, normalizer: Normalizer) -> None:
+    def __init__(self, info: PolicyInfo, network: BasePolicy, tensors: Mapping[str, NDArray[Any]]) -> None:
         super().__init__(info)
         self.network = network
-        self.normalizer = normalizer
-        self._uses_sde = bool(info.policy_kwargs.get("use_sde"))
+        self._normalize = {
+            key: Normalize("", *_read_statistics(tensors, key), float(info.clip_observation or np.inf))
+            for key in info.normalized_keys
+        }
+        self.is_recurrent = info.algo == "recurrent_ppo"
+        self._state: Any = None
         network.set_training_mode(False)
 
     @classmethod
@@ -244,33 +220,30 @@ class TorchPolicy(Policy):
         missing = select_actor_tensors(info, dict.fromkeys((prefix + name for name in mismatch.missing_keys), _NOTHING))
         if missing or mismatch.unexpected_keys:
             raise ValueError(f"tensors missing: {list(missing)}, unknown: {mismatch.unexpected_keys}")
-        policy = cls(info, network, Normalizer(info, tensors))
-        shapes = {key: space.shape for key, space in split_space(policy.observation_space).items()}
-        for key in info.normalized_keys:
-            for name in (f"normalize/{key}/mean", f"normalize/{key}/var"):
-                if tensors[name].shape != shapes.get(key):
-                    raise ValueError(f"{name} has shape {tensors[name].shape}, the observation {shapes.get(key)}")
+        policy = cls(info, network, tensors)
         policy.try_once()
         return policy
 
-    def initial_state(self) -> State | None:
-        """Return zeros for `ROWS` episodes; None for a policy without a state."""
-        if self.info.algo != "recurrent_ppo":
-            return None
-        lstm: Any = self.network.lstm_actor
-        shape = (lstm.num_layers, ROWS, lstm.hidden_size)
-        return (np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+    def normalize(self, observations: Observations) -> Observations:
+        """Return observations, one or several, as the network gets them."""
+        parts = split(observations)
+        normalized: Observations = join({**parts, **{key: each(parts[key]) for key, each in self._normalize.items()}})
+        return normalized
 
-    def forward(
-        self, observations: Observations, state: State | None, deterministic: bool
-    ) -> tuple[NDArray[Any], State | None]:
-        """Normalise `ROWS` observations and return the actions for them and the next state."""
-        if not deterministic and self._uses_sde:
-            self.network.reset_noise(ROWS)  # type: ignore[operator]
-        actions, after = self.network.predict(
-            self.normalizer(observations),
-            state=state,
-            episode_start=None if state is None else np.zeros(ROWS, np.bool_),
-            deterministic=deterministic,
-        )
-        return actions, after
+    def act(self, observations: Observations) -> NDArray[Any]:
+        """Return the actions for several observations; a recurrent policy remembers as many states."""
+        actions, self._state = self.network.predict(self.normalize(observations), self._state, deterministic=True)
+        return actions
+
+    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
+        """Return the action for one observation; a recurrent policy remembers."""
+        parts = self.read_observation(observation)
+        return np.asarray(self.act(join({key: part[None] for key, part in parts.items()}))[0])
+
+    def reset(self) -> None:
+        """Begin an episode: forget the recurrent state."""
+        self._state = None
+
+
+def _read_statistics(tensors: Mapping[str, NDArray[Any]], key: str) -> tuple[NDArray[Any], NDArray[Any]]:
+    return tensors[f"normalize/{key}/mean"], tensors[f"normalize/{key}/var"]

@@ -138,10 +138,13 @@ def _collect_tensors(model: SavedModel, normalization: SavedNormalization | None
 
 def _write_checked(output: Path, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
     """Write the file beside its place, load it, and put it in place only if it acts."""
+    from rlctl.run.torch_policy import TorchPolicy
+
     beside = output.with_name(f".{output.stem}.import.safetensors")
     save_policy(beside, info, tensors)
     try:
         load_policy(beside)
+        TorchPolicy.load(beside)  # which is stricter
         beside.replace(output)
     except ArtifactError as error:
         raise ArtifactError(str(error).replace(str(beside), str(output))) from None

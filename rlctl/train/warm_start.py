@@ -10,7 +10,7 @@ from rlctl import registry
 from rlctl.errors import UsageError
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.lookup import find_policy
-from rlctl.run.numpy_policy import select_actor_tensors
+from rlctl.run.network import select_actor_tensors
 from rlctl.run.policy import PolicyInfo, read_info, read_policy
 from rlctl.run.recipe import Recipe
 from rlctl.run.shipped import PRETRAINED

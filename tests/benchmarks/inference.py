@@ -30,7 +30,7 @@ def onnx_runtime(repeat: int) -> Row:
     batch = {"obs": observation[None]}
 
     def theirs() -> float:
-        return _seconds(lambda: sb3.network.predict(sb3.normalizer(observation), deterministic=True))
+        return _seconds(lambda: sb3.network.predict(sb3.normalize(observation), deterministic=True))
 
     bare = side_by_side(lambda: _seconds(lambda: exported.session.run(["action"], batch)), theirs, 3 * repeat)
     pair = side_by_side(lambda: _seconds(lambda: exported.predict(observation)), theirs, 3 * repeat)
@@ -60,7 +60,7 @@ def c_function(repeat: int) -> Row:
     info, tensors = read_policy(run / "policies" / "best.safetensors")
     compiler = find_compiler()
     assert compiler is not None, "no C compiler"
-    code = write_c(info, build(info, _torch_policy(run).network, tensors), "policy")
+    code = write_c(info, build(info, tensors), "policy")
     with tempfile.TemporaryDirectory() as folder:
         policy = CPolicy.load(build_library(code, info, Path(folder), compiler))
     observation = np.zeros(exported.observation_space.shape, np.float32)
@@ -84,11 +84,11 @@ def c_function(repeat: int) -> Row:
 
 
 def _torch_policy(run: Path) -> Any:
-    from rlctl.run.torch_policy import pin_threads
+    from rlctl.run.torch_policy import TorchPolicy, pin_threads
 
     # The best case for so small a network.
     pin_threads()
-    return rlctl.load_policy(run / "policies" / "best.safetensors")
+    return TorchPolicy.load(run / "policies" / "best.safetensors")
 
 
 def _seconds(call: Callable[[], object]) -> float:

@@ -24,7 +24,7 @@ STEPS = 30
 
 def write_source(path, name="policy"):
     info, tensors = read_policy(path)
-    return info, write_c(info, build(info, TorchPolicy.load(path).network, tensors), name)
+    return info, write_c(info, build(info, tensors), name)
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def test_names_of_a_stranger_stay_in_their_comments(small, train, write, tmp_pat
     evil = '*/ #error "out"\n#error "line" /* \\'
     env = info.env.model_copy(update={"action_meaning": evil, "robot": evil, "observation_sizes": {evil: 3}})
     info = info.model_copy(update={"env": env})
-    code = write_c(info, build(info, TorchPolicy.load(path).network, tensors), "int")
+    code = write_c(info, build(info, tensors), "int")
     assert code.name == "int"
     build_library(code, info, tmp_path, [*find_compiler(), "-Werror"])
 

@@ -13,7 +13,7 @@ from rlctl.run import onnx_file
 from rlctl.run.env_info import describe
 from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import read_policy
-from rlctl.run.torch_policy import ACTIVATIONS, TorchPolicy
+from rlctl.run.torch_policy import ACTIVATIONS
 
 ALGORITHMS = ["ppo", "a2c", "sac", "td3", "ddpg", "tqc", "crossq", "recurrent_ppo", "dqn"]
 ROWS = 50
@@ -21,7 +21,7 @@ ROWS = 50
 
 def session_of(path):
     info, tensors = read_policy(path)
-    model = build(info, TorchPolicy.load(path).network, tensors)
+    model = build(info, tensors)
     return onnxruntime.InferenceSession(model.SerializeToString())
 
 
@@ -192,7 +192,7 @@ def test_file_says_what_it_is(train, tmp_path):
     spec = EnvSpec("reach", {"tolerance": 0.02})
     model = train("ppo", spec, steps=0)
     info, tensors = pack(model, "ppo", spec, describe(spec.make()))
-    proto = build(info, model.policy, tensors)
+    proto = build(info, tensors)
     assert proto.ir_version == 8
     assert [(each.domain, each.version) for each in proto.opset_import] == [("", 17)]
     metadata = {each.key: each.value for each in proto.metadata_props}
@@ -234,7 +234,7 @@ def test_recurrent_state_goes_in_and_out_after_the_action(small, train, write):
         ("taken", "box", "ppo", {}, "an observation cannot be named 'action' in an ONNX file, an output is"),
         (
             "vector", "box", "recurrent_ppo", {"lstm_kwargs": {"bidirectional": True}},
-            "lstm_actor with bidirectional=True cannot be written as ONNX yet",
+            "an LSTM with two directions or a projection cannot be played",
         ),
     ],
 )  # fmt: skip
@@ -245,5 +245,5 @@ def test_what_has_no_translation_is_named(observation, action, algo, policy_kwar
     model = train(algo, spec, steps=0, policy_kwargs=policy_kwargs)
     info, tensors = pack(model, algo, spec, describe(spec.make()))
     with pytest.raises(UsageError, match=message) as raised:
-        build(info, model.policy, tensors)
+        build(info, tensors)
     assert raised.value.exit_code == 2

@@ -13,7 +13,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.policy import PolicyInfo, compute_digest, load_policy, save_policy
-from rlctl.run.torch_policy import build_network
+from rlctl.run.torch_policy import TorchPolicy, build_network
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 
@@ -51,11 +51,11 @@ def described(good):
     return json.loads(load_policy(good).info.model_dump_json())
 
 
-def refused(path):
+def refused(path, load=load_policy):
     """What is said of a file that is refused: at once, in one line."""
     began = time.monotonic()
     with pytest.raises(RlctlError) as caught:
-        load_policy(path)
+        load(path)
     assert caught.value.exit_code == 5
     assert time.monotonic() - began < 10
     message = str(caught.value)
@@ -95,14 +95,14 @@ BOX_DATA = {"type": "Box", "low": "-1.0", "high": "1.0", "dtype": "float32"}
     ],
 )
 def test_a_network_of_another_size(kwargs, message, changed, described):
-    assert message in refused(changed({**described, "policy_kwargs": kwargs}))
+    assert message in refused(changed({**described, "policy_kwargs": kwargs}), TorchPolicy.load)
 
 
 def test_critics_and_layers_without_number(changed, described):
     sac = {**described, "algo": "sac", "policy_kwargs": {"n_critics": 10**9}}
-    assert LARGER in refused(changed(sac))
+    assert LARGER in refused(changed(sac), TorchPolicy.load)
     recurrent = {"algo": "recurrent_ppo", "policy": "MlpLstmPolicy", "policy_kwargs": {"n_lstm_layers": 10**9}}
-    assert LARGER in refused(changed({**described, **recurrent}))
+    assert LARGER in refused(changed({**described, **recurrent}), TorchPolicy.load)
 
 
 @pytest.mark.parametrize(
@@ -157,12 +157,19 @@ def test_a_description_that_is_none(text, message, changed):
         ({"normalize//mean": np.zeros(1)}, "normalize//mean has shape (1,), the observation (5,)"),
         ({"normalize//var": np.full(5, -1.0)}, "its tensors do not fit its description: "),
         ({"policy/log_std": np.zeros(3, np.float32)}, "its tensors do not fit its description: "),
-        ({"policy/more": np.zeros(3, np.float32)}, "its tensors do not fit its description: "),
     ],
 )
 @pytest.mark.filterwarnings("ignore:invalid value encountered in sqrt")
 def test_tensors_that_cannot_be(tensors, message, changed):
     assert message in refused(changed(**tensors))
+
+
+def test_a_tensor_of_no_network(changed):
+    path = changed(**{"policy/more": np.zeros(3, np.float32)})
+    assert "its tensors do not fit its description: tensors missing: [], unknown: ['more']" in refused(
+        path, TorchPolicy.load
+    )
+    assert load_policy(path).predict(np.zeros(5)).shape == (2,)
 
 
 @pytest.mark.parametrize("value", [None, -1, "x", [], {}, 10**30])

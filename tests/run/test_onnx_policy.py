@@ -16,7 +16,7 @@ from rlctl.export.actor import build
 from rlctl.run import onnx_file
 from rlctl.run.env_info import describe
 from rlctl.run.onnx_policy import OnnxPolicy
-from rlctl.run.policy import ROWS, BatchActor, load_policy
+from rlctl.run.policy import load_policy
 from rlctl.run.torch_policy import ALGORITHMS, policy_name
 from rlctl.train.pack import pack
 
@@ -29,7 +29,7 @@ def exported(path, algo="ppo", **kwargs):
     model = ALGORITHMS[algo](policy_name(algo, env.observation_space), env, device="cpu", seed=0, **kwargs)
     model.policy.action_net.weight.data.mul_(100.0)  # SB3 begins with actions near zero
     info, tensors = pack(model, algo, PENDULUM, describe(PENDULUM.make()))
-    path.write_bytes(onnx_file.encode(build(info, model.policy, tensors)))
+    path.write_bytes(onnx_file.encode(build(info, tensors)))
     return path
 
 
@@ -46,30 +46,19 @@ def recurrent(tmp_path_factory):
 
 @pytest.fixture
 def observations():
-    return np.random.default_rng(0).normal(size=(ROWS, 3)).astype(np.float32)
+    return np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
 
 
-def test_one_observation_gets_the_action_of_its_row(pendulum, observations):
+def test_one_observation_gets_the_action_that_it_gets_beside_others(pendulum, observations):
     policy = load_policy(pendulum)
     assert isinstance(policy, OnnxPolicy)
-    actions, state = policy.forward(observations, None, True)
-    assert state is None
-    assert actions.shape == (ROWS, 1)
+    actions = policy.start_episodes(observations)
+    assert actions.shape == (50, 1)
     assert actions.dtype == np.float32
     alone = np.stack([policy.predict(each) for each in observations])
     assert alone.shape == actions.shape
     assert np.abs(alone - actions).max() <= 1e-6
     assert len(np.unique(actions)) > 10
-
-
-def test_an_action_does_not_depend_on_how_many_others_are_asked_for(pendulum, observations):
-    policy = load_policy(pendulum)
-
-    def act(count):
-        rows = np.arange(count)
-        return BatchActor(policy, count).act(observations[:count], rows, np.ones(count, bool))
-
-    assert act(1).tobytes() == act(3)[:1].tobytes() == act(ROWS)[:1].tobytes()
 
 
 def test_recurrent_policy_remembers_until_reset(recurrent, observations):
@@ -82,21 +71,17 @@ def test_recurrent_policy_remembers_until_reset(recurrent, observations):
     assert np.array_equal(first, afresh)
 
 
-def test_recurrent_state_of_a_batch(recurrent, observations):
+def test_several_recurrent_episodes_begin_without_a_state(recurrent, observations):
     policy = load_policy(recurrent)
-    state = policy.initial_state()
-    assert [part.shape for part in state] == [(2, ROWS, 8)] * 2
-    assert not any(part.any() for part in state)
-    _, state = policy.forward(observations, state, True)
-    actions, _ = policy.forward(observations, state, True)
+    policy.predict(observations[0])
+    actions = policy.start_episodes(observations)
     policy.reset()
-    policy.predict(observations[5])
     assert np.abs(policy.predict(observations[5]) - actions[5]).max() <= 1e-6
 
 
 def test_observation_of_a_wrong_shape(pendulum):
     policy = load_policy(pendulum)
-    with pytest.raises(ValueError, match=r"observation 'obs': shape \(4,\), the policy expects \(3,\)"):
+    with pytest.raises(ValueError, match=r"observation of shape \(4,\), the policy expects \(3,\)"):
         policy.predict(np.zeros(4))
 
 

@@ -1,4 +1,4 @@
-"""Policy files, and policies that act: a row's action depends on that row alone."""
+"""Policy files, and policies that act."""
 
 import contextlib
 import json
@@ -12,9 +12,9 @@ import rlctl
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.run.env_info import EnvInfo, space_to_json
-from rlctl.run.numpy_policy import select_actor_tensors
-from rlctl.run.policy import ROWS, BatchActor, PolicyInfo, compute_digest, read_policy, save_policy
-from rlctl.run.torch_policy import build_network, pin_threads
+from rlctl.run.network import Network, select_actor_tensors
+from rlctl.run.policy import PolicyInfo, compute_digest, read_policy, save_policy
+from rlctl.run.torch_policy import TorchPolicy, build_network, pin_threads
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 DICT = spaces.Dict({"a": spaces.Box(-np.inf, np.inf, (3,), np.float32), "b": spaces.Discrete(4)})
@@ -96,12 +96,13 @@ def test_no_bit_of_a_policy_changes_unnoticed(path):
 
 def test_normalisation_by_hand(path):
     _, tensors = read_policy(path)
-    policy = rlctl.load_policy(path)
     observation = np.array([3.0, -2.0, 0.0, 1.0, 90.0], np.float32)
     mean, var = tensors["normalize//mean"], tensors["normalize//var"]
     expected = np.clip((observation - mean) / np.sqrt(var + 1e-8), -10.0, 10.0)
     assert expected[4] == 10.0
-    np.testing.assert_array_equal(policy.normalizer(observation[None])[0], expected.astype(np.float32))
+    (normalize, _) = Network(*read_policy(path)).parts[""]
+    np.testing.assert_array_equal(normalize(observation), expected.astype(np.float32))
+    np.testing.assert_array_equal(TorchPolicy.load(path).normalize(observation), expected.astype(np.float32))
 
 
 def rewrite(path, metadata):
@@ -168,48 +169,8 @@ def test_a_description_that_does_not_fit(path, changes, message):
     info, _ = read_policy(path)
     rewrite(path, {"rlctl": info.model_copy(update=changes).model_dump_json()})
     with pytest.raises(ArtifactError) as caught:
-        rlctl.load_policy(path)
+        TorchPolicy.load(path)
     assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"policy_kwargs": {"net_arch": [64, 64]}},
-        {"algo": "sac"},
-        {"algo": "dqn", "action": spaces.Discrete(3)},
-        {"algo": "recurrent_ppo", "policy": "MlpLstmPolicy", "policy_kwargs": {"lstm_hidden_size": 32}},
-        {"policy": "MultiInputPolicy", "observation": DICT},
-    ],
-    ids=["ppo", "sac", "dqn", "recurrent", "dict"],
-)
-def test_an_action_does_not_depend_on_its_neighbours(saved, options):
-    """Bit for bit: alone, beside others, at another place, or beyond the first block of rows."""
-    policy = rlctl.load_policy(saved(**options))
-    rng = np.random.default_rng(0)
-    count, steps = ROWS + 9, 3
-    if isinstance(policy.observation_space, spaces.Dict):
-        seen = [
-            {"a": rng.normal(size=(count, 3)).astype(np.float32), "b": rng.integers(0, 4, count)} for _ in range(steps)
-        ]
-    else:
-        seen = [rng.normal(size=(count, 5)).astype(np.float32) for _ in range(steps)]
-
-    def picked(step, rows):
-        whole = seen[step]
-        return {key: value[rows] for key, value in whole.items()} if isinstance(whole, dict) else whole[rows]
-
-    def act(order):
-        actor = BatchActor(policy, count)
-        return [actor.act(picked(step, order), order, np.full(len(order), step == 0)) for step in range(steps)]
-
-    together = act(np.arange(count))
-    backwards = act(np.arange(count)[::-1])
-    for env in (0, 5, ROWS - 1, ROWS, count - 1):
-        alone = act(np.array([env]))
-        for step in range(steps):
-            assert alone[step][0].tobytes() == together[step][env].tobytes()
-            assert backwards[step][count - 1 - env].tobytes() == together[step][env].tobytes()
 
 
 def test_a_recurrent_policy_remembers_until_reset(saved):
@@ -258,4 +219,4 @@ def test_an_actor_alone_acts_as_the_whole_policy(tmp_path, algo):
     del actor[min(name for name in actor if name.endswith(".weight"))]
     save_policy(tmp_path / "part.safetensors", info, actor)
     with pytest.raises(ArtifactError, match="its tensors do not fit its description: tensors missing: "):
-        rlctl.load_policy(tmp_path / "part.safetensors")
+        TorchPolicy.load(tmp_path / "part.safetensors")

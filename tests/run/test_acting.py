@@ -11,9 +11,9 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.run.acting import Exploration, PolicyPlayer, check_playable
 from rlctl.run.env_info import EnvInfo, space_to_json
-from rlctl.run.numpy_policy import select_actor_tensors
+from rlctl.run.network import select_actor_tensors
 from rlctl.run.policy import PolicyInfo
-from rlctl.run.torch_policy import ALGORITHMS, Normalizer, TorchPolicy, describe_network, policy_name
+from rlctl.run.torch_policy import ALGORITHMS, TorchPolicy, describe_network, policy_name
 
 FLAT, BOX = spaces.Box(-np.inf, np.inf, (6,)), spaces.Box(-2, 3, (2,))
 IMAGE = spaces.Box(0, 255, (36, 40, 3), np.uint8)
@@ -78,7 +78,7 @@ def policy():
             env=EnvInfo(observation_space=space_to_json(observation), action_space=space_to_json(action)),
             spec=EnvSpec("test"),
         )
-        return info, tensors, TorchPolicy(info, network, Normalizer(info, tensors))
+        return info, tensors, TorchPolicy(info, network, tensors)
 
     return make
 
