@@ -8,12 +8,13 @@ import json
 import os
 import stat
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.text import Text
 
 _PIPED_WIDTH = 1000  # nothing folds: a line stays a line for grep
 
@@ -76,6 +77,25 @@ def print_notes(notes: Iterable[str]) -> None:
     """Print lines for people to stderr."""
     for note in notes:
         err().print(note, markup=False, style="dim")
+
+
+def print_table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str | Text]],
+    *,
+    left: Collection[str] = (),
+    padding: tuple[int, int] = (0, 1),
+) -> None:
+    """Print a table of results, its columns aligned right but for those in `left`. What is in a cell is no markup."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, padding=padding)
+    for name in columns:
+        table.add_column(Text(name, style="bold"), justify="left" if name in left else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    out().print(table)
 
 
 def write_result_json(target: str, content: Any) -> None:

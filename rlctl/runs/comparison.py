@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
-from rlctl.run.directory import RunDirectory
+from rlctl.run.directory import RunDirectory, is_group
+from rlctl.run.group import read_group
 from rlctl.run.lookup import find_run
 from rlctl.run.recipe_difference import find_difference
 from rlctl.runs.statistics import (
@@ -41,7 +42,7 @@ class CompareRequest:
     """What the command line asks for."""
 
     sides: Sequence[str]
-    """Runs, globs, or folders of runs; the first is the baseline."""
+    """Runs, groups, globs, or folders of runs; the first is the baseline."""
     episodes: int = 100
     seed: int = 0
     task: str | None = None
@@ -80,7 +81,7 @@ class Side:
 
     def scores(self, quantity: Quantity) -> NDArray[np.float64]:
         """Return each run's mean over its episodes, shape (runs,)."""
-        return np.array([run.values(quantity).mean() for run in self.runs], np.float64)
+        return np.array([np.nanmean(run.values(quantity)) for run in self.runs], np.float64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +113,11 @@ class Comparison:
     episodes: int
     threshold: float | None
 
+    @property
+    def sides(self) -> list[Side]:
+        """The baseline, then the candidates' sides."""
+        return [self.baseline, *(candidate.side for candidate in self.candidates)]
+
     def check(self) -> None:
         """Raise `AnswerIsNo` if a candidate is worse than the baseline."""
         worse = [each.side.name for each in self.candidates if each.verdict is Verdict.WORSE]
@@ -142,20 +148,27 @@ def compare(request: CompareRequest) -> Comparison:
         baseline=baseline,
         candidates=[_candidate(baseline, side, of_recipes) for side in others],
         episodes=request.episodes,
-        threshold=_threshold(request, baseline),
+        threshold=_threshold(request, baseline.has_success),
     )
 
 
 def find_group(text: str) -> list[RunDirectory]:
-    """Return the runs that a word stands for: those of a glob or a folder of runs, or one run."""
-    found: list[Path] = []
+    """Return the runs that a word stands for: those of a glob, a group or a folder of runs, or one run."""
     if any(character in text for character in "*?["):
-        found = [path for path in map(Path, sorted(glob.glob(text))) if (path / "run.json").is_file()]
+        found = [RunDirectory(path) for path in map(Path, sorted(glob.glob(text))) if (path / "run.json").is_file()]
         if not found:
             raise ArtifactError(f"{text}: no run matches")
-    elif Path(text).is_dir() and not (Path(text) / "run.json").is_file():
-        found = sorted(path.parent for path in Path(text).glob("*/run.json"))
-    return [RunDirectory(path) for path in found] or [find_run(text)]
+        return found
+    path = Path(text)
+    if is_group(path):
+        group = read_group(path)
+        runs = [run for seed in group.seeds if (run := group.find_run(seed)) is not None]
+        if not runs:
+            raise ArtifactError(f"{text}: none of its seeds has begun")
+        return runs
+    if path.is_dir() and not (path / "run.json").is_file():
+        return [RunDirectory(file.parent) for file in sorted(path.glob("*/run.json"))] or [find_run(text)]
+    return [find_run(text)]
 
 
 def _name(text: str, group: list[RunDirectory]) -> str:
@@ -190,21 +203,21 @@ def _evaluate(run: RunDirectory, request: CompareRequest) -> EvaluatedRun:
         EvalRequest(run=str(run.path), task=request.task, episodes=request.episodes, seed=request.seed), Gates()
     )
     has_success = evaluation.success_rate is not None
-    column = "success" if has_success else "return"
-    threshold = request.threshold if request.threshold is not None else THRESHOLD if has_success else None
-    reached = (
-        next((row for row in evaluations(run) if (value := row.get(column)) is not None and value >= threshold), None)
-        if threshold is not None
-        else None
+    column, threshold = "success" if has_success else "return", _threshold(request, has_success)
+    rows = [] if threshold is None else evaluations(run)
+    reached = next((row for row in rows if (value := row.get(column)) is not None and value >= threshold), {})
+    steps = reached.get("steps")
+    return EvaluatedRun(
+        path=run.path,
+        seed=summarize(run.path).seed,
+        evaluation=evaluation,
+        steps_to_threshold=None if steps is None else int(steps),
+        seconds_to_threshold=reached.get("seconds"),
     )
-    steps, seconds = (reached.get("steps"), reached.get("seconds")) if reached else (None, None)
-    return EvaluatedRun(run.path, summarize(run.path).seed, evaluation, None if steps is None else int(steps), seconds)
 
 
-def _threshold(request: CompareRequest, side: Side) -> float | None:
-    if request.threshold is not None:
-        return request.threshold
-    return THRESHOLD if side.has_success else None
+def _threshold(request: CompareRequest, has_success: bool) -> float | None:
+    return THRESHOLD if request.threshold is None and has_success else request.threshold
 
 
 def _candidate(baseline: Side, side: Side, of_recipes: bool) -> Candidate:
@@ -217,9 +230,9 @@ def _candidate(baseline: Side, side: Side, of_recipes: bool) -> Candidate:
 
 def _between_policies(baseline: Side, side: Side, quantity: Quantity) -> Difference:
     one, two = (each.runs[0].values(quantity) for each in (baseline, side))
-    if quantity == "success":
-        return success_difference(one.astype(np.bool_), two.astype(np.bool_))
-    return return_difference(one, two)
+    known = np.isfinite(one) & np.isfinite(two)
+    differ = success_difference if quantity == "success" else return_difference
+    return differ(one[known], two[known])
 
 
 def _between_recipes(baseline: Side, side: Side, quantity: Quantity) -> SeedDifference:

@@ -6,15 +6,9 @@ import dataclasses
 from typing import Any
 
 from rlctl import output
-from rlctl.runs.comparison import Candidate, Comparison, Quantity, Side
-from rlctl.runs.statistics import (
-    ALPHA,
-    Difference,
-    SeedDifference,
-    Verdict,
-    interquartile_mean,
-    interquartile_mean_interval,
-)
+from rlctl.eval.statistics import Spread
+from rlctl.runs.comparison import Candidate, Comparison, EvaluatedRun, Quantity, Side
+from rlctl.runs.statistics import ALPHA, Difference, SeedDifference, Verdict, interquartile_mean_interval
 
 
 def show(result: Comparison, json: str | None) -> None:
@@ -34,61 +28,44 @@ def show(result: Comparison, json: str | None) -> None:
 
 
 def _show_policies(result: Comparison) -> None:
-    table = _table("", "success", "return")
-    for side in _sides(result):
-        rate = side.runs[0].evaluation.success_rate
-        table.add_row(side.name, "-" if rate is None else f"{rate:.1%}", f"{side.runs[0].values('return').mean():.4g}")
-    output.out().print(table)
+    rows = [(side.name, *_format_scores(side.runs[0])) for side in result.sides]
+    output.print_table(("policy", "success", "return"), rows, left=("policy",))
 
 
 def _show_seeds(result: Comparison) -> None:
-    reaching = "" if result.threshold is None else f" to {result.threshold:g}"
-    table = _table("", "seed", "success", "return", *([f"steps{reaching}", f"seconds{reaching}"] if reaching else []))
-    for side in _sides(result):
-        for run in side.runs:
-            rate = run.evaluation.success_rate
-            table.add_row(
-                side.name,
-                "-" if run.seed is None else str(run.seed),
-                "-" if rate is None else f"{rate:.1%}",
-                f"{run.values('return').mean():.4g}",
-                *(
-                    [
-                        "-" if run.steps_to_threshold is None else f"{run.steps_to_threshold:,}",
-                        "-" if run.seconds_to_threshold is None else f"{run.seconds_to_threshold:.0f}",
-                    ]
-                    if reaching
-                    else []
-                ),
-            )
-    out = output.out()
-    out.print(table)
-    for side in _sides(result):
-        for quantity in _quantities(result):
-            scores = side.scores(quantity)
-            low, high = interquartile_mean_interval(scores)
-            out.print(
-                f"{side.name}: {quantity} mean {scores.mean():.4g}, IQM {interquartile_mean(scores):.4g} "
-                f"(95 % interval {low:.4g} to {high:.4g}), {len(scores)} seeds",
-                markup=False,
-            )
+    columns = ["recipe", "seed", "success", "return"]
+    if result.threshold is not None:
+        columns += [f"steps to {result.threshold:g}", f"seconds to {result.threshold:g}"]
+    rows = [
+        (side.name, _or_dash(run.seed, ""), *_format_scores(run), *_format_reached(run))[: len(columns)]
+        for side in result.sides
+        for run in side.runs
+    ]
+    output.print_table(columns, rows, left=("recipe",))
+    for side in result.sides:
+        scores = "; ".join(_format_aggregate(side, quantity) for quantity in result.candidates[0].differences)
+        output.out().print(f"{side.name}: {len(side.runs)} seeds, {scores}", markup=False)
 
 
-def _table(*columns: str) -> Any:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="right" if number else "left", header_style="bold", overflow="fold")
-    return table
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
 
 
-def _sides(result: Comparison) -> list[Side]:
-    return [result.baseline, *(candidate.side for candidate in result.candidates)]
+def _format_scores(run: EvaluatedRun) -> tuple[str, str]:
+    return _or_dash(run.evaluation.success_rate, ".1%"), f"{run.evaluation.returns.mean:.4g}"
 
 
-def _quantities(result: Comparison) -> list[Quantity]:
-    return list(result.candidates[0].differences)
+def _format_reached(run: EvaluatedRun) -> tuple[str, str]:
+    return _or_dash(run.steps_to_threshold, ","), _or_dash(run.seconds_to_threshold, ".0f")
+
+
+def _format_aggregate(side: Side, quantity: Quantity) -> str:
+    """Return `success mean 97.0%, IQM 97.5% (95 % interval 95.0% to 99.0%)`."""
+    scores = side.scores(quantity)
+    spread, interval = Spread.of(scores.tolist()), interquartile_mean_interval(scores)
+    form = ".1%" if quantity == "success" else ".4g"
+    mean, middle, low, high = (format(value, form) for value in (spread.mean, spread.iqm, *interval))
+    return f"{quantity} mean {mean}, IQM {middle} (95 % interval {low} to {high})"
 
 
 def _show_candidate(result: Comparison, candidate: Candidate) -> None:
@@ -121,17 +98,18 @@ def format_difference(difference: Difference, *, as_percent: bool) -> str:
 
 def format_needed(candidate: Candidate, of_recipes: bool) -> str:
     """Say how much data would decide."""
-    unit = "seeds for each recipe" if of_recipes else "episodes"
+    unit, parts = "seeds for each recipe" if of_recipes else "episodes", []
     first = next(iter(candidate.differences.values()))
     if isinstance(first, SeedDifference) and first.smallest_p >= ALPHA:
-        return (
+        parts.append(
             f"so few seeds cannot decide: the smallest p-value that they can reach is {first.smallest_p:.2g}; "
             "4 seeds for each recipe reach 0.029, 5 reach 0.008"
         )
-    needed = [each.needed for each in candidate.differences.values() if each.needed is not None]
-    if not needed:
-        return "no difference at all: more of the same would not decide"
-    return f"if the difference is as it seems, about {min(needed):,} {unit} would decide"
+    needed = [(each.needed, quantity) for quantity, each in candidate.differences.items() if each.needed is not None]
+    if needed:
+        count, quantity = min(needed)
+        parts.append(f"if the difference in {quantity} is as it seems, about {count:,} {unit} would decide")
+    return "; ".join(parts) or "no difference at all: more of the same would not decide"
 
 
 def as_json(result: Comparison) -> dict[str, Any]:
@@ -142,10 +120,10 @@ def as_json(result: Comparison) -> dict[str, Any]:
         "task": result.task,
         "episodes": result.episodes,
         "threshold": result.threshold,
-        "baseline": _side_as_json(result.baseline),
+        "baseline": _side_as_json(result.baseline, result),
         "candidates": [
             {
-                **_side_as_json(candidate.side),
+                **_side_as_json(candidate.side, result),
                 "verdict": str(candidate.verdict),
                 "differences": {
                     quantity: {**dataclasses.asdict(difference), "verdict": str(difference.verdict)}
@@ -161,16 +139,26 @@ def as_json(result: Comparison) -> dict[str, Any]:
     }
 
 
-def _side_as_json(side: Side) -> dict[str, Any]:
+def _side_as_json(side: Side, result: Comparison) -> dict[str, Any]:
     runs = [
         {
             "run": str(run.path),
             "seed": run.seed,
             "success_rate": run.evaluation.success_rate,
-            "return": float(run.values("return").mean()),
+            "return": run.evaluation.returns.mean,
             "steps_to_threshold": run.steps_to_threshold,
             "seconds_to_threshold": run.seconds_to_threshold,
         }
         for run in side.runs
     ]
-    return {"name": side.name, "runs": runs}
+    if not result.of_recipes:
+        return {"name": side.name, "runs": runs}
+    scores = {quantity: side.scores(quantity) for quantity in result.candidates[0].differences}
+    over_seeds = {
+        quantity: {
+            **dataclasses.asdict(Spread.of(values.tolist())),
+            "iqm_interval": interquartile_mean_interval(values),
+        }
+        for quantity, values in scores.items()
+    }
+    return {"name": side.name, "runs": runs, "over_seeds": over_seeds}

@@ -58,19 +58,21 @@ class SeedDifference(Difference):
     """The smallest p-value that so many seeds can reach at all."""
 
 
-def success_difference(baseline: NDArray[np.bool_], candidate: NDArray[np.bool_]) -> Difference:
-    """Compare two policies' successes on the same episodes: McNemar's exact test (McNemar, 1947).
+def success_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64]) -> Difference:
+    """Compare two policies' successes, 0 or 1, on the same episodes: McNemar's exact test (McNemar, 1947).
 
-    Both of shape (episodes,). Raises `ValueError` if the shapes differ.
+    Both of shape (episodes,). The interval is that of Agresti and Min (2005), which is not empty where no episode
+    differs: half an episode is added to each of the four outcomes of a pair.
     """
     from scipy.stats import binomtest
 
-    gained, lost = int((candidate & ~baseline).sum()), int((baseline & ~candidate).sum())
-    difference = candidate.astype(np.float64) - baseline
-    disagreeing = gained + lost
-    p = float(binomtest(gained, disagreeing, 0.5).pvalue) if disagreeing else 1.0
-    low, high = _mean_interval(difference)
-    return Difference(float(difference.mean()), low, high, p, _episodes_for_success(gained, lost, len(difference)))
+    episodes, difference = baseline.size, candidate - baseline
+    gained, lost = int((difference > 0).sum()), int((difference < 0).sum())
+    p = float(binomtest(gained, gained + lost, 0.5).pvalue) if gained + lost else 1.0
+    centre = (gained - lost) / (episodes + 2)
+    half = _quantiles()[0] * math.sqrt((gained + lost + 1) / (episodes + 2) - centre**2) / math.sqrt(episodes + 2)
+    needed = _episodes_for_success(gained, lost, episodes)
+    return Difference(float(difference.mean()), max(-1.0, centre - half), min(1.0, centre + half), p, needed)
 
 
 def return_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64]) -> Difference:
@@ -87,7 +89,7 @@ def return_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float
     test = permutation_test(
         (difference,), np.mean, permutation_type="samples", n_resamples=_RESAMPLES, vectorized=True, rng=_rng()
     )
-    low, high = _mean_interval(difference)
+    low, high = _interval((difference,), np.mean)
     std = float(difference.std(ddof=1)) if difference.size > 1 else math.nan
     return Difference(mean, low, high, float(test.pvalue), _sample_size(mean, std))
 
@@ -115,13 +117,6 @@ def seed_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64
     return SeedDifference(mean, low, high, p, None if needed is None else max(needed, 4), improvement, smallest)
 
 
-def interquartile_mean(scores: NDArray[np.float64]) -> float:
-    """Return the mean of the middle half (Agarwal et al., 2021)."""
-    from scipy.stats import trim_mean
-
-    return float(trim_mean(scores, 0.25))
-
-
 def interquartile_mean_interval(scores: NDArray[np.float64]) -> tuple[float, float]:
     """Return the 95 % bootstrap interval of the interquartile mean over seeds, shape (seeds,)."""
     from scipy.stats import trim_mean
@@ -134,10 +129,6 @@ def interquartile_mean_interval(scores: NDArray[np.float64]) -> tuple[float, flo
 
 def _difference_of_means(one: NDArray[np.float64], two: NDArray[np.float64], axis: int = -1) -> Any:
     return np.mean(one, axis=axis) - np.mean(two, axis=axis)
-
-
-def _mean_interval(values: NDArray[np.float64]) -> tuple[float, float]:
-    return _interval((values,), np.mean)
 
 
 def _interval(samples: tuple[NDArray[np.float64], ...], statistic: Any) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
@@ -44,8 +45,14 @@ def test_recipes_are_compared_seed_by_seed(root):
     (candidate,) = result.candidates
     assert candidate.recipe_changes == {"algo_kwargs.gamma": (0.99, 0.9)}
     assert candidate.verdict is Verdict.CANNOT_TELL
-    assert "smallest p-value that they can reach is 0.33" in format_needed(candidate, of_recipes=True)
+    needed = format_needed(candidate, of_recipes=True)
+    assert "smallest p-value that they can reach is 0.33" in needed
+    assert "if the difference in return is as it seems, about " in needed
     content = json.loads(json.dumps(as_json(result)))
+    baseline = content["baseline"]
+    assert baseline["over_seeds"]["return"]["mean"] == pytest.approx(
+        np.mean([each["return"] for each in baseline["runs"]])
+    )
     assert [len(side["runs"]) for side in (content["baseline"], *content["candidates"])] == [2, 2]
 
 

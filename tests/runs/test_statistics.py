@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.stats import mannwhitneyu, norm, trim_mean
 
 from rlctl.runs.statistics import (
     Verdict,
-    interquartile_mean,
     interquartile_mean_interval,
     return_difference,
     seed_difference,
@@ -14,7 +14,7 @@ from rlctl.runs.statistics import (
 
 
 def successes(*groups):
-    return np.array([value for value, count in groups for _ in range(count)], np.bool_)
+    return np.array([value for value, count in groups for _ in range(count)], np.float64)
 
 
 def test_mcnemar_by_hand():
@@ -33,7 +33,15 @@ def test_equal_policies_do_not_differ_significantly():
     difference = success_difference(values, values)
     assert (difference.mean, difference.p, difference.needed) == (0.0, 1.0, None)
     assert difference.verdict is Verdict.CANNOT_TELL
-    assert return_difference(values.astype(float), values.astype(float)).verdict is Verdict.CANNOT_TELL
+    assert return_difference(values, values).verdict is Verdict.CANNOT_TELL
+    # Agresti and Min: (0 + 0 + 1) / 12 under the root, 1.959964 * sqrt(1 / 12) / sqrt(12) = 0.163330
+    assert (difference.low, difference.high) == pytest.approx((-0.163330, 0.163330), abs=1e-6)
+
+
+def test_interval_of_a_difference_in_success_by_hand():
+    # 10 gained, 2 lost of 100: 8 / 102 = 0.078431 -+ 1.959964 * sqrt(13 / 102 - 0.078431^2) / sqrt(102) = 0.067589
+    difference = success_difference(successes((False, 10), (True, 90)), successes((True, 10), (False, 2), (True, 88)))
+    assert (difference.low, difference.high) == pytest.approx((0.010842, 0.146020), abs=2e-6)
 
 
 def test_episodes_needed_by_connors_formula():
@@ -69,10 +77,22 @@ def test_probability_of_improvement_counts_ties_half():
     assert difference.probability_of_improvement == pytest.approx(0.625)
 
 
-def test_interquartile_mean_by_hand():
-    # Middle half of 0 1 2 3 4 5 6 100 is 2 3 4 5.
-    assert interquartile_mean(np.array([100.0, 0, 1, 2, 3, 4, 5, 6])) == 3.5
+def test_figures_over_seeds_are_those_of_rliable():
+    # Its formulas: probability of improvement is Mann and Whitney's U over the number of pairs; the interval of the
+    # interquartile mean is the percentile bootstrap over seeds of scipy's trim_mean(scores, 0.25).
+    rng = np.random.default_rng(1)
+    baseline, candidate = rng.normal(0.0, 1.0, 10).round(1), rng.normal(0.5, 1.0, 12).round(1)
+    expected = mannwhitneyu(candidate, baseline).statistic / 120
+    assert seed_difference(baseline, candidate).probability_of_improvement == pytest.approx(expected)
+    resampled = trim_mean(candidate[rng.integers(12, size=(20_000, 12))], 0.25, axis=1)
+    assert interquartile_mean_interval(candidate) == pytest.approx(np.percentile(resampled, [2.5, 97.5]), abs=0.05)
     assert interquartile_mean_interval(np.full(5, 2.0)) == (2.0, 2.0)
+
+
+def test_probability_of_improvement_of_normal_scores():
+    # Of N(0, 1) and N(1, 1): P(Y > X) = Phi(1 / sqrt(2)) = 0.760250
+    scores = norm.ppf((np.arange(200) + 0.5) / 200)
+    assert seed_difference(scores, scores + 1.0).probability_of_improvement == pytest.approx(0.760250, abs=0.002)
 
 
 @pytest.mark.slow

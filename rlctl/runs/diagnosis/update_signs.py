@@ -20,27 +20,33 @@ def critic_blind(run: History) -> str | None:
 
 
 def values_explode(run: History) -> str | None:
-    """The critic expects several times as much as rewards can add up to."""
-    value, gamma = run.curve("value"), run.setting("gamma")
-    if len(value) < LEAST_ROWS or not run.episodes or not isinstance(gamma, float) or gamma >= 1:
+    """The critic expects far more than rewards can add up to."""
+    value, most = run.curve("value"), _largest_value(run)
+    if len(value) < LEAST_ROWS or most is None:
         return None
-    settings = run.recipe.get("normalize")
+    peak, last = float(np.abs(value.values).max()), value.thirds()[1]
+    # An entropy bonus comes on top of rewards, most at the beginning.
+    if peak < 30 * most and abs(last) < 3 * most:
+        return None
+    return f"the critic expects up to {peak:.3g}, {last:.3g} in the last third; rewards add up to {most:.3g} at most"
+
+
+def gradients_explode(run: History) -> str | None:
+    """Gradients are far larger than errors of a value could make them."""
+    norm, most = run.curve("gradient_norm"), _largest_value(run)
+    if len(norm) < LEAST_ROWS or most is None or (peak := float(norm.values.max())) < 1000 * max(most, 1.0):
+        return None
+    return f"the gradient's norm is up to {peak:.2g}, where rewards add up to {most:.3g} at most"
+
+
+def _largest_value(run: History) -> float | None:
+    """Return the most that discounted rewards can add up to, as the critic sees them; None where it is not known."""
+    gamma, settings = run.setting("gamma"), run.recipe.get("normalize")
+    if not isinstance(gamma, float) or not 0 <= gamma < 1 or not run.episodes:
+        return None
     normalized = isinstance(settings, dict) and settings.get("reward", True)
     largest = _MOST_NORMALIZED_REWARD if normalized else max(float(np.abs(each.rewards).max()) for each in run.episodes)
-    most = max(largest / (1 - gamma), float(np.abs(run.curve("return").values).max(initial=0.0)))
-    last = value.thirds()[1]
-    if abs(last) < 3 * most:
-        return None
-    return f"the critic expects {last:.3g} in the last third; rewards add up to {most:.3g} at most"
-
-
-def gradients_grow(run: History) -> str | None:
-    """Gradients become far larger than they were."""
-    norm = run.curve("gradient_norm")
-    if len(norm) < LEAST_ROWS:
-        return None
-    first, last = norm.thirds()
-    return f"the gradient's norm grows from {first:.2g} to {last:.2g}" if last > 30 * first > 0 else None
+    return max(largest / (1 - gamma), float(np.abs(run.curve("return").values).max(initial=0.0)))
 
 
 def policy_hardly_changes(run: History) -> str | None:
