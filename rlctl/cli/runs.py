@@ -43,9 +43,10 @@ def list_runs(
 @app.command("show")
 def show_run(run: Run = None, json: Json = None) -> None:
     """Show a run: its recipe, curve, evaluations, warnings and files."""
+    from rlctl.run.lookup import find_run
     from rlctl.runs.show import describe, show
 
-    show(describe(run), json)
+    show(describe(find_run(run)), json)
 
 
 @app.command("report")
@@ -101,7 +102,7 @@ def compare_runs(
     """Say whether a policy, or a recipe trained with several seeds, is better than another."""
     claim_stdout()
     if gate not in (None, "not-worse"):
-        raise UsageError(f"--gate {gate}: the one gate there is is not-worse")
+        raise UsageError(f"--gate {gate}: the only gate is not-worse")
     from rlctl.runs.comparison import CompareRequest, compare
     from rlctl.runs.comparison_report import show
 

@@ -82,37 +82,28 @@ def show(result: GroupScore, json: str | None) -> None:
     if json is not None:
         output.write_result_json(json, as_json(result))
         return
-    from rich.table import Table
-
     out = output.out()
     scores = [each.score for each in result.seeds if each.score is not None]
     episodes = f", {scores[0].episodes} episodes each, seed {scores[0].seed}" if scores else ""
     out.print(f"{result.group.task}: {result.group.path}, {len(result.seeds)} seeds{episodes}", markup=False)
-    table = Table(box=None, pad_edge=False)
-    for number, column in enumerate(("seed", "success", "return", "steps", "seconds", "")):
-        table.add_column(column, justify="right" if number < 5 else "left", header_style="bold")
-    for each in result.seeds:
-        table.add_row(*_list_cells(each))
     success, returns = result.spread("success"), result.spread("mean_return")
-    for name in ("mean", "iqm", "std"):
-        rate, value = (None if spread is None else getattr(spread, name) for spread in (success, returns))
-        label = "IQM" if name == "iqm" else name
-        table.add_row(label, "-" if rate is None else f"{rate:.1%}", "-" if value is None else f"{value:.4g}")
-    out.print(table)
+    rows = [_list_cells(each) for each in result.seeds]
+    for label in ("mean", "IQM", "std"):
+        rate, value = (None if each is None else getattr(each, label.lower()) for each in (success, returns))
+        rows.append((label, "-" if rate is None else f"{rate:.1%}", "-" if value is None else f"{value:.4g}"))
+    output.print_table(("seed", "success", "return", "steps", "seconds", ""), rows, left=("",))
 
 
-def _list_cells(each: SeedScore) -> list[Any]:
-    from rich.text import Text
-
+def _list_cells(each: SeedScore) -> tuple[str, ...]:
     score = each.score
-    return [
+    return (
         str(each.seed),
         "-" if score is None or score.success is None else f"{score.success:.1%}",
         "-" if score is None else f"{score.mean_return:.4g}",
         "-" if each.steps is None else f"{each.steps:,}",
         "-" if each.seconds is None else f"{each.seconds:.0f}",
-        Text(each.problem),
-    ]
+        each.problem,
+    )
 
 
 def as_json(result: GroupScore) -> dict[str, Any]:

@@ -26,26 +26,20 @@ def show_all(results: Sequence[Evaluation], json: str | None) -> None:
 
 
 def _show_stages(results: Sequence[Evaluation]) -> None:
-    from rich.table import Table
-
-    first, out = results[0], output.out()
-    _show_head(first)
-    table = Table(box=None, pad_edge=False)
-    table.add_column("stage", justify="right")
-    for column in ("success", "95 % interval", "return", "length"):
-        table.add_column(column, justify="right", header_style="bold")
-    table.add_column("changes")
-    for result in results:
-        rate, interval = result.success_rate, result.success_interval
-        table.add_row(
+    _show_head(results[0])
+    specs = [each.spec for each in results]
+    rows = [
+        (
             str(result.spec.stage),
-            "-" if rate is None else f"{rate:.1%}",
-            "-" if interval is None else f"{interval[0]:.1%} to {interval[1]:.1%}",
+            "-" if result.success_rate is None else f"{result.success_rate:.1%}",
+            "-" if (interval := result.success_interval) is None else f"{interval[0]:.1%} to {interval[1]:.1%}",
             f"{result.returns.mean:.4g}",
             f"{result.lengths.mean:.4g}",
-            _describe_changes(result.spec, [each.spec for each in results]),
+            _describe_changes(result.spec, specs),
         )
-    out.print(table)
+        for result in results
+    ]
+    output.print_table(("stage", "success", "95 % interval", "return", "length", "changes"), rows, left=("changes",))
 
 
 def _describe_changes(spec: EnvSpec, specs: Sequence[EnvSpec]) -> str:
@@ -66,8 +60,6 @@ def show(result: Evaluation, json: str | None) -> None:
     if json is not None:
         output.write_result_json(json, as_json(result))
         return
-    from rich.table import Table
-
     out = output.out()
     _show_head(result)
     if result.spec.stage and result.policy is not None:
@@ -75,25 +67,17 @@ def show(result: Evaluation, json: str | None) -> None:
     if result.success_rate is not None and result.success_interval is not None:
         low, high = result.success_interval
         out.print(f"success rate {result.success_rate:.1%}  (95 % interval {low:.1%} to {high:.1%})")
-    table = Table(box=None, pad_edge=False)
-    table.add_column("")
-    for column in ("mean", "IQM", "std", "min", "max"):
-        table.add_column(column, justify="right", header_style="bold")
-    table.add_row("return", *_format_spread(result.returns))
-    table.add_row("length", *_format_spread(result.lengths))
+    rows = [("return", *_format_spread(result.returns)), ("length", *_format_spread(result.lengths))]
     if result.final_distance is not None:
-        table.add_row("final distance", *_format_spread(result.final_distance))
-    for name, mean in result.terms.items():
-        table.add_row(f"term {name}", f"{mean:.4g}")
-    out.print(table)
+        rows.append(("final distance", *_format_spread(result.final_distance)))
+    rows += [(f"term {name}", f"{mean:.4g}") for name, mean in result.terms.items()]
+    output.print_table(("", "mean", "IQM", "std", "min", "max"), rows, left=("",))
     if result.unlimited is not None:
         _show_limits(result, result.unlimited)
 
 
 def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
     """Print what the limits cost, and how often each stepped in."""
-    from rich.table import Table
-
     out = output.out()
     without, now = unlimited.success_rate, result.success_rate
     success = ""
@@ -102,12 +86,11 @@ def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
     returns = f"return {unlimited.returns.mean:.4g} without them, {result.returns.mean:.4g} with them"
     out.print(f"limits of {result.limited_by}: {success}{returns}", markup=False)
     steps = sum(episode.result.length for episode in result.episodes)
-    table = Table(box=None, pad_edge=False)
-    table.add_column("stepped in")
-    table.add_column("per 1,000 steps", justify="right")
-    for name, count in count_interventions(result).most_common():
-        table.add_row(name, f"{1000 * count / steps:.4g}")
-    out.print(table if table.row_count else "they never stepped in")
+    rows = [(name, f"{1000 * count / steps:.4g}") for name, count in count_interventions(result).most_common()]
+    if rows:
+        output.print_table(("stepped in", "per 1,000 steps"), rows, left=("stepped in",))
+    else:
+        out.print("they never stepped in")
 
 
 def count_interventions(result: Evaluation) -> collections.Counter[str]:
@@ -132,8 +115,8 @@ def describe_policy(result: Evaluation) -> str:
     return f"policy {result.name}" if info is None else f"{result.name} ({info.algo}, step {info.training_steps:,})"
 
 
-def _format_spread(spread: Spread) -> list[str]:
-    return [f"{value:.4g}" for value in (spread.mean, spread.iqm, spread.std, spread.min, spread.max)]
+def _format_spread(spread: Spread) -> tuple[str, ...]:
+    return tuple(f"{value:.4g}" for value in (spread.mean, spread.iqm, spread.std, spread.min, spread.max))
 
 
 def as_json(result: Evaluation) -> dict[str, Any]:

@@ -70,23 +70,18 @@ def _name_axes(axes: Sequence[Axis]) -> str:
 
 
 def _show_list(found: RobustnessMap, worst: Cell | None) -> None:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    table.add_column(found.axes[0].name, justify="right", header_style="bold")
     has_success = found.cells[0].success_rate is not None
-    for column in (*(("success", "95 % interval") if has_success else ()), "return", "95 % interval"):
-        table.add_column(column, justify="right", header_style="bold")
-    table.add_column("")
+    successes = ("success", "95 % interval") if has_success else ()
+    rows = []
     for cell, color in zip(found.cells, _color_cells(found), strict=True):
-        values: list[str | Text] = [f"{cell.values[0]:g}"]
+        cells: list[str | Text] = [f"{cell.values[0]:g}"]
         if cell.success_rate is not None:
-            values += [_paint(f"{cell.success_rate:.1%}", color), _format_interval(cell.success_interval, percent=True)]
+            cells += [_paint(f"{cell.success_rate:.1%}", color), _format_interval(cell.success_interval, percent=True)]
         value = f"{cell.mean_return:.4g}"
-        values += [value if has_success else _paint(value, color), _format_interval(cell.return_interval)]
+        cells += [value if has_success else _paint(value, color), _format_interval(cell.return_interval)]
         marks = [*(["nominal"] if cell.nominal else []), *(["worst"] if cell is worst else [])]
-        table.add_row(*values, ", ".join(marks))
-    output.out().print(table)
+        rows.append([*cells, ", ".join(marks)])
+    output.print_table((found.axes[0].name, *successes, "return", "95 % interval", ""), rows, left=("",))
 
 
 def _format_interval(interval: tuple[float, float] | None, *, percent: bool = False) -> str:
@@ -98,21 +93,17 @@ def _format_interval(interval: tuple[float, float] | None, *, percent: bool = Fa
 
 def _show_grid(found: RobustnessMap, worst: Cell | None) -> None:
     """Print a heat map: the first axis downwards, the second across."""
-    from rich.table import Table
-
     down, across = found.axes
     has_success = found.cells[0].success_rate is not None
-    table = Table(box=None, pad_edge=False, padding=(0, 0))
-    table.add_column(f"{down.name} \\ {across.name} ", justify="right", header_style="bold")
-    for value in across.values:
-        table.add_column(f" {value:.3g} ", justify="right", header_style="bold")
     cells = list(zip(found.cells, _color_cells(found), strict=True))
     width = len(across.values)
-    rows = [cells[start : start + width] for start in range(0, len(cells), width)]
-    for value, row in zip(down.values, rows, strict=True):
-        table.add_row(f"{value:.3g} ", *(_draw_cell(cell, color, cell is worst) for cell, color in row))
+    rows = [
+        [f"{value:.3g} ", *(_draw_cell(cell, color, cell is worst) for cell, color in cells[start : start + width])]
+        for value, start in zip(down.values, range(0, len(cells), width), strict=True)
+    ]
+    columns = [f"{down.name} \\ {across.name} ", *(f" {value:.3g} " for value in across.values)]
+    output.print_table(columns, rows, gap="")
     out = output.out()
-    out.print(table)
     marks = [*([f"{_NOMINAL} nominal"] if any(cell.nominal for cell in found.cells) else []), f"{_WORST} worst"]
     out.print(f"{'success [%]' if has_success else 'mean return'}; {', '.join(marks)}")
 
@@ -141,17 +132,14 @@ def _color_cells(found: RobustnessMap) -> list[str]:
 
 
 def _show_push(push: PushTest) -> None:
-    from rich.table import Table
-
     out = output.out()
     what = push.body if push.link is None else f"{push.link} of {push.body}"
     out.print(f"push on {what} in the middle of the episode, {push.duration_s:g} s, from a random side", markup=False)
-    table = Table(box=None, pad_edge=False)
-    name = "success" if push.measure == "success" else "up to the end"
-    for column in ("push [N s]", "of a speed of [m/s]", name, "return"):
-        table.add_column(column, justify="right", header_style="bold")
-    for level in push.levels:
-        speed = level.impulse / push.mass if push.mass else 0.0
-        table.add_row(f"{level.impulse:.3g}", f"{speed:.2g}", f"{level.held:.1%}", f"{level.mean_return:.4g}")
-    out.print(table)
+    held = "success" if push.measure == "success" else "up to the end"
+    speeds = [level.impulse / push.mass if push.mass else 0.0 for level in push.levels]
+    rows = [
+        (f"{level.impulse:.3g}", f"{speed:.2g}", f"{level.held:.1%}", f"{level.mean_return:.4g}")
+        for level, speed in zip(push.levels, speeds, strict=True)
+    ]
+    output.print_table(("push [N s]", "of a speed of [m/s]", held, "return"), rows)
     out.print(push.verdict, markup=False)

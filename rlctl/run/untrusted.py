@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 JSON_LIMIT = 16 * 2**20  # [bytes]
+_ALWAYS_READ = 1_000_000  # [bytes]
 _DEPTH = 100
 """How deep JSON may be nested: far more than anything of ours, far less than Python's own limit."""
 _MEMBERS = 1000
@@ -63,8 +64,8 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
 
 def explain_size(size: int) -> str | None:
     """Say why so many bytes are not read into memory; None if they may be: up to half of what is there."""
-    there = memory.available()
-    if there is None or size <= there // 2:
+    # To ask costs as much as to read a small file, of which `rlctl runs` reads thousands.
+    if size <= _ALWAYS_READ or (there := memory.available()) is None or size <= there // 2:
         return None
     return f"it needs {memory.format_bytes(size)} of memory, and {memory.format_bytes(there)} are free"
 

@@ -23,13 +23,12 @@ from rlctl.run.lookup import find_run
 from rlctl.run.recipe_difference import find_difference
 from rlctl.runs.statistics import (
     Difference,
-    SeedDifference,
     Verdict,
     return_difference,
     seed_difference,
     success_difference,
 )
-from rlctl.runs.summary import evaluations, summarize
+from rlctl.runs.summary import read_table, summarize
 
 Quantity = Literal["success", "return"]
 
@@ -136,6 +135,7 @@ def compare(request: CompareRequest) -> Comparison:
     groups = [find_group(text) for text in request.sides]
     _refuse_unequal(request.sides, groups)
     task = _common_task([run for group in groups for run in group], request.task)
+    recipes = [group[0].recipe() for group in groups]
     sides = [
         Side(_name(text, group), [_evaluate(run, request) for run in group])
         for text, group in zip(request.sides, groups, strict=True)
@@ -146,7 +146,10 @@ def compare(request: CompareRequest) -> Comparison:
         of_recipes=of_recipes,
         task=task,
         baseline=baseline,
-        candidates=[_candidate(baseline, side, of_recipes) for side in others],
+        candidates=[
+            Candidate(side, _differences(baseline, side, of_recipes), find_difference(recipe, recipes[0]))
+            for side, recipe in zip(others, recipes[1:], strict=True)
+        ],
         episodes=request.episodes,
         threshold=_threshold(request, baseline.has_success),
     )
@@ -204,7 +207,7 @@ def _evaluate(run: RunDirectory, request: CompareRequest) -> EvaluatedRun:
     )
     has_success = evaluation.success_rate is not None
     column, threshold = "success" if has_success else "return", _threshold(request, has_success)
-    rows = [] if threshold is None else evaluations(run)
+    rows = [] if threshold is None else read_table(run.evals_file)
     reached = next((row for row in rows if (value := row.get(column)) is not None and value >= threshold), {})
     steps = reached.get("steps")
     return EvaluatedRun(
@@ -220,12 +223,11 @@ def _threshold(request: CompareRequest, has_success: bool) -> float | None:
     return THRESHOLD if request.threshold is None and has_success else request.threshold
 
 
-def _candidate(baseline: Side, side: Side, of_recipes: bool) -> Candidate:
+def _differences(baseline: Side, side: Side, of_recipes: bool) -> dict[Quantity, Difference]:
     quantities: list[Quantity] = ["success", "return"] if baseline.has_success and side.has_success else ["return"]
-    differ = _between_recipes if of_recipes else _between_policies
-    differences = {quantity: differ(baseline, side, quantity) for quantity in quantities}
-    changes = find_difference(RunDirectory(side.runs[0].path).recipe(), RunDirectory(baseline.runs[0].path).recipe())
-    return Candidate(side, differences, changes)
+    if of_recipes:
+        return {each: seed_difference(baseline.scores(each), side.scores(each)) for each in quantities}
+    return {each: _between_policies(baseline, side, each) for each in quantities}
 
 
 def _between_policies(baseline: Side, side: Side, quantity: Quantity) -> Difference:
@@ -233,7 +235,3 @@ def _between_policies(baseline: Side, side: Side, quantity: Quantity) -> Differe
     known = np.isfinite(one) & np.isfinite(two)
     differ = success_difference if quantity == "success" else return_difference
     return differ(one[known], two[known])
-
-
-def _between_recipes(baseline: Side, side: Side, quantity: Quantity) -> SeedDifference:
-    return seed_difference(baseline.scores(quantity), side.scores(quantity))

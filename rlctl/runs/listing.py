@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rlctl import registry
+from rlctl import output, registry
 from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.run.directory import ROOT
 from rlctl.runs.summary import RunSummary, find_runs, summarize
@@ -18,6 +18,8 @@ SORT_KEYS = {
     "steps": lambda run: run.steps or 0,
     "minutes": lambda run: run.seconds or 0.0,
 }
+_COLUMNS = ("run", "algo", "seed", "state", "steps", "minutes", "success", "return", "differs from the recipe")
+_LEFT = ("run", "algo", "state", "differs from the recipe")
 _CHANGES_SHOWN = 4
 _STATE_SHOWN = 44  # characters; `rlctl runs show` has the whole error
 
@@ -44,8 +46,6 @@ def list_runs(
 
 def show(runs: list[RunSummary], json: str | None) -> None:
     """Print the table, or write it as JSON."""
-    from rlctl import output
-
     if json is not None:
         output.write_result_json(json, {"runs": [as_json(run) for run in runs]})
         return
@@ -53,15 +53,7 @@ def show(runs: list[RunSummary], json: str | None) -> None:
     if not runs:
         out.print(f"no runs yet under {ROOT.resolve()}; train one: rlctl train reach")
         return
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    for column in ("run", "algo", "seed", "state", "steps", "minutes", "success", "return", "differs from the recipe"):
-        right = column in ("seed", "steps", "minutes", "success", "return")
-        table.add_column(column, header_style="bold", justify="right" if right else "left", overflow="fold")
-    for run in runs:
-        table.add_row(*_cells(run))
-    out.print(table)
+    output.print_table(_COLUMNS, map(_cells, runs), left=_LEFT)
 
 
 def _cells(run: RunSummary) -> list[Any]:
@@ -69,7 +61,7 @@ def _cells(run: RunSummary) -> list[Any]:
 
     styles = {"done": "green", "running": "cyan", "failed": "red", "damaged": "red"}
     return [
-        Text(run.name),
+        run.name,
         run.algo,
         "" if run.seed is None else str(run.seed),
         Text(short_repr(run.state_text, _STATE_SHOWN), style=styles.get(run.state, "")),
@@ -77,7 +69,7 @@ def _cells(run: RunSummary) -> list[Any]:
         "" if run.seconds is None else f"{run.seconds / 60:.1f}",
         "" if run.best_success is None else f"{run.best_success:.1%}",
         "" if run.best_return is None else f"{run.best_return:.2f}",
-        Text(format_changes(run.changes)),
+        format_changes(run.changes),
     ]
 
 

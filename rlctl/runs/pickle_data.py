@@ -51,16 +51,63 @@ class Persistent:
 
 
 _MARK = object()
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-_EMPTY: dict[str, Callable[[], Any]] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set, "EMPTY_TUPLE": tuple}
-_IGNORED = frozenset({"PROTO", "FRAME", "READONLY_BUFFER"})
-_VALUES = frozenset(
+
+
+def _make_call(function: Any, arguments: Any, keywords: Any = None) -> Call:
+    if not isinstance(function, Name) or not isinstance(arguments, tuple):
+        raise NotPlainData("a call of something that is not a name")
+    return Call(function, arguments if keywords is None else (*arguments, keywords))
+
+
+def _set_state(target: Any, state: Any) -> Any:
+    if not isinstance(target, Call):
+        raise NotPlainData("a state for something that was not made by a call")
+    target.state = state
+    return target
+
+
+def _pair(items: list[Any]) -> dict[Any, Any]:
+    return dict(zip(items[::2], items[1::2], strict=True))
+
+
+def _set_items(target: Any, items: list[Any]) -> None:
+    (target.items if isinstance(target, Call) else target).update(_pair(items))
+
+
+_PUSHES_ARGUMENT = frozenset(
     {
         *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
         *("STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"),
         *("BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"),
     }
 )
+_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "MARK": _MARK}
+_EMPTY: dict[str, Callable[[], Any]] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set, "EMPTY_TUPLE": tuple}
+_MAKES: dict[str, tuple[int, Callable[..., Any]]] = {
+    "TUPLE1": (1, lambda *values: values),
+    "TUPLE2": (2, lambda *values: values),
+    "TUPLE3": (3, lambda *values: values),
+    "STACK_GLOBAL": (2, lambda module, qualname: Name(str(module), str(qualname))),
+    "REDUCE": (2, _make_call),
+    "NEWOBJ": (2, _make_call),
+    "NEWOBJ_EX": (3, _make_call),
+    "BUILD": (2, _set_state),
+    "BINPERSID": (1, Persistent),
+}
+"""Of so many values from the top of the stack one is made."""
+_COLLECTS: dict[str, Callable[[list[Any]], Any]] = {
+    "TUPLE": tuple, "LIST": list, "FROZENSET": frozenset, "DICT": _pair,
+}  # fmt: skip
+"""Of the values above the mark one is made."""
+_ADDS: dict[str, tuple[int | None, Callable[[Any, list[Any]], None]]] = {
+    "APPEND": (1, lambda target, items: target.extend(items)),
+    "APPENDS": (None, lambda target, items: target.extend(items)),
+    "ADDITEMS": (None, lambda target, items: target.update(items)),
+    "SETITEM": (2, _set_items),
+    "SETITEMS": (None, _set_items),
+}
+"""So many values, or with None those above the mark, are added to what is below them."""
+_IGNORED = frozenset({"PROTO", "FRAME", "READONLY_BUFFER"})
 
 
 def read(content: bytes) -> Any:
@@ -89,131 +136,45 @@ class _Machine:
         self._memory: dict[int, Any] = {}
 
     def run(self, name: str, argument: Any) -> None:
-        if name in _VALUES:
-            self.stack.append(argument)
+        stack, memory = self.stack, self._memory
+        if name in _PUSHES_ARGUMENT:
+            stack.append(argument)
         elif name in _CONSTANTS:
-            self.stack.append(_CONSTANTS[name])
+            stack.append(_CONSTANTS[name])
         elif name in _EMPTY:
-            self.stack.append(_EMPTY[name]())
+            stack.append(_EMPTY[name]())
+        elif name in _MAKES:
+            count, make = _MAKES[name]
+            stack.append(make(*self._pop(count)))
+        elif name in _COLLECTS:
+            stack.append(_COLLECTS[name](self._pop_to_mark()))
+        elif name in _ADDS:
+            size, add = _ADDS[name]
+            items = self._pop_to_mark() if size is None else self._pop(size)
+            add(stack[-1], items)
+        elif name in ("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT"):
+            memory[len(memory) if argument is None else int(argument)] = stack[-1]
+        elif name in ("GET", "BINGET", "LONG_BINGET"):
+            stack.append(memory[int(argument)])
+        elif name == "GLOBAL":
+            stack.append(Name(*argument.split(" ", 1)))
+        elif name == "DUP":
+            stack.append(stack[-1])
+        elif name == "POP":
+            stack.pop()
+        elif name == "POP_MARK":
+            self._pop_to_mark()
         elif name not in _IGNORED:
-            handler = getattr(self, f"_run_{name.lower()}", None)
-            if handler is None:
-                raise NotPlainData(f"the instruction {name}, which no model file has")
-            handler(argument)
+            raise NotPlainData(f"the instruction {name}, which no model file has")
+
+    def _pop(self, count: int) -> list[Any]:
+        return [self.stack.pop() for _ in range(count)][::-1]
 
     def _pop_to_mark(self) -> list[Any]:
-        start = next(index for index in range(len(self.stack) - 1, -1, -1) if self.stack[index] is _MARK)
-        items = self.stack[start + 1 :]
-        del self.stack[start:]
-        return items
-
-    def _run_mark(self, _: Any) -> None:
-        self.stack.append(_MARK)
-
-    def _run_pop(self, _: Any) -> None:
-        self.stack.pop()
-
-    def _run_pop_mark(self, _: Any) -> None:
-        self._pop_to_mark()
-
-    def _run_dup(self, _: Any) -> None:
-        self.stack.append(self.stack[-1])
-
-    def _run_memoize(self, _: Any) -> None:
-        self._memory[len(self._memory)] = self.stack[-1]
-
-    def _run_put(self, index: int) -> None:
-        self._memory[int(index)] = self.stack[-1]
-
-    _run_binput = _run_long_binput = _run_put
-
-    def _run_get(self, index: int) -> None:
-        self.stack.append(self._memory[int(index)])
-
-    _run_binget = _run_long_binget = _run_get
-
-    def _run_tuple(self, _: Any) -> None:
-        self.stack.append(tuple(self._pop_to_mark()))
-
-    def _push_tuple(self, size: int) -> None:
-        items = tuple(self.stack[-size:])
-        del self.stack[-size:]
-        self.stack.append(items)
-
-    def _run_tuple1(self, _: Any) -> None:
-        self._push_tuple(1)
-
-    def _run_tuple2(self, _: Any) -> None:
-        self._push_tuple(2)
-
-    def _run_tuple3(self, _: Any) -> None:
-        self._push_tuple(3)
-
-    def _run_list(self, _: Any) -> None:
-        self.stack.append(self._pop_to_mark())
-
-    def _run_dict(self, _: Any) -> None:
-        items = self._pop_to_mark()
-        self.stack.append(dict(zip(items[::2], items[1::2], strict=True)))
-
-    def _run_append(self, _: Any) -> None:
-        value = self.stack.pop()
-        self.stack[-1].append(value)
-
-    def _run_appends(self, _: Any) -> None:
-        items = self._pop_to_mark()
-        self.stack[-1].extend(items)
-
-    def _run_additems(self, _: Any) -> None:
-        items = self._pop_to_mark()
-        self.stack[-1].update(items)
-
-    def _run_frozenset(self, _: Any) -> None:
-        self.stack.append(frozenset(self._pop_to_mark()))
-
-    def _run_setitem(self, _: Any) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
-        self._target()[key] = value
-
-    def _run_setitems(self, _: Any) -> None:
-        items = self._pop_to_mark()
-        self._target().update(zip(items[::2], items[1::2], strict=True))
-
-    def _target(self) -> Any:
-        top = self.stack[-1]
-        return top.items if isinstance(top, Call) else top
-
-    def _run_global(self, argument: str) -> None:
-        module, _, qualname = argument.partition(" ")
-        self.stack.append(Name(module, qualname))
-
-    def _run_stack_global(self, _: Any) -> None:
-        qualname, module = self.stack.pop(), self.stack.pop()
-        self.stack.append(Name(str(module), str(qualname)))
-
-    def _run_reduce(self, _: Any) -> None:
-        arguments, function = self.stack.pop(), self.stack.pop()
-        self._push_call(function, arguments)
-
-    _run_newobj = _run_reduce
-
-    def _run_newobj_ex(self, _: Any) -> None:
-        keywords, arguments, function = self.stack.pop(), self.stack.pop(), self.stack.pop()
-        self._push_call(function, (*arguments, keywords))
-
-    def _push_call(self, function: Any, arguments: Any) -> None:
-        if not isinstance(function, Name) or not isinstance(arguments, tuple):
-            raise NotPlainData("a call of something that is not a name")
-        self.stack.append(Call(function, arguments))
-
-    def _run_build(self, _: Any) -> None:
-        state = self.stack.pop()
-        if not isinstance(self.stack[-1], Call):
-            raise NotPlainData("a state for something that was not made by a call")
-        self.stack[-1].state = state
-
-    def _run_binpersid(self, _: Any) -> None:
-        self.stack.append(Persistent(self.stack.pop()))
+        items = []
+        while (value := self.stack.pop()) is not _MARK:
+            items.append(value)
+        return items[::-1]
 
 
 _RECONSTRUCT = frozenset({"numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct"})

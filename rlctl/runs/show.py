@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rlctl import output
+from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
-from rlctl.run.lookup import find_run
 from rlctl.run.memory import format_bytes
+from rlctl.run.robustness import Robustness
 from rlctl.runs.diagnosis import Finding, diagnose
 from rlctl.runs.diagnosis import show as diagnosis
 from rlctl.runs.listing import as_json
-from rlctl.runs.summary import RunSummary, evaluations, read_table, summarize
-
-Rows = list[dict[str, float | None]]
+from rlctl.runs.summary import Rows, RunSummary, read_table, summarize
 
 _EVALUATIONS_SHOWN = 12
 _PLOT_SIZE = (90, 13)
@@ -27,66 +26,82 @@ _PLOT_SIZE = (90, 13)
 class RunDescription:
     """Everything that is shown of a run."""
 
+    run: RunDirectory
     summary: RunSummary
     metrics: Rows
     evaluations: Rows
-    warnings: list[str]
     findings: list[Finding]
     """What its records show."""
-    source: dict[str, Any] | None
-    """The policy that it began with, as `run.json` has it."""
-    sizes: dict[str, int]
-    """Bytes per file or folder of the run."""
+    warnings: list[str]
+    robustness: Robustness | None
+    """What `rlctl eval --vary` or `--push` measured."""
 
 
-def describe(text: str | None) -> RunDescription:
-    """Read the run that a word stands for; raises `ArtifactError` if there is none."""
-    run = find_run(text)
+def describe(run: RunDirectory) -> RunDescription:
+    """Read a run; raises `ArtifactError` if it is damaged."""
+    status, file = run.status(), run.robustness_file
     return RunDescription(
+        run=run,
         summary=summarize(run.path),
         metrics=read_table(run.metrics_file),
-        evaluations=evaluations(run),
-        warnings=_warnings(run),
-        source=source if isinstance(source := run.status().get("from"), dict) else None,
+        evaluations=read_table(run.evals_file),
         findings=diagnose(run),
-        sizes={entry.name: _bytes(entry) for entry in sorted(run.path.iterdir()) if not entry.name.startswith(".")},
+        warnings=list(_list_warnings(status)),
+        robustness=robustness.read(file) if file.is_file() else None,
     )
 
 
-def _warnings(run: RunDirectory) -> list[str]:
-    status = run.status()
+def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
     counted = {
         "observations_outside": "observations outside their space",
         "observations_cast": "observations of another dtype than their space's",
         "failed_evaluations": "evaluations that failed",
     }
-    found = [
-        f"{count:,} {what}" for key, what in counted.items() if isinstance(count := status.get(key), int) and count
-    ]
-    return [*found, *([str(status["error"])] if status.get("error") else [])]
+    for key, what in counted.items():
+        if isinstance(count := status.get(key), int) and count:
+            yield f"{count:,} {what}"
+    if status.get("error"):
+        yield str(status["error"])
 
 
-def _bytes(entry: Path) -> int:
-    if entry.is_file():
-        return entry.stat().st_size
-    return sum(file.stat().st_size for file in entry.rglob("*") if file.is_file())
+def describe_robustness(result: Robustness) -> Iterator[str]:
+    """Yield the worst cell of all maps, what a push does, and how both were measured."""
+    if (found := result.find_worst()) is not None:
+        axes, cell = found[0].axes, found[1]
+        where = ", ".join(f"{axis.name} {value:g}" for axis, value in zip(axes, cell.values, strict=True))
+        rate = "" if cell.success_rate is None else f"success {cell.success_rate:.1%}, "
+        yield f"worst of {result.episodes} episodes each at {where}: {rate}return {cell.mean_return:.4g}"
+    if result.push is not None:
+        yield result.push.verdict
+    if result.command:
+        yield f"measured by: {result.command}"
+
+
+def _measure_sizes(run: RunDirectory) -> dict[str, int]:
+    """Return the bytes of each file or folder of a run."""
+    entries = [each for each in sorted(run.path.iterdir()) if not each.name.startswith(".")]
+    return {
+        each.name: sum(file.stat().st_size for file in (each, *each.rglob("*")) if file.is_file()) for each in entries
+    }
 
 
 def show(run: RunDescription, json: str | None) -> None:
     """Print the description, or write it as JSON."""
+    out, summary, sizes = output.out(), run.summary, _measure_sizes(run.run)
+    source = run.run.status().get("from")
     if json is not None:
-        content = {**as_json(run.summary), "evaluations": run.evaluations, "metrics": run.metrics}
+        content = {**as_json(summary), "evaluations": run.evaluations, "metrics": run.metrics}
         found = {"warnings": run.warnings, "findings": diagnosis.as_json(run.findings)}
-        output.write_result_json(json, {**content, **found, "bytes": run.sizes})
+        measured = None if run.robustness is None else run.robustness.model_dump(mode="json")
+        output.write_result_json(json, {**content, **found, "robustness": measured, "bytes": sizes})
         return
-    out, summary = output.out(), run.summary
     out.print(f"[bold]{summary.name}[/bold]: {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}")
     out.print(f"{summary.steps or 0:,} steps in {(summary.seconds or 0) / 60:.1f} minutes, started {summary.started}")
     if summary.best_return is not None:
         success = "" if summary.best_success is None else f"success {summary.best_success:.1%}, "
         out.print(f"best evaluation at step {summary.best_step:,}: {success}return {summary.best_return:.4g}")
-    if run.source is not None:
-        out.print(f"began with {run.source.get('policy')}, step {run.source.get('training_steps')}", markup=False)
+    if isinstance(source, dict):
+        out.print(f"began with {source.get('policy')}, step {source.get('training_steps')}", markup=False)
     for key, value in summary.changes.items():
         out.print(f"differs from the task's recipe: {key} = {value}", markup=False)
     for warning in run.warnings:
@@ -95,9 +110,11 @@ def show(run: RunDescription, json: str | None) -> None:
         if curve := plot(run, name):
             out.print(curve, markup=False)
     _show_evaluations(run.evaluations)
+    for line in () if run.robustness is None else describe_robustness(run.robustness):
+        out.print(f"robustness: {line}", markup=False)
     for finding in run.findings:
         out.print("\n".join(diagnosis.format_finding(finding)), markup=False)
-    files = "  ".join(f"{name} {format_bytes(size)}" for name, size in run.sizes.items())
+    files = "  ".join(f"{name} {format_bytes(size)}" for name, size in sizes.items())
     out.print(f"files: {files}  in {summary.path}", markup=False)
 
 
@@ -132,21 +149,16 @@ def _points(rows: Rows, name: str) -> list[tuple[float, float]]:
 
 
 def _show_evaluations(rows: Rows) -> None:
-    from rich.table import Table
-
-    if not rows:
-        output.out().print("no evaluation yet")
-        return
     shown = rows[-_EVALUATIONS_SHOWN:]
-    names = [name for name in rows[-1] if any(row.get(name) is not None for row in shown)]
-    table = Table(box=None, pad_edge=False, title=None)
-    for name in names:
-        table.add_column(name, justify="right", header_style="bold")
-    for row in shown:
-        table.add_row(*(format_cell(name, row.get(name)) for name in names))
     if len(rows) > len(shown):
         output.out().print(f"the last {len(shown)} of {len(rows)} evaluations:")
-    output.out().print(table)
+    output.print_table(*tabulate(shown)) if shown else output.out().print("no evaluation yet")
+
+
+def tabulate(rows: Rows) -> tuple[list[str], list[list[str]]]:
+    """Return the columns that have values in a table of evaluations, and the cells of its rows."""
+    columns = [name for name in (rows[0] if rows else {}) if any(row.get(name) is not None for row in rows)]
+    return columns, [[format_cell(name, row.get(name)) for name in columns] for row in rows]
 
 
 def format_cell(name: str, value: float | None) -> str:

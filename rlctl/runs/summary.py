@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import dataclasses
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from rlctl.errors import ArtifactError
 from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
 
+Rows = list[dict[str, float | None]]
+"""Of a table, oldest first; an empty field is None."""
 _TAIL_BYTES = 4096
 """The last row of a table is looked for here; a row has at most some hundred bytes."""
 
@@ -81,7 +83,8 @@ def summarize(path: Path) -> RunSummary:
     try:
         status = run.status()
     except (ArtifactError, OSError) as error:
-        reason = "no run.json" if not run.status_file.is_file() else _first_line(str(error))
+        problem = _first_line(str(error)).removeprefix(f"{path}/")
+        reason = problem if run.status_file.is_file() else "no run.json"
         return RunSummary(path, task=path.parent.name, state="damaged", reason=reason)
     try:
         return _summarize(run, status)
@@ -91,7 +94,7 @@ def summarize(path: Path) -> RunSummary:
 
 def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
     last = last_row(run.metrics_file)
-    best = best_row(evaluations(run))
+    best = best_row(read_table(run.evals_file))
     state, reason = _state(run, status)
     return RunSummary(
         path=run.path,
@@ -127,12 +130,7 @@ def _first_line(text: str) -> str:
     return text.partition("\n")[0]
 
 
-def evaluations(run: RunDirectory) -> list[dict[str, float | None]]:
-    """Return the rows of `evals.csv` that are whole, oldest first; empty fields are None."""
-    return read_table(run.evals_file)
-
-
-def read_table(path: Path) -> list[dict[str, float | None]]:
+def read_table(path: Path) -> Rows:
     """Return a table's rows with numbers; rows cut short by a killed process are left out."""
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as file:
@@ -151,7 +149,7 @@ def _numbers(row: dict[str, Any]) -> dict[str, float | None] | None:
         return None
 
 
-def best_row(rows: Iterable[dict[str, float | None]]) -> dict[str, float | None] | None:
+def best_row(rows: Rows) -> dict[str, float | None] | None:
     """Return the evaluation with the best success, then return."""
     scored = [row for row in rows if row.get("return") is not None]
     return max(scored, key=lambda row: (_or_lowest(row.get("success")), _or_lowest(row["return"])), default=None)

@@ -196,8 +196,9 @@ def test_arrays_of_every_protocol(protocol, value):
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"garbage", b"]", b"\x80\x04.", pickle.dumps([1, 2])[:-1], b"cos\nsystem\n(S'true'\ntRb.", b"0.", b"h\x01."],
-)
+    [b"", b"garbage", b"]", b"\x80\x04.", pickle.dumps([1, 2])[:-1], b"cos\nsystem\n(S'true'\ntRb.", b"0.", b"h\x01.",
+     b"t.", b"(b.", b"R.", b"N}s."],
+)  # fmt: skip
 def test_damaged_pickles_are_refused(content):
     with pytest.raises(NotPlainData):
         pickle_data.read(content)

@@ -64,6 +64,7 @@ def test_group_is_drawn_with_a_band(group):
     assert "reach, ppo, seeds 0, 1, 2" in page
     assert "The best policies of 3 trainings succeed in 90.0% of the evaluation episodes (80.0% to 100.0%)" in page
     assert "Mean of 3 trainings, from the lowest to the highest." in page
+    assert "rlctl train reach --seeds 0,1,2 --set algo_kwargs.learning_rate=0.001" in page
 
 
 def test_curves_of_seeds_are_averaged_at_common_steps():

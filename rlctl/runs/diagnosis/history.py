@@ -18,10 +18,9 @@ from rlctl.run.env_info import EnvInfo
 from rlctl.run.episode import RecordedEpisode, load_episode
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.run.policy import read_policy
-from rlctl.runs.summary import read_table
+from rlctl.runs.summary import Rows, read_table
 
 Array = NDArray[np.float64]
-Rows = list[dict[str, float | None]]
 
 LEAST_ROWS = 10
 """Of `metrics.csv`; of a shorter training most signs say nothing."""

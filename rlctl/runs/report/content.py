@@ -12,39 +12,18 @@ from typing import Any
 import numpy as np
 
 from rlctl.errors import ArtifactError, RlctlError, UsageError
-from rlctl.run import robustness
-from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import RecordedEpisode, load_episode
 from rlctl.run.recipe_difference import find_difference
-from rlctl.run.robustness import Robustness
 from rlctl.runs.comparison import find_group
-from rlctl.runs.diagnosis import Finding, diagnose
-from rlctl.runs.show import Rows
-from rlctl.runs.summary import RunSummary, evaluations, read_table, summarize
-
-
-@dataclasses.dataclass(frozen=True)
-class ReportedRun:
-    """A run and what its folder has."""
-
-    run: RunDirectory
-    summary: RunSummary
-    metrics: Rows
-    evaluations: Rows
-    findings: list[Finding]
-    robustness: Robustness | None
-
-    @property
-    def best(self) -> dict[str, float | None] | None:
-        """The row of the best evaluation."""
-        return next((row for row in self.evaluations if row.get("steps") == self.summary.best_step), None)
+from rlctl.runs.show import RunDescription, describe
+from rlctl.runs.summary import Rows
 
 
 @dataclasses.dataclass(frozen=True)
 class Report:
     """One run, or several of one task."""
 
-    runs: list[ReportedRun]
+    runs: list[RunDescription]
     notes: list[str]
     """What a reader must know of the runs themselves."""
 
@@ -67,7 +46,10 @@ def collect(texts: Sequence[str]) -> Report:
     Raises `ArtifactError` for a damaged run and one that has nothing yet, `UsageError` for runs of several tasks.
     """
     found = {run.path.resolve(): run for text in texts for run in find_group(text)}
-    runs = [_read(run) for run in found.values()]
+    runs = [describe(run) for run in found.values()]
+    for each in runs:
+        if each.summary.state == "damaged":
+            raise ArtifactError(f"{each.run.path}: damaged: {each.summary.reason}")
     if len(tasks := {each.summary.task for each in runs}) > 1:
         raise UsageError(f"runs of several tasks, {', '.join(sorted(tasks))}: a report is of one")
     if not any(each.metrics or each.evaluations for each in runs):
@@ -75,26 +57,15 @@ def collect(texts: Sequence[str]) -> Report:
     return Report(runs, _find_notes(runs))
 
 
-def _read(run: RunDirectory) -> ReportedRun:
-    run.status()  # raises if the run is damaged
-    summary = summarize(run.path)
-    if summary.state == "damaged":
-        raise ArtifactError(f"{run.path}: damaged: {summary.reason}")
-    rows = read_table(run.metrics_file)
-    return ReportedRun(run, summary, rows, evaluations(run), diagnose(run), _read_robustness(run))
-
-
-def _read_robustness(run: RunDirectory) -> Robustness | None:
-    return robustness.read(run.robustness_file) if run.robustness_file.is_file() else None
-
-
-def _find_notes(runs: Sequence[ReportedRun]) -> list[str]:
+def _find_notes(runs: Sequence[RunDescription]) -> list[str]:
     notes = [
         f"{each.summary.name} is {each.summary.state_text}, {each.summary.steps or 0:,} steps so far"
         for each in runs
         if each.summary.state in ("running", "stopped")
     ]
-    notes += [f"{each.summary.name} {each.summary.state_text}" for each in runs if each.summary.state == "failed"]
+    for each in runs:
+        warnings = [each.summary.state_text] if each.summary.state == "failed" else each.warnings
+        notes += [f"{each.summary.name}: {warning}" for warning in warnings]
     notes += [f"{each.summary.name} has no evaluation yet" for each in runs if not each.evaluations]
     try:
         recipes = [each.run.recipe() for each in runs]
@@ -106,11 +77,12 @@ def _find_notes(runs: Sequence[ReportedRun]) -> list[str]:
 
 def summarize_result(report: Report) -> str:
     """Return the result as a sentence."""
-    scored = [each for each in report.runs if each.best is not None]
+    scored = [each for each in report.runs if each.summary.best_return is not None]
     if not scored:
         return "No evaluation yet."
     if len(scored) == 1:
-        best, summary = scored[0].best or {}, scored[0].summary
+        summary = scored[0].summary
+        best = next(row for row in scored[0].evaluations if row.get("steps") == summary.best_step)
         count = f"{best['episodes']:,.0f}" if best.get("episodes") else "the"
         success = "" if summary.best_success is None else f"succeeds in {summary.best_success:.1%} of "
         start = f"The best policy {success}" if success else "The best policy, over "
@@ -125,13 +97,25 @@ def summarize_result(report: Report) -> str:
     return f"The best policies of {len(scored)} trainings succeed in {rates}, with {of_returns}."
 
 
-def format_command(run: ReportedRun) -> str:
-    """Return the command that trains the same again."""
-    changes = [
-        f"--set {shlex.quote(f'{key}={value if isinstance(value, str) else json.dumps(value)}')}"
-        for key, value in run.summary.changes.items()
+def list_commands(report: Report) -> list[str]:
+    """Return the commands that train the same again: one for all seeds of a recipe."""
+    seeds: dict[tuple[str, ...], list[int]] = {}
+    for each in report.runs:
+        changes = [
+            f"{key}={value if isinstance(value, str) else json.dumps(value)}"
+            for key, value in each.summary.changes.items()
+        ]
+        source = each.run.status().get("from")
+        start = ["--from", str(source.get("policy"))] if isinstance(source, dict) else []
+        options = (*start, *(part for change in changes for part in ("--set", change)))
+        seeds.setdefault(options, []).append(each.summary.seed or 0)
+    task = report.runs[0].summary.task
+    return [
+        shlex.join(
+            ["rlctl", "train", task, "--seed" if len(each) == 1 else "--seeds", ",".join(map(str, each)), *options]
+        )
+        for options, each in seeds.items()
     ]
-    return " ".join(["rlctl train", shlex.quote(run.summary.task), f"--seed {run.summary.seed or 0}", *changes])
 
 
 def choose_episodes(report: Report) -> list[tuple[str, RecordedEpisode]]:

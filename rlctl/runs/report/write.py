@@ -12,8 +12,8 @@ from rlctl import output
 from rlctl.errors import RlctlError, UsageError, did_you_mean
 from rlctl.run import files
 from rlctl.runs.report import content
-from rlctl.runs.report.content import Report, ReportedRun
-from rlctl.runs.show import format_cell
+from rlctl.runs.report.content import Report
+from rlctl.runs.show import describe_robustness, tabulate
 
 FORMATS = ("html", "md")
 DEFAULT_FILE = Path("report.html")
@@ -68,9 +68,14 @@ def _values(report: Report, is_html: bool, pictures: bool) -> dict[str, Any]:
         "result": content.summarize_result(report),
         "notes": report.notes,
         "findings": findings,
-        "runs": [_tabulate(each) for each in report.runs],
-        "robustness": list(_describe_robustness(report)),
-        "commands": [content.format_command(each) for each in report.runs],
+        "runs": [
+            dict(zip(("name", "columns", "rows"), (each.summary.name, *tabulate(each.evaluations)), strict=True))
+            for each in report.runs
+        ],
+        "robustness": [
+            line for each in report.runs if each.robustness is not None for line in describe_robustness(each.robustness)
+        ],
+        "commands": content.list_commands(report),
         "changes": dict.fromkeys(
             f"{key} = {value}" for each in report.runs for key, value in each.summary.changes.items()
         ),
@@ -111,26 +116,3 @@ def _take_pictures(report: Report) -> Iterator[tuple[str, list[tuple[int, str]]]
         depth = 1000 * strip.deepest_contact  # [mm]
         overlap = f"; bodies overlap by up to {depth:.0f} mm" if depth > 1 else ""
         yield name + overlap, [(step, base64.b64encode(picture).decode()) for step, picture in strip.pictures]
-
-
-def _tabulate(run: ReportedRun) -> dict[str, Any]:
-    rows = run.evaluations
-    columns = [name for name in (rows[0] if rows else {}) if any(row.get(name) is not None for row in rows)]
-    cells = [[format_cell(name, row.get(name)) for name in columns] for row in rows]
-    return {"name": run.summary.name, "columns": columns, "rows": cells}
-
-
-def _describe_robustness(report: Report) -> Iterator[str]:
-    for each in report.runs:
-        result = each.robustness
-        if result is None:
-            continue
-        if (found := result.find_worst()) is not None:
-            axes, cell = found[0].axes, found[1]
-            where = ", ".join(f"{axis.name} {value:g}" for axis, value in zip(axes, cell.values, strict=True))
-            rate = "" if cell.success_rate is None else f"success {cell.success_rate:.1%}, "
-            yield f"worst of {result.episodes} episodes each at {where}: {rate}return {cell.mean_return:.4g}"
-        if result.push is not None:
-            yield result.push.verdict
-        if result.command:
-            yield f"measured by: {result.command}"
