@@ -15,6 +15,7 @@ from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.run.episode import RecordedEpisode, load_episode
 from rlctl.run.recipe_difference import find_difference
 from rlctl.runs.comparison import find_group
+from rlctl.runs.diagnosis import Finding
 from rlctl.runs.show import RunDescription, describe
 from rlctl.runs.summary import Rows
 
@@ -95,6 +96,17 @@ def summarize_result(report: Report) -> str:
         return f"The best policies of {len(scored)} trainings have {of_returns}."
     rates = f"{np.mean(successes):.1%} of the evaluation episodes ({min(successes):.1%} to {max(successes):.1%})"
     return f"The best policies of {len(scored)} trainings succeed in {rates}, with {of_returns}."
+
+
+def collect_findings(report: Report) -> list[tuple[Finding, list[str]]]:
+    """Return what the runs' records show, each finding once, with its evidence; of several runs with their seeds."""
+    found: dict[str, tuple[Finding, list[str]]] = {}
+    for run in report.runs:
+        for finding in run.findings:
+            seed = f"seed {run.summary.seed}: " if len(report.runs) > 1 else ""
+            _, evidence = found.setdefault(f"{finding.id} {finding.name}", (finding, []))
+            evidence.append(seed + "; ".join(finding.evidence))
+    return list(found.values())
 
 
 def list_commands(report: Report) -> list[str]:

@@ -60,14 +60,12 @@ def _render(template: str, escape: bool, values: dict[str, Any]) -> str:
 
 
 def _values(report: Report, is_html: bool, pictures: bool) -> dict[str, Any]:
-    single = len(report.runs) == 1
     first = report.runs[0]
-    findings = [("" if single else f", {each.summary.name}", found) for each in report.runs for found in each.findings]
     values = {
         "title": report.title,
         "result": content.summarize_result(report),
         "notes": report.notes,
-        "findings": findings,
+        "findings": content.collect_findings(report),
         "runs": [
             dict(zip(("name", "columns", "rows"), (each.summary.name, *tabulate(each.evaluations)), strict=True))
             for each in report.runs
@@ -76,9 +74,6 @@ def _values(report: Report, is_html: bool, pictures: bool) -> dict[str, Any]:
             line for each in report.runs if each.robustness is not None for line in describe_robustness(each.robustness)
         ],
         "commands": content.list_commands(report),
-        "changes": dict.fromkeys(
-            f"{key} = {value}" for each in report.runs for key, value in each.summary.changes.items()
-        ),
         "versions": ", ".join(f"{name} {version}" for name, version in first.summary.versions.items()),
         "recipe": first.run.recipe_file.read_text(encoding="utf-8", errors="replace").strip()
         if first.run.recipe_file.is_file()
