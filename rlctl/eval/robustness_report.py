@@ -97,7 +97,7 @@ def _show_grid(found: RobustnessMap, worst: Cell | None) -> None:
     has_success = found.cells[0].success_rate is not None
     cells = list(zip(found.cells, _color_cells(found), strict=True))
     width = len(across.values)
-    rows = [
+    rows: list[list[str | Text]] = [
         [f"{value:.3g} ", *(_draw_cell(cell, color, cell is worst) for cell, color in cells[start : start + width])]
         for value, start in zip(down.values, range(0, len(cells), width), strict=True)
     ]

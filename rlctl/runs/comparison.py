@@ -207,8 +207,10 @@ def _evaluate(run: RunDirectory, request: CompareRequest) -> EvaluatedRun:
     )
     has_success = evaluation.success_rate is not None
     column, threshold = "success" if has_success else "return", _threshold(request, has_success)
-    rows = [] if threshold is None else read_table(run.evals_file)
-    reached = next((row for row in rows if (value := row.get(column)) is not None and value >= threshold), {})
+    reached: dict[str, float | None] = {}
+    if threshold is not None:
+        rows = read_table(run.evals_file)
+        reached = next((row for row in rows if (value := row.get(column)) is not None and value >= threshold), reached)
     steps = reached.get("steps")
     return EvaluatedRun(
         path=run.path,

@@ -21,8 +21,11 @@ class Removal:
 
     paths: list[Path]
     bytes: int
-    what: str
-    """What they are: `runs`, or `folders of checkpoints`."""
+
+    @property
+    def count(self) -> str:
+        """`1 folder`, `3 folders`."""
+        return f"{len(self.paths)} folder{'' if len(self.paths) == 1 else 's'}"
 
 
 def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Path = ROOT) -> Removal:
@@ -34,12 +37,12 @@ def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Pat
     if bool(runs) == (keep_best is not None):
         raise UsageError("say what to remove: RUN..., or --keep-best N for all but the N best of each task")
     if keep_best is not None:
-        return _measured([run.path for run in _all_but_best(list_runs(root=root), keep_best)], "runs")
+        return _measured([run.path for run in _all_but_best(list_runs(root=root), keep_best)])
     paths = [_checked(Path(text), root) for text in runs]
     for path in paths:
         if any(is_being_written(each) for each in (path, *(lock.parent for lock in path.glob("*/.lock")))):
             raise UsageError(f"{path}: this run is being trained; nothing was removed")
-    return _measured(list(dict.fromkeys(paths)), "runs")
+    return _measured(list(dict.fromkeys(paths)))
 
 
 def _checked(path: Path, root: Path) -> Path:
@@ -67,12 +70,12 @@ def plan_prune(root: Path = ROOT) -> Removal:
     """Find the checkpoints, replay buffers included, of finished runs; they are needed only to train on."""
     runs = [run for run in list_runs(root=root) if run.state == "done" and not is_being_written(run.path)]
     folders = [RunDirectory(run.path).checkpoint(0).parent for run in runs]
-    return _measured([folder for folder in folders if folder.is_dir()], "folders of checkpoints")
+    return _measured([folder for folder in folders if folder.is_dir()])
 
 
-def _measured(paths: list[Path], what: str) -> Removal:
+def _measured(paths: list[Path]) -> Removal:
     size = sum(file.lstat().st_size for path in paths for file in path.rglob("*") if not file.is_dir())
-    return Removal(paths, size, what)
+    return Removal(paths, size)
 
 
 def remove_with_report(removal: Removal, *, yes: bool) -> None:
@@ -85,7 +88,7 @@ def remove_with_report(removal: Removal, *, yes: bool) -> None:
     if not removal.paths:
         out.print("nothing to remove")
     elif remove(removal, yes=yes):
-        out.print(f"removed {len(removal.paths)} {removal.what}: {format_bytes(removal.bytes)} free")
+        out.print(f"removed {removal.count}: {format_bytes(removal.bytes)} came free")
 
 
 def remove(removal: Removal, *, yes: bool) -> bool:
@@ -100,7 +103,7 @@ def remove(removal: Removal, *, yes: bool) -> bool:
             raise UsageError("nothing was removed: there is no terminal to ask on; --yes removes without asking")
         import typer
 
-        if not typer.confirm(f"remove these {len(removal.paths)}?", err=True):
+        if not typer.confirm(f"remove {removal.count}, {format_bytes(removal.bytes)}?", err=True):
             return False
     for path in removal.paths:
         if is_being_written(path if (path / ".lock").exists() else path.parent):
