@@ -1,12 +1,10 @@
-"""Draws a world: URDF robots from their files, other bodies from their shapes, markers, paths."""
+"""Draws a world: bodies by the shapes of their links, markers, paths."""
 
 from __future__ import annotations
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from rerun.chunk import Chunk
-from rerun.urdf import UrdfTree
 from scipy.spatial.transform import Rotation
 
 from rlctl.replay.mjcf import Shape
@@ -14,7 +12,6 @@ from rlctl.replay.scene import BodyMotion, Scene, Warn
 from rlctl.replay.timelines import Timelines
 from rlctl.task.bullet import pybullet
 
-WORLD_FRAME = "tf#/"
 _MARKER_COLORS = [(40, 200, 90), (70, 150, 255), (240, 120, 200), (250, 180, 40)]
 _HALO_RADIUS = 0.09  # [m]
 _PATH_COLOR = (255, 80, 180)
@@ -35,7 +32,7 @@ def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> str | None:
         elif body.terrain is not None:
             _draw_terrain(body.name, body.terrain, timelines)
         else:
-            drawn = _draw_body(body, timelines, warn)
+            drawn = draw_shapes(body, timelines, warn)
             if body.trunk is not None:
                 trunk = _entity("world", body.name, body.links[body.trunk]) + "/"
                 trunks += [entity for entity in drawn if entity.startswith(trunk)]
@@ -123,72 +120,6 @@ def start_bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return np.min(low, axis=0), np.max(high, axis=0)
 
 
-def _draw_body(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]:
-    """Draw a body that moves; return the entities of its shapes."""
-    if body.file.suffix == ".xml":
-        return draw_shapes(body, timelines, warn)
-    try:
-        tree = UrdfTree.from_file_path(
-            body.file, frame_prefix=f"{body.name}/", static_transform_entity_path=_entity("tf", body.name, "fixed")
-        )
-    except Exception as error:  # Rerun's reader is stricter than PyBullet's, and raises what its parser raises
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        warn(f"{body.file.name}: drawn from PyBullet's shapes, Rerun cannot read it: {reason}")
-        return draw_shapes(body, timelines, warn)
-    _send_motion(tree, body, timelines)
-    return _send_meshes(tree, body, timelines.stream)
-
-
-def _send_meshes(tree: UrdfTree, body: BodyMotion, stream: rr.RecordingStream) -> list[str]:
-    root, ours = _entity(tree.name), _entity("world", body.name)
-    visuals = tree.stream().drop(content=f"{root}/collision_geometries/**")
-    chunks = []
-    for chunk in visuals:
-        if chunk.entity_path == root or chunk.entity_path.startswith(f"{root}/"):
-            rest = chunk.entity_path.removeprefix(root).removeprefix("/visual_geometries")
-            chunk = chunk.with_entity_path(ours + rest)
-        chunks.append(chunk)
-    stream.send_chunks(chunks)
-    for chunk in chunks:
-        _fill(chunk, stream)
-    return [chunk.entity_path for chunk in chunks]
-
-
-def _fill(chunk: Chunk, stream: rr.RecordingStream) -> None:
-    """Draw the boxes, cylinders and spheres of a URDF file with faces, not with edges alone."""
-    kinds = {name.partition(":")[0] for name in chunk.to_record_batch().schema.names}
-    for archetype in (rr.Boxes3D, rr.Cylinders3D, rr.Ellipsoids3D, rr.Capsules3D):
-        if archetype.__name__ in kinds:
-            filled = archetype.from_fields(fill_mode=rr.components.FillMode.Solid)
-            stream.log(chunk.entity_path, filled, static=True)
-
-
-def _send_motion(tree: UrdfTree, body: BodyMotion, timelines: Timelines) -> None:
-    frame = f"{body.name}/{tree.root_link().name}"
-    positions, orientations, base = body.positions[:, 0], body.orientations[:, 0], _entity("tf", body.name, "base")
-    if body.fixed:
-        quaternion = rr.Quaternion(xyzw=orientations[0])
-        pose = rr.Transform3D(
-            translation=positions[0], quaternion=quaternion, parent_frame=WORLD_FRAME, child_frame=frame
-        )
-        timelines.stream.log(base, pose, static=True)
-    else:
-        steps = len(positions)
-        columns = rr.Transform3D.columns(
-            translation=positions,
-            quaternion=orientations,
-            parent_frame=[WORLD_FRAME] * steps,
-            child_frame=[frame] * steps,
-        )
-        timelines.send(base, range(steps), columns)
-    known = {joint.name: joint for joint in tree.joints()}
-    for index, name in enumerate(body.joint_names):
-        if name in known:
-            angles = body.joint_positions[:, index].tolist()
-            columns = known[name].compute_transform_columns(angles, clamp=False)
-            timelines.send(_entity("tf", body.name, name), range(len(angles)), columns)
-
-
 def _draw_path(body: BodyMotion, timelines: Timelines) -> None:
     """Draw the path of a robot's trunk, or else of an arm's last link: a segment per step."""
     if not body.joint_names or (body.trunk is None and not body.chain):
@@ -224,8 +155,11 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]
         if not shapes:
             continue
         entity = _entity("world", body.name, name)
-        columns = rr.Transform3D.columns(translation=body.positions[:, link], quaternion=body.orientations[:, link])
-        timelines.send(entity, range(len(body.positions)), columns)
+        positions, orientations = body.positions[:, link], body.orientations[:, link]
+        # What never moves has one row.
+        rows = 1 if np.ptp(positions, axis=0).max() == np.ptp(orientations, axis=0).max() == 0.0 else len(positions)
+        columns = rr.Transform3D.columns(translation=positions[:rows], quaternion=orientations[:rows])
+        timelines.send(entity, range(rows), columns)
         for number, shape in enumerate(shapes):
             archetype = _archetype(shape)
             if archetype is None:
@@ -234,7 +168,7 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]
             timelines.stream.log(part, archetype, static=True)
             timelines.stream.log(part, _pose(shape), static=True)
             drawn.append(part)
-    if len(drawn) < len(body.shapes) or not drawn:
+    if len(drawn) < len(body.shapes) or (not drawn and body.file.suffix == ".xml"):  # which PyBullet alone can read
         warn(f"{body.file.name}: {len(drawn)} of {len(body.shapes)} shapes of {body.name!r} could be drawn")
     return drawn
 

@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from rlctl import registry
 from rlctl.errors import ArtifactError
-from rlctl.replay.bodies import WORLD_FRAME, bounds, draw_scene, start_bounds
+from rlctl.replay.bodies import bounds, draw_scene, start_bounds
 from rlctl.replay.curves import Plot, send_curves
 from rlctl.replay.recorder import Rollout
 from rlctl.replay.scene import Scene, Warn
@@ -175,11 +175,10 @@ def _world(scene: Scene, followed: str | None) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
         name="world",
         origin="/",
-        contents=["/world/**", "/tf/**"],
+        contents=["/world/**"],
         overrides={
             rr.new_entity_path(["world", "paths", body.name]): rrb.VisibleTimeRanges(so_far) for body in scene.robots()
         },
         eye_controls=rrb.EyeControls3D(position=eye, look_target=center, eye_up=(0, 0, 1), tracking_entity=followed),
-        spatial_information=rrb.SpatialInformation(target_frame=WORLD_FRAME),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, plane=rr.components.Plane3D.XY),
     )

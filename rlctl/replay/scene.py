@@ -41,7 +41,6 @@ class BodyMotion:
 
     name: str
     file: Path
-    fixed: bool
     ground_height: float | None
     """Height of the upper face [m] if the body is the flat ground."""
     terrain: Array | None
@@ -146,7 +145,6 @@ class _BodyReader:
         return BodyMotion(
             name=body.name,
             file=body.file,
-            fixed=body.fixed,
             ground_height=self._ground_height(),
             terrain=self.body.terrain,
             joint_names=body.joint_names,

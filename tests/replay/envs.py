@@ -11,7 +11,7 @@ from rlctl.task import Box, Event, Sim, Task, events, rough_heights
 
 @dataclass
 class Tumble(Task):
-    """A cube falls beside a car that Rerun's URDF reader refuses; the goal moves, and the cube's mass is drawn."""
+    """A cube falls beside a car; the goal moves, and the cube's mass is drawn."""
 
     car: str = "racecar/racecar.urdf"
 

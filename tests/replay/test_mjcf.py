@@ -180,8 +180,8 @@ def test_camera_follows_no_arm(reached, tmp_path):
 def test_camera_follows_a_free_urdf_robot(tmp_path):
     rollout, warnings = play("Tumble", car="r2d2.urdf")
     write_rrd(tmp_path / "r2d2.rrd", rollout, title="r2d2", warn=warnings.append)
-    assert tracked(tmp_path / "r2d2.rrd") == ["/world/car/base_link/visual_0"]
-    assert "/world/car/base_link/visual_0" in entities(tmp_path / "r2d2.rrd")
+    assert tracked(tmp_path / "r2d2.rrd") == ["/world/car/base_link/shape_0"]
+    assert "/world/car/base_link/shape_0" in entities(tmp_path / "r2d2.rrd")
 
 
 def test_the_goal_of_a_small_robot_is_in_view(tmp_path):
@@ -250,7 +250,6 @@ def test_shapes_turn_with_their_link():
     robot = BodyMotion(
         name="m",
         file=Path("m.xml"),
-        fixed=False,
         ground_height=None,
         terrain=None,
         joint_names=[],

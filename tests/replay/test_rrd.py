@@ -68,31 +68,17 @@ def test_actions_and_observations_by_name(recording, reached):
     np.testing.assert_array_equal(hand, named_observations(reached)["hand"])
 
 
-def test_robot_has_meshes_and_a_transform_per_joint(recording):
+def test_robot_has_meshes_where_its_links_are(recording, reached):
     found = entities(recording)
-    assert {f"/world/arm/lbr_iiwa_link_{link}/visual_0" for link in range(8)} <= found
-    assert not any("collision" in entity for entity in found)
-    _, turns = column(recording, "/tf/arm/lbr_iiwa_joint_1", "Transform3D:quaternion")
-    assert turns.shape == (121, 1, 4)
-    assert static(recording, "/tf/arm/base", "Transform3D:child_frame") == ["arm/lbr_iiwa_link_0"]
-
-
-def test_link_pose_from_the_transforms_is_that_of_pybullet(recording, reached):
-    # Fixed offset of the joint, then the turn about its axis: the chain of the file must end where PyBullet's does.
-    arm, step = reached.scene.robots()[0], 30
-    position, rotation = np.zeros(3), np.eye(3)
-    for joint in arm.joint_names:
-        _, offsets = column(recording, f"/tf/arm/{joint}", "Transform3D:translation")
-        _, turns = column(recording, f"/tf/arm/{joint}", "Transform3D:quaternion")
-        position = position + rotation @ offsets[step, 0]
-        rotation = rotation @ _matrix(turns[step, 0])
-    np.testing.assert_allclose(position, arm.positions[step, -1], atol=1e-5)
-
-
-def _matrix(quaternion):
-    x, y, z, w = quaternion
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    assert {f"/world/arm/lbr_iiwa_link_{link}/shape_0" for link in range(8)} <= found
+    arm = reached.scene.robots()[0]
+    for link, name in enumerate(arm.links):
+        steps, positions = column(recording, f"/world/arm/{name}", "Transform3D:translation")
+        _, turns = column(recording, f"/world/arm/{name}", "Transform3D:quaternion")
+        # What does not move, the base, has one row.
+        assert len(steps) == (1 if link == 0 else 121)
+        np.testing.assert_allclose(positions[:, 0], arm.positions[: len(steps), link], atol=1e-6)
+        np.testing.assert_allclose(turns[:, 0], arm.orientations[: len(steps), link], atol=1e-6)
 
 
 def test_two_timelines_of_equal_length(recording):
@@ -157,16 +143,15 @@ def test_file_appears_whole_or_not_at_all(reached, tmp_path, monkeypatch):
 def test_free_body_moves_by_its_link_frame(tumble):
     path, rollout, _ = tumble
     cube = next(body for body in rollout.scene.bodies if body.name == "cube")
-    _, positions = column(path, "/tf/cube/base", "Transform3D:translation")
+    _, positions = column(path, "/world/cube/baseLink", "Transform3D:translation")
     np.testing.assert_allclose(positions[:, 0], cube.positions[:, 0], rtol=1e-6)
     assert cube.positions[0, 0, 2] == pytest.approx(0.4, abs=1e-6)
     assert cube.positions[-1, 0, 2] < 0.3
 
 
-def test_what_rerun_cannot_read_is_drawn_from_pybullets_shapes(tumble):
+def test_every_shape_of_a_robot_is_drawn(tumble):
     path, rollout, warnings = tumble
-    assert len(warnings) == 1
-    assert warnings[0].startswith("racecar.urdf: drawn from PyBullet's shapes, Rerun cannot read it: ")
+    assert warnings == []
     car = next(body for body in rollout.scene.bodies if body.name == "car")
     drawn = [entity for entity in entities(path) if entity.startswith("/world/car/") and "shape" in entity]
     assert len(drawn) == len(car.shapes) > 3
@@ -174,7 +159,7 @@ def test_what_rerun_cannot_read_is_drawn_from_pybullets_shapes(tumble):
 
 def test_ground_is_a_box_and_no_mesh(tumble):
     path, _, _ = tumble
-    assert "/world/ground/planeLink/visual_0" not in entities(path)
+    assert "/world/ground/planeLink/shape_0" not in entities(path)
     assert static(path, "/world/ground", "Boxes3D:half_sizes")
 
 
