@@ -103,12 +103,16 @@ class Bounds:
         """
         return x if self._keeps_all(x, before, reference) else self._bound_in_turn(x, before, reference, report)
 
+    def keeps_ends(self, value: Array) -> bool:
+        """Say whether a value is within its bounds."""
+        # To compare bytes takes a tenth of the time of `(a != b).any()`.
+        return np.minimum(np.maximum(value, self.low), self.high).tobytes() == value.tobytes()
+
     def _keeps_all(self, x: Array, before: Array, reference: Array | None) -> bool:
         """Say whether a motion clearly keeps all limits, in as few operations as it takes: most motions do."""
         low, high = self._least, self._most
         if self.change is not None:
             low, high = np.maximum(low, before - self.change), np.minimum(high, before + self.change)
-        # To compare bytes takes a tenth of the time of `(a != b).any()`.
         if np.minimum(np.maximum(x, low), high).tobytes() != x.tobytes():
             return False
         return not self.bounds_position or reference is None or self._keeps_position(x, reference)

@@ -42,6 +42,8 @@ class Command:
         self._blend_steps = round(limits.blend_in_s / bounds.dt)
         cutoff = limits.lowpass_hz
         self._alpha = 1.0 if cutoff is None else 1.0 - math.exp(-2.0 * math.pi * cutoff * bounds.dt)
+        self._is_action = bool((bounds.factor == 1.0).all() and not bounds.offset.any())
+        """Whether a command is the action itself."""
         self._zeros = np.zeros(len(self._safe))
         self._none = bytes(len(self._safe))
         self.reset()
@@ -81,7 +83,7 @@ class Command:
     def follow(self, action: Array) -> NDArray[Any]:
         """Return the action closest to a wanted one. Raises `OutsideLimits` at the first step."""
         start = self._present(action)
-        target = self._bounds.offset + action * self._bounds.factor
+        target = action if self._is_action else self._bounds.offset + action * self._bounds.factor
         if self._alpha < 1.0:
             before = start if self._smooth is None else self._smooth
             self._smooth = target = before + self._alpha * (target - before)
@@ -134,14 +136,19 @@ class Command:
             command = self._before = bounds.bound(target, self._before, reference, self._note)
         elif reference is None:
             command = target
+        elif bounds.change is None and bounds.speed is None and bounds.keeps_ends(target):
+            command = self._reference = target
         else:
             self._before = bounds.bound(target - reference, self._before, reference, self._note)
             command = np.minimum(np.maximum(reference + self._before, bounds.low), bounds.high)
             self._reference = command
-        action = ((command - bounds.offset) / bounds.factor).astype(self._space.dtype)
+        action = command if self._is_action else (command - bounds.offset) / bounds.factor
+        action = action.astype(self._space.dtype)
         if action.ndim != len(self._space.shape):
             action = action.reshape(self._space.shape)
-        result: NDArray[Any] = np.minimum(np.maximum(action, self._space.low), self._space.high)
+        if self._is_action:
+            return action
+        result: NDArray[Any] = np.minimum(np.maximum(action, self._space.low), self._space.high)  # rounding
         return result
 
     def _note(self, limit: str, x: Array, allowed: Array, ends: tuple[Array, Array]) -> None:

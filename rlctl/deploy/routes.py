@@ -73,8 +73,8 @@ class _Routes:
         except messages.MessageError as error:
             server.measurements.errors += 1
             return _refuse(400, str(error))
-        answer = server.answer(server.posting, content)
-        server.note_duration(server.posting, time.perf_counter() - begin)
+        answer = server.posting.answer(content)
+        server.measure(server.posting, answer, time.perf_counter() - begin)
         return web.json_response(messages.as_json(answer), status=400 if "error" in answer else 200)
 
     async def _serve_order(self, request: web.Request) -> web.Response:

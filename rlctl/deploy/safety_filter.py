@@ -187,7 +187,9 @@ class SafetyFilter:
         self.steps += 1
         wanted = self._manual if self._manual is not None else action
         if wanted is not None and self._command is not None:
-            wanted = np.asarray(wanted, np.float64).ravel()
+            wanted = np.array(
+                wanted, np.float64
+            ).ravel()  # a copy: a policy may write the next one into the same memory
         fault = self._fault or self._find_fault(wanted)
         if self.state != "stopped" and not self._ordered:
             self._follow(fault)

@@ -28,7 +28,7 @@ from rlctl.dict_spaces import split
 from rlctl.errors import RlctlError, short_repr
 
 _HEARTBEAT_S = 30.0
-_AT_ONCE_S = 50e-6
+_AT_ONCE_S = 20e-6
 _SHORTEST_TICK_S = 0.01
 
 
@@ -166,7 +166,7 @@ class PolicyServer:
             try:
                 if message.type is not aiohttp.WSMsgType.BINARY:
                     raise messages.MessageError("a text frame; requests are binary frames of msgpack")
-                answer = self.answer(session, messages.unpack(message.data))
+                answer = session.answer(messages.unpack(message.data))
             except messages.MessageError as error:
                 await self._send_error(socket, session, str(error))
                 ready = time.perf_counter()
@@ -176,25 +176,27 @@ class PolicyServer:
             await socket.send_bytes(messages.pack(answer))
             ready = time.perf_counter()
             before_s = ready - begin
-            self.note_duration(session, before_s)
+            self.measure(session, answer, before_s)
 
     async def _send_error(self, socket: web.WebSocketResponse, session: Session, text: str) -> None:
         self.measurements.errors += 1
         self._write_fault(session, "message", text)
         await socket.send_str(text)
 
-    def answer(self, session: Session, request: Any) -> dict[str, Any]:
-        """Return a session's answer to a request, and measure it."""
-        answer = session.answer(request)
+    def measure(self, session: Session, answer: dict[str, Any], seconds: float) -> None:
+        """Count an answer that was given after so long."""
         measured = self.measurements
+        measured.request.add(seconds)
         if (infer_ms := answer["server_timing"]["infer_ms"]) > 0.0:
             measured.inference.add(infer_ms / 1000.0)
         measured.control_error = session.safety.control_error
-        if self._recording is not None:
-            self._record(self._recording, session, infer_ms)
         if "error" in answer:
             measured.errors += 1
-        return answer
+        if self._recording is not None:
+            self._record(self._recording, session, infer_ms)
+        if (dt := session.safety.control_dt) is not None and seconds > dt:
+            measured.deadline_misses += 1
+            self._write_fault(session, "deadline", seconds, dt)
 
     def _record(self, recording: RerunLog, session: Session, infer_ms: float) -> None:
         root, layout = f"client_{session.number}", session.safety.layout
@@ -204,13 +206,6 @@ class PolicyServer:
             flat = layout.flatten(session.observation)
             for name, place in layout.slices.items():
                 recording.add(f"{root}/observation/{name}", flat[place].copy())
-
-    def note_duration(self, session: Session, seconds: float) -> None:
-        """Count a request that took so long."""
-        self.measurements.request.add(seconds)
-        if (dt := session.safety.control_dt) is not None and seconds > dt:
-            self.measurements.deadline_misses += 1
-            self._write_fault(session, "deadline", seconds, dt)
 
     def give_order(self, order: str) -> int:
         """Order all clients, present and future, to stop, home, hold or resume; return how many there are.

@@ -70,7 +70,7 @@ class Session:
                 infer_s = time.perf_counter() - begin
         self.action = action = self.safety.limit(wanted)
         answer: dict[str, Any] = {
-            "actions": np.atleast_1d(action)[None],
+            "actions": action.reshape(1, -1) if action.ndim < 2 else action[None],
             "server_timing": {"infer_ms": infer_s * 1000.0},
             "state": self.safety.state,
         }

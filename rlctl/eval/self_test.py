@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import os
 import threading
 from concurrent.futures import Future
 from typing import Any
@@ -15,6 +16,7 @@ from rlctl.deploy.serve import make_loop, serve_until
 from rlctl.deploy.server import PolicyServer
 from rlctl.errors import AnswerIsNo
 from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
+from rlctl.rollout.workers import available_cores
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +33,8 @@ class SelfTest:
     """Answers that took longer than `control_dt`."""
     not_running: int
     """Answers of a server that held or stopped."""
+    load: float
+    """Programs that wanted a core in the last minute, those of the test among them."""
 
     def list_problems(self) -> list[str]:
         """Return why the server is not good enough; none if it is."""
@@ -46,7 +50,9 @@ class SelfTest:
         if self.control_dt is not None and self.round_trip_p99_s >= self.control_dt:
             problems.append(f"p99 {self.round_trip_p99_s * 1e3:.3g} ms is not below control_dt, {self.control_dt:g} s")
         if self.misses:
-            problems.append(f"{self.misses:,} of {self.requests:,} answers took longer than control_dt")
+            busy = self.load > available_cores()
+            hint = f"; other programs ran beside the test (load {self.load:.1f}): again without them?" if busy else ""
+            problems.append(f"{self.misses:,} of {self.requests:,} answers took longer than control_dt{hint}")
         return problems
 
     def check(self) -> None:
@@ -101,6 +107,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
         len(times),
         sum(each["misses"] for each in reports),
         sum(each["not_running"] for each in reports),
+        os.getloadavg()[0],
     )
 
 
@@ -137,5 +144,6 @@ def as_json(result: SelfTest) -> dict[str, Any]:
         "requests": result.requests,
         "deadline_misses": result.misses,
         "not_running": result.not_running,
+        "load": result.load,
         "problems": result.list_problems(),
     }

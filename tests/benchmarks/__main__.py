@@ -29,6 +29,7 @@ ROWS = {
     "serve": "serving:one_client",
     "serve-16": "serving:sixteen_clients",
     "serve-memory": "serving:memory",
+    "serve-plain": "serving:against_plain_server",
     "serve-start": "serving:start",
     "safety-filter": "serving:safety_filter",
     "help": "startup:help_page",
