@@ -9,7 +9,8 @@ from urllib.parse import urlsplit
 from aiohttp import web
 from aiohttp.typedefs import Middleware
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+from rlctl.deploy.serve import LOOPBACK
+
 _OPEN = ("/healthz",)
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]

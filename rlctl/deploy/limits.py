@@ -11,7 +11,7 @@ from pydantic import Field
 
 from rlctl.errors import RecipeError, did_you_mean, short_repr
 from rlctl.run import schema_text, yaml_text
-from rlctl.run.quantities import Number, Whole
+from rlctl.run.quantities import Number
 
 _NUMBER_WITH_UNIT = re.compile(r"^\s*[-+]?\d[\d.eE+-]*\s*[^\d\s.]")
 _UNITS = {
@@ -111,8 +111,6 @@ class Limits(_Section):
     """The action that is given while holding or stopped, for commands of torque and action; null: zero."""
     control_dt: Positive | None = None
     """Time between two actions [s]; null: the policy's."""
-    log_lines: Whole = Field(1000, ge=1, le=1_000_000)
-    """How many of the last events the filter keeps."""
 
 
 def read_limits(path: Path) -> Limits:

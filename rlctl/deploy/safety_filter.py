@@ -24,6 +24,7 @@ Array = NDArray[Any]
 State = Literal["idle", "running", "holding", "stopped"]
 
 _NO_FILE = Limits()
+_KEPT = 1000  # of the last events
 
 
 class SafetyFilter:
@@ -55,7 +56,7 @@ class SafetyFilter:
         if fitted.bounds is not None:
             self._command = Command(limits, fitted, fitted.bounds, self._limited)
         self._clock = clock
-        self._history: collections.deque[SafetyEvent | Intervention] = collections.deque(maxlen=limits.log_lines)
+        self._history: collections.deque[SafetyEvent | Intervention] = collections.deque(maxlen=_KEPT)
         self._limits_acted: dict[str, NDArray[np.int64]] = {}
         self._counted: collections.Counter[str] = collections.Counter()
         self.on_event: Callable[[SafetyEvent | Intervention], None] | None = None
@@ -125,7 +126,7 @@ class SafetyFilter:
     def events(self) -> list[SafetyEvent]:
         """The last events, oldest first."""
         found = [event for each in self._history for event in each.list_events()]
-        return found[-self.limits.log_lines :]
+        return found[-_KEPT:]
 
     @property
     def counts(self) -> collections.Counter[str]:

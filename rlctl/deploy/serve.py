@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rlctl.deploy.server import PolicyServer
 
 KEY_VARIABLE = "RLCTL_API_KEY"
-_LOOPBACK = ("127.0.0.1", "localhost", "::1")
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 def make_server(
@@ -42,7 +42,7 @@ def make_server(
     except ModuleNotFoundError as error:
         raise UsageError(f"rlctl serve needs {error.name}: pip install 'rlctl[serve]'") from None
     key = _read_key(key_file)
-    if host not in _LOOPBACK and key is None:
+    if host not in LOOPBACK and key is None:
         raise UsageError(
             f"--host {host}: others can reach this server, and could move the robot; give a key: "
             f"--key-file FILE, or {KEY_VARIABLE} in the environment"

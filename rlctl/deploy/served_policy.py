@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import abc
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +16,27 @@ from rlctl.run.network import Network, select_actor_tensors
 from rlctl.run.policy import Policy, PolicyInfo, read_policy
 
 
-class ServedPolicy(abc.ABC):
+@dataclasses.dataclass(frozen=True, eq=False)
+class ServedPolicy:
     """A policy that a server acts with."""
 
-    def __init__(self, file: Path, info: PolicyInfo) -> None:
-        self.file = file
-        self.info = info
-
-    @abc.abstractmethod
-    def make_actor(self) -> Policy:
-        """Return what acts for one client: a recurrent policy remembers."""
+    file: Path
+    info: PolicyInfo
+    make_actor: Callable[[], Policy]
+    """Returns what acts for one client: a recurrent policy remembers."""
+    network: Network | None = None
+    """None of an ONNX file, which has nothing but the action."""
 
     def measure_spread(self, observation: Any) -> float | None:
         """Return the mean standard deviation of the actions that were trained with; None where there is none."""
-        return None
+        network, algo = self.network, self.info.algo
+        if network is None or algo in ("td3", "ddpg", "dqn") or self.info.policy_kwargs.get("use_sde"):
+            return None
+        if network.log_std is not None:
+            return float(np.exp(network.log_std).mean())
+        if network.lstm is not None or self.info.env.action_space["type"] != "Box":
+            return None
+        return float(np.exp(network.compute_log_std(network.compute_latent(observation))).mean())
 
     def check_replaces(self, other: EnvInfo) -> None:
         """Raise `ArtifactError` if this policy cannot take the place of one for another environment."""
@@ -42,39 +50,14 @@ class ServedPolicy(abc.ABC):
             raise ArtifactError(f"{self.file.name}: this policy cannot replace the one that is served: {difference}")
 
 
-class _NumpyPolicy(ServedPolicy):
-    def __init__(self, file: Path) -> None:
-        info, tensors = read_policy(file)
-        check_playable(info, tensors, file)
-        super().__init__(file, info)
-        self._tensors = select_actor_tensors(info, tensors)
-        self._network = Network(info, self._tensors)
-
-    def make_actor(self) -> Policy:
-        return NumpyPolicy(self.info, self._tensors)
-
-    def measure_spread(self, observation: Any) -> float | None:
-        network, algo = self._network, self.info.algo
-        if algo in ("td3", "ddpg", "dqn") or self.info.policy_kwargs.get("use_sde"):
-            return None
-        if network.log_std is not None:
-            return float(np.exp(network.log_std).mean())
-        if network.lstm is not None or self.info.env.action_space["type"] != "Box":
-            return None
-        return float(np.exp(network.compute_log_std(network.compute_latent(observation))).mean())
-
-
-class _OnnxServedPolicy(ServedPolicy):
-    def __init__(self, file: Path) -> None:
-        from rlctl.run.onnx_policy import OnnxPolicy  # only here: it imports onnxruntime
-
-        self._policy = OnnxPolicy.load(file)
-        super().__init__(file, self._policy.info)
-
-    def make_actor(self) -> Policy:
-        return type(self._policy)(self.info, self._policy.session)
-
-
 def load_served_policy(file: Path) -> ServedPolicy:
     """Load a `.safetensors` or `.onnx` file and act once; raises `ArtifactError` for what is not a sound policy."""
-    return _OnnxServedPolicy(file) if file.suffix == ".onnx" else _NumpyPolicy(file)
+    if file.suffix == ".onnx":
+        from rlctl.run.onnx_policy import OnnxPolicy  # only here: it imports onnxruntime
+
+        policy = OnnxPolicy.load(file)
+        return ServedPolicy(file, policy.info, lambda: OnnxPolicy(policy.info, policy.session))
+    info, tensors = read_policy(file)
+    check_playable(info, tensors, file)
+    tensors = select_actor_tensors(info, tensors)
+    return ServedPolicy(file, info, lambda: NumpyPolicy(info, tensors), Network(info, tensors))

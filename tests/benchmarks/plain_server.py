@@ -41,7 +41,7 @@ async def answer(socket: ServerConnection) -> None:
             begin = time.monotonic()
             request = msgpack.unpackb(await socket.recv(), object_hook=decode)
             begin_acting = time.monotonic()
-            action = actor.act(request["observation"])
+            action = actor.predict(request["observation"])
             timing = {"infer_ms": (time.monotonic() - begin_acting) * 1e3}
             if before_s is not None:
                 timing["prev_total_ms"] = before_s * 1e3
