@@ -124,9 +124,17 @@ class SafetyFilter:
 
     @property
     def events(self) -> list[SafetyEvent]:
-        """The last events, oldest first."""
-        found = [event for each in self._history for event in each.list_events()]
-        return found[-_KEPT:]
+        """The last 1000 events, oldest first."""
+        return self.find_last_events(_KEPT)
+
+    def find_last_events(self, count: int) -> list[SafetyEvent]:
+        """Return the last events, oldest first."""
+        found: list[SafetyEvent] = []
+        for each in reversed(self._history):
+            if len(found) >= count:
+                break
+            found += reversed(each.list_events())
+        return found[:count][::-1]
 
     @property
     def counts(self) -> collections.Counter[str]:

@@ -287,5 +287,5 @@ def _describe(session: Session) -> dict[str, Any]:
         "observation": {
             name: [] if flat is None else flat[place][:32] for name, place in list(safety.layout.slices.items())[:16]
         },
-        "events": [dataclasses.asdict(event) for event in safety.events[-8:]],
+        "events": [dataclasses.asdict(event) for event in safety.find_last_events(8)],
     }

@@ -37,6 +37,25 @@ def test_acceleration_brakes_before_the_bound(arm):
     assert moved == pytest.approx([0.05, 0.15, 0.25, 0.3, 0.3, 0.3])
 
 
+def test_events_have_the_units_of_their_limits(arm):
+    limits = {"all": {"acceleration": 5.0}, "shoulder": {"position": [-1, 0.3]}}
+    safety = make_filter(arm, command="position", limits=limits)
+    for _ in range(3):
+        run_filter(safety, REST, [9.0, 0.0])
+    limited = [event for event in safety.events if event.kind == "limit"]
+    assert [event.name.partition(".")[2] for event in limited] == [
+        "acceleration",
+        "acceleration",
+        "acceleration",
+        "position",
+    ]
+    # From rest 9 rad in a step of 0.1 s are 900 rad/s^2. The third step would lead to 0.15 + 0.15, and braking beyond.
+    assert (limited[0].value, limited[0].limit) == pytest.approx((900.0, 5.0))
+    assert (limited[3].value, limited[3].limit) == pytest.approx((0.3, 0.25))
+    assert safety.find_last_events(2) == safety.events[-2:]
+    assert safety.counts == {"shoulder.acceleration": 3, "shoulder.position": 1}
+
+
 def test_steps_from_the_measured_position(arm):
     safety = make_filter(arm, command="step", scale=0.1, limits={"all": {"position": [-1, 1]}})
     # 2 of the action are 0.2 rad; from 0.9 only 0.1 are left, which are 1 of the action.
