@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rlctl import output
-from rlctl.eval.vary import format_cell
 from rlctl.run.robustness import Axis, Cell, Outcome, PushTest, Robustness, RobustnessMap
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ def show(result: Robustness, json: str | None) -> None:
         _show_map(each, worst[1] if worst else None)
     if worst is not None:
         found, cell = worst
-        out.print(f"\nworst: {format_cell(found, cell)}: {format_outcome(cell)}", markup=False)
+        out.print(f"\nworst: {found.name_cell(cell)}: {format_outcome(cell)}", markup=False)
         settings = " ".join(
             f"--set {axis.setting}={value:g}" for axis, value in zip(found.axes, cell.values, strict=True)
         )

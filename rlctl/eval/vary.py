@@ -213,11 +213,6 @@ def _keep(file: Path, result: Robustness) -> None:
 def check_gates(result: Robustness, gates: Gates) -> None:
     """Raise `AnswerIsNo` if the worst cell of all maps misses a gate; without maps, the nominal one."""
     found = result.find_worst()
-    where, outcome = ("nominal", result.nominal) if found is None else (format_cell(*found), found[1])
+    where, outcome = ("nominal", result.nominal) if found is None else (found[0].name_cell(found[1]), found[1])
     if missed := gates.list_missed(outcome.success_rate, outcome.success_interval, outcome.mean_return):
         raise AnswerIsNo(f"gate missed in the worst cell, {where}: " + "; ".join(missed))
-
-
-def format_cell(found: RobustnessMap, cell: Cell) -> str:
-    """Return where a cell is: `mass 0.6, friction 0.2`."""
-    return ", ".join(f"{axis.name} {value:g}" for axis, value in zip(found.axes, cell.values, strict=True))

@@ -66,6 +66,10 @@ class RobustnessMap(_Content):
     cells: list[Cell]
     """For every combination of the axes' values, that of the last axis changing fastest."""
 
+    def name_cell(self, cell: Cell) -> str:
+        """Return where a cell is: `mass 0.6, friction 0.2`."""
+        return ", ".join(f"{axis.name} {value:g}" for axis, value in zip(self.axes, cell.values, strict=True))
+
     def find_worst(self) -> Cell:
         """Return the cell with the lowest success rate, or mean return where there is none."""
         return min(self.cells, key=lambda cell: cell.score)

@@ -15,7 +15,7 @@ from rlctl.run.robustness import Robustness
 from rlctl.runs.diagnosis import Finding, diagnose
 from rlctl.runs.diagnosis import show as diagnosis
 from rlctl.runs.listing import as_json
-from rlctl.runs.summary import Rows, RunSummary, read_table, summarize
+from rlctl.runs.summary import Rows, RunSummary, list_points, read_table, summarize
 
 _EVALUATIONS_SHOWN = 12
 _PLOT_SIZE = (90, 13)
@@ -67,8 +67,7 @@ def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
 def describe_robustness(result: Robustness) -> Iterator[str]:
     """Yield the worst cell of all maps, what a push does, and how both were measured."""
     if (found := result.find_worst()) is not None:
-        axes, cell = found[0].axes, found[1]
-        where = ", ".join(f"{axis.name} {value:g}" for axis, value in zip(axes, cell.values, strict=True))
+        where, cell = found[0].name_cell(found[1]), found[1]
         rate = "" if cell.success_rate is None else f"success {cell.success_rate:.1%}, "
         yield f"worst of {result.episodes} episodes each at {where}: {rate}return {cell.mean_return:.4g}"
     if result.push is not None:
@@ -120,7 +119,7 @@ def show(run: RunDescription, json: str | None) -> None:
 
 def plot(run: RunDescription, name: str) -> str:
     """Draw a quantity over training steps, episodes of training as a line and evaluations as points; empty if none."""
-    lines = [_points(rows, name) for rows in (run.metrics, run.evaluations)]
+    lines = [list_points(rows, name) for rows in (run.metrics, run.evaluations)]
     if not any(lines):
         return ""
     import plotext
@@ -138,14 +137,6 @@ def plot(run: RunDescription, name: str) -> str:
             draw = plotext.plot if label == "training" else plotext.scatter
             draw(*zip(*points, strict=True), label=label, marker=marker)
     return str(plotext.uncolorize(plotext.build()))
-
-
-def _points(rows: Rows, name: str) -> list[tuple[float, float]]:
-    return [
-        (steps, value)
-        for row in rows
-        if (steps := row.get("steps")) is not None and (value := row.get(name)) is not None
-    ]
 
 
 def _show_evaluations(rows: Rows) -> None:

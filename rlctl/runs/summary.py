@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -147,6 +148,14 @@ def _numbers(row: dict[str, Any]) -> dict[str, float | None] | None:
         return {name: float(value) if value else None for name, value in row.items()}
     except ValueError:
         return None
+
+
+def list_points(rows: Rows, column: str) -> list[tuple[float, float]]:
+    """Return the steps and the values of a column where it has finite ones."""
+    pairs = ((row.get("steps"), row.get(column)) for row in rows)
+    return [
+        (steps, value) for steps, value in pairs if steps is not None and value is not None and math.isfinite(value)
+    ]
 
 
 def best_row(rows: Rows) -> dict[str, float | None] | None:

@@ -51,7 +51,9 @@ def test_a_zoo_agent_acts_as_the_model_does(tmp_path, algo, env, task, settings)
     statistics = next(tmp_path.rglob("vecnormalize.pkl"), None)
     imported = import_model(ImportRequest(file, task, statistics, output=tmp_path / "policy.safetensors"))
     assert imported.info.spec.time_feature is (task == "reach")
-    model = ALGORITHMS["recurrent_ppo" if algo == "ppo_lstm" else algo].load(file, device="cpu")
+    # Its schedules are classes of rl_zoo3, which is not installed here.
+    schedules = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": 0.2}
+    model = ALGORITHMS["recurrent_ppo" if algo == "ppo_lstm" else algo].load(file, None, "cpu", schedules)
     normalize = pickle.loads(statistics.read_bytes()).normalize_obs if statistics else np.asarray  # noqa: S301 (ours)
     policy, rng, state = load_policy(imported.file), np.random.default_rng(0), None
     space = policy.observation_space

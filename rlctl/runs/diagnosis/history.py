@@ -18,7 +18,7 @@ from rlctl.run.env_info import EnvInfo
 from rlctl.run.episode import RecordedEpisode, load_episode
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.run.policy import read_policy
-from rlctl.runs.summary import Rows, read_table
+from rlctl.runs.summary import Rows, list_points, read_table
 
 Array = NDArray[np.float64]
 
@@ -160,9 +160,4 @@ def _load(file: Path) -> RecordedEpisode | None:
 
 
 def _curve(rows: Rows, name: str) -> Curve:
-    points = [
-        (steps, value)
-        for row in rows
-        if (steps := row.get("steps")) is not None and (value := row.get(name)) is not None and np.isfinite(value)
-    ]
-    return Curve(*np.array(points, np.float64).reshape(-1, 2).T)
+    return Curve(*np.array(list_points(rows, name), np.float64).reshape(-1, 2).T)

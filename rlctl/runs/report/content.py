@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import shlex
 from collections.abc import Sequence
 from typing import Any
@@ -17,7 +16,7 @@ from rlctl.run.recipe_difference import find_difference
 from rlctl.runs.comparison import find_group
 from rlctl.runs.diagnosis import Finding
 from rlctl.runs.show import RunDescription, describe
-from rlctl.runs.summary import Rows
+from rlctl.runs.summary import Rows, list_points
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,7 +162,7 @@ def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[s
 
     All of one shape, at most (points,); a single table gives its own rows, averaged where there are more.
     """
-    curves = [found for rows in tables if len(found := _points(rows, column))]
+    curves = [np.array(found) for rows in tables if (found := list_points(rows, column))]
     if not curves:
         return None
     if len(curves) == 1:
@@ -176,12 +175,3 @@ def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[s
     steps = np.linspace(first, last, min(points, max(map(len, curves))))
     values = np.array([np.interp(steps, *curve.T) for curve in curves])
     return {"steps": steps, "mean": values.mean(0), "low": values.min(0), "high": values.max(0), "count": len(curves)}
-
-
-def _points(rows: Rows, column: str) -> Any:
-    found = [
-        (steps, value)
-        for row in rows
-        if (steps := row.get("steps")) is not None and (value := row.get(column)) is not None and math.isfinite(value)
-    ]
-    return np.array(found, np.float64).reshape(-1, 2)
