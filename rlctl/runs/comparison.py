@@ -20,6 +20,7 @@ from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
 from rlctl.run.directory import RunDirectory, is_group
 from rlctl.run.group import read_group
 from rlctl.run.lookup import find_run
+from rlctl.run.recipe import Recipe
 from rlctl.run.recipe_difference import find_difference
 from rlctl.runs.statistics import (
     Difference,
@@ -73,6 +74,8 @@ class Side:
 
     name: str
     runs: list[EvaluatedRun]
+    mixed: list[str]
+    """Keys in which the recipes of its own runs differ: it should have none."""
 
     @property
     def has_success(self) -> bool:
@@ -135,10 +138,10 @@ def compare(request: CompareRequest) -> Comparison:
     groups = [find_group(text) for text in request.sides]
     _refuse_unequal(request.sides, groups)
     task = _common_task([run for group in groups for run in group], request.task)
-    recipes = [group[0].recipe() for group in groups]
+    recipes = [[run.recipe() for run in group] for group in groups]
     sides = [
-        Side(_name(text, group), [_evaluate(run, request) for run in group])
-        for text, group in zip(request.sides, groups, strict=True)
+        Side(_name(text, group), [_evaluate(run, request) for run in group], _find_mixed(mixed))
+        for text, group, mixed in zip(request.sides, groups, recipes, strict=True)
     ]
     baseline, *others = sides
     of_recipes = len(groups[0]) > 1
@@ -147,7 +150,7 @@ def compare(request: CompareRequest) -> Comparison:
         task=task,
         baseline=baseline,
         candidates=[
-            Candidate(side, _differences(baseline, side, of_recipes), find_difference(recipe, recipes[0]))
+            Candidate(side, _differences(baseline, side, of_recipes), find_difference(recipe[0], recipes[0][0]))
             for side, recipe in zip(others, recipes[1:], strict=True)
         ],
         episodes=request.episodes,
@@ -199,6 +202,10 @@ def _common_task(runs: list[RunDirectory], task: str | None) -> str:
     if len(tasks) > 1:
         raise UsageError(f"these runs are of different tasks ({', '.join(tasks)}); --task TASK evaluates all on one")
     return tasks[0]
+
+
+def _find_mixed(recipes: list[Recipe]) -> list[str]:
+    return sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})
 
 
 def _evaluate(run: RunDirectory, request: CompareRequest) -> EvaluatedRun:

@@ -45,6 +45,9 @@ def _show_seeds(result: Comparison) -> None:
     for side in result.sides:
         scores = "; ".join(_format_aggregate(side, quantity) for quantity in result.candidates[0].differences)
         output.out().print(f"{side.name}: {len(side.runs)} seeds, {scores}", markup=False)
+        if side.mixed:
+            mixed = ", ".join(side.mixed)
+            output.out().print(f"warning: {side.name} is not one recipe: its runs differ in {mixed}", markup=False)
 
 
 def _or_dash(value: float | None, form: str) -> str:
@@ -161,4 +164,4 @@ def _side_as_json(side: Side, result: Comparison) -> dict[str, Any]:
         }
         for quantity, values in scores.items()
     }
-    return {"name": side.name, "runs": runs, "over_seeds": over_seeds}
+    return {"name": side.name, "runs": runs, "over_seeds": over_seeds, "mixed": side.mixed}

@@ -56,6 +56,11 @@ def test_recipes_are_compared_seed_by_seed(root):
     assert [len(side["runs"]) for side in (content["baseline"], *content["candidates"])] == [2, 2]
 
 
+def test_runs_of_several_recipes_as_one_are_pointed_out(root):
+    result = compare(CompareRequest([f"{root}/0.9*/reach/*_s0", f"{root}/0.9*/reach/*_s1"], episodes=2))
+    assert result.baseline.mixed == ["algo_kwargs.gamma"]
+
+
 def test_refusals(root, write_run):
     one, _ = sorted((root / "0.9/reach").iterdir())
     with pytest.raises(UsageError, match="two or more"):
