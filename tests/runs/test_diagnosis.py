@@ -122,6 +122,11 @@ def test_rare_success_at_the_beginning_has_no_finding(write_training):
     assert diagnose(write_training({"return": lucky, "success": None, "explained_variance": None})) == []
 
 
+def test_saturated_actions_of_a_policy_that_still_learns_are_no_finding(write_training):
+    # As of the biped: torques at their limits push it forward long before it walks the whole way.
+    assert diagnose(write_training({"success": 0.0, "action_saturation": 0.9})) == []
+
+
 @pytest.mark.parametrize(
     ("id", "metrics", "more"),
     [

@@ -77,18 +77,29 @@ def test_acts_as_the_model_does(save, algo, observation, action, kwargs):
     imported = import_model(request)
     assert imported.info.algo == algo
     policy = load_policy(imported.file)
-    rng = np.random.default_rng(0)
-    space = policy.observation_space
+    rng, space = np.random.default_rng(0), policy.observation_space
     space.seed(0)
-    state = None
-    for step in range(100):
-        value = space.sample()
-        if observation == "vector":
-            value = rng.normal(0, 3, space.shape).astype(np.float32)
-        expected, state = model.predict(
-            env.normalize_obs(value), state=state, episode_start=np.array([step == 0]), deterministic=True
-        )
-        np.testing.assert_allclose(policy.predict(value), expected, rtol=1e-5, atol=1e-6)
+    observations = [
+        rng.normal(0, 3, space.shape).astype(np.float32) if observation == "vector" else space.sample()
+        for _ in range(1000)
+    ]
+    expected = predict(model, env, observations, one_by_one=algo == "recurrent_ppo")
+    np.testing.assert_allclose([policy.predict(each) for each in observations], expected, rtol=1e-5, atol=1e-5)
+
+
+def predict(model, env, observations, *, one_by_one):
+    """Return the model's actions; one by one for a model that remembers what it saw."""
+    if one_by_one:
+        actions, state = [], None
+        for step, each in enumerate(map(env.normalize_obs, observations)):
+            action, state = model.predict(each, state, np.array([step == 0]), deterministic=True)
+            actions.append(action)
+        return actions
+    first = observations[0]
+    together = (
+        {key: np.stack([each[key] for each in observations]) for key in first} if isinstance(first, dict) else None
+    )
+    return model.predict(env.normalize_obs(together or np.stack(observations)), deterministic=True)[0]
 
 
 def test_nothing_is_unpickled(save, monkeypatch):
