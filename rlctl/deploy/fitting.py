@@ -11,13 +11,21 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.deploy.bounds import Bounds
-from rlctl.deploy.limits import Limits, check_names
+from rlctl.deploy.limits import JointLimits, Limits, check_names
 from rlctl.deploy.observation import ObservationLayout
 from rlctl.errors import RecipeError, UsageError
+from rlctl.joints import Joints
 from rlctl.run.env_info import EnvInfo
 
 Array = NDArray[np.float64]
 
+_CAN_BE_LIMITED = {
+    "position": ("position", "speed", "acceleration", "action"),
+    "step": ("position", "speed", "acceleration", "action"),
+    "speed": ("position", "speed", "acceleration", "action"),
+    "torque": ("torque", "rate", "action"),
+    "action": ("rate", "action"),
+}
 _NO_CONTROL_DT = "limits: this policy does not say its control_dt; write control_dt: SECONDS"
 
 
@@ -53,7 +61,7 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
         names = limits.joints or (list(known.names) if known else [f"action[{index}]" for index in range(count)])
         if len(names) != count or len(set(names)) != count:
             raise RecipeError(f"limits: joints: {len(set(names))} different names, the action has {count} elements")
-        bounds = Bounds(limits, space, names, control_dt, known)
+        bounds = _make_bounds(limits, space, names, control_dt, known)
     elif limits.limits or limits.lowpass_hz:
         raise UsageError("limits: the actions of this policy are choices, not quantities that can be bounded")
     measured = _find_measured(limits, layout, count)
@@ -64,6 +72,112 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     _check_measured(limits, bounds, measured, layout)
     safe = _make_safe_command(limits, bounds, count)
     return FittedLimits(layout, space, control_dt, bounds, measured, home, safe)
+
+
+def _make_bounds(
+    limits: Limits, space: spaces.Box, names: list[str], control_dt: float | None, known: Joints | None
+) -> Bounds:
+    """Return the limits as arrays, in the units of a command and per control step."""
+    given = [name for name in limits.limits if name != "all"]
+    named = limits.joints is not None or known is not None
+    hint = "" if named else " This policy does not name them: write joints: [names, in the action's order]."
+    check_names("joint", given, names, "limits: ", hint)
+    each = [_merge(limits, name, _list_known(limits, known, index)) for index, name in enumerate(names)]
+    for joint, name in zip(each, names, strict=True):
+        _check_can_be_limited(limits, joint, name)
+    timed = limits.command == "speed" or any(joint.speed or joint.acceleration or joint.rate for joint in each)
+    if timed and control_dt is None:
+        raise RecipeError(_NO_CONTROL_DT)
+    dt, is_value = control_dt or 1.0, limits.command in ("position", "torque", "action")
+    scale, offset = _choose_units(limits, known, names)
+    if not is_value and offset.any():
+        raise RecipeError(f"limits: offset: with command: {limits.command} action 0 is to keep still; leave it out")
+    factor = scale * (dt if limits.command == "speed" else 1.0)
+    low = offset + factor * np.maximum(space.low.ravel(), _gather(each, "action", -np.inf, 0))
+    high = offset + factor * np.minimum(space.high.ravel(), _gather(each, "action", np.inf, 1))
+    position = np.array([_gather(each, "position", -np.inf, 0), _gather(each, "position", np.inf, 1)])
+    if is_value:
+        torque = np.array([joint.torque or np.inf for joint in each])
+        low = np.maximum(np.maximum(low, position[0]), -torque)
+        high = np.minimum(np.minimum(high, position[1]), torque)
+        position = np.array([low, high])
+    elif ((low > 0) | (high < 0)).any():
+        raise UsageError("limits: an action of this policy cannot stand still: its bounds exclude zero")
+    if (low > high).any():
+        name = names[int(np.argmax(low > high))]
+        raise RecipeError(f"limits: {name}: no action keeps these limits and the policy's own action bounds")
+    return Bounds(
+        names,
+        dt,
+        is_value,
+        factor,
+        offset,
+        low,
+        high,
+        position,
+        speed=_drop_infinite(np.array([joint.speed or joint.rate or np.inf for joint in each]) * dt),
+        change=_drop_infinite(np.array([joint.acceleration or np.inf for joint in each]) * dt**2),
+        position_name=limits.command if limits.command in ("torque", "action") else "position",
+        speed_name="rate" if limits.command in ("torque", "action") else "speed",
+    )
+
+
+def _drop_infinite(values: Array) -> Array | None:
+    return values if np.isfinite(values).any() else None
+
+
+def _merge(limits: Limits, name: str, known: dict[str, Any]) -> JointLimits:
+    own = limits.limits.get(name, JointLimits())
+    every = limits.limits.get("all", JointLimits())
+    given = {**every.model_dump(exclude_none=True), **own.model_dump(exclude_none=True)}
+    return JointLimits(**{**known, **given})
+
+
+def _list_known(limits: Limits, joints: Joints | None, index: int) -> dict[str, Any]:
+    """Return the limits of one joint that the task's model of the robot has, as far as they can be kept."""
+    found: dict[str, Any] = {}
+    if joints is None:
+        return found
+    measured = limits.measured.position is not None
+    moves = limits.command in ("position", "step", "speed")
+    if joints.low and joints.high and (limits.command == "position" or (moves and measured)):
+        found["position"] = joints.low[index], joints.high[index]
+    if joints.max_speed and moves and measured:
+        found["speed"] = joints.max_speed[index]
+    if joints.max_torque and limits.command == "torque":
+        found["torque"] = joints.max_torque[index]
+    return found
+
+
+def _check_can_be_limited(limits: Limits, joint: JointLimits, name: str) -> None:
+    for key in joint.model_fields_set:
+        if key not in _CAN_BE_LIMITED[limits.command]:
+            can = ", ".join(_CAN_BE_LIMITED[limits.command])
+            raise RecipeError(
+                f"limits: {name}.{key}: with command: {limits.command} only {can} can be limited; "
+                "say with command: what an action is, or watch a measured value with sensors:"
+            )
+
+
+def _choose_units(limits: Limits, known: Joints | None, names: list[str]) -> tuple[Array, Array]:
+    """Return scale and offset of the command, per joint."""
+    scale: Any = 1.0
+    offset: Any = 0.0
+    if known is not None and known.action_scale and limits.command == "position":
+        scale, offset = known.action_scale, known.default_positions or 0.0
+    return _spread("scale", limits.scale, scale, names), _spread("offset", limits.offset, offset, names)
+
+
+def _spread(key: str, given: Any, default: Any, names: list[str]) -> Array:
+    """Return a number per joint: what was given, or the default."""
+    values = np.atleast_1d(np.asarray(default if given is None else given, np.float64))
+    if len(values) not in (1, len(names)):
+        raise RecipeError(f"limits: {key} has {len(values)} numbers, the action {len(names)}")
+    return np.broadcast_to(values, (len(names),)).copy()
+
+
+def _gather(joints: list[JointLimits], key: str, default: float, end: int) -> Array:
+    return np.array([default if (ends := getattr(joint, key)) is None else ends[end] for joint in joints])
 
 
 def _find_measured(limits: Limits, layout: ObservationLayout, count: int) -> slice | None:
@@ -100,7 +214,11 @@ def _check_measured(limits: Limits, bounds: Bounds | None, measured: slice | Non
     if measured is not None or bounds is None:
         return
     moves = bounds.speed is not None or bounds.change is not None or limits.blend_in_s > 0
-    if (limits.command == "position" and moves) or bounds.needs_position or limits.home is not None:
+    if (
+        (limits.command == "position" and moves)
+        or (not bounds.is_value and bounds.bounds_position)
+        or limits.home is not None
+    ):
         raise RecipeError(
             "limits: these need to know where the joints are; write measured: {position: NAME} with the name of the "
             f"observation, one of {', '.join(layout.slices)}"
