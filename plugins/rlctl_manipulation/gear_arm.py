@@ -39,6 +39,8 @@ GOAL_HEIGHT = 0.1  # [m]: of the middle of an object of 4 cm on a table of 8 cm
 TABLE_HEIGHT = 0.08  # [m]
 DROP = np.array([0.0, 0.0, 0.02])  # [m], from where the cube falls onto the table
 NEAR = 0.05  # [m]
+HELD = 0.025  # [m], from the tool to an object that is between the fingers, and not below closed ones
+CLEARANCE = 0.06  # [m], above an object, at which the tool goes there from beside it
 LIFTED = 0.05  # [m], above the table
 HOLD_S = 0.5  # [s]
 
@@ -127,8 +129,9 @@ class GearArm(Task):
         return np.array([angles[name] for name in self.arm.joint_names])
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Start near the home pose, a goal on the table."""
-        self.arm.set_joints(self.pose(HOME + rng.uniform(-self.start_noise, self.start_noise, 3), OPEN / 2))
+        """Start near the home pose, a goal on the table; where there is an object to grasp, with open fingers."""
+        opening = OPEN / 2 if self.stage == "reach" else 0.95 * OPEN
+        self.arm.set_joints(self.pose(HOME + rng.uniform(-self.start_noise, self.start_noise, 3), opening))
         self.goal = np.array([*rng.uniform(-self.goal_range, self.goal_range, 2), GOAL_HEIGHT])
         if self.stage != "reach":
             # One side faces the base: the gripper turns with the arm, and not by itself. A box, and let fall, because
@@ -181,7 +184,7 @@ class GearArm(Task):
         distance = rewards.distance(self.tool, self.object)
         torques = self.arm.joint_torques[self.motors]
         return {
-            "distance": distance,
+            "distance": distance if self.stage == "reach" else self.measure_way(),
             "arrival": rewards.closeness(distance, NEAR),
             "grasp": rewards.grasp(distance, NEAR, held),
             "lift": min(max(height, 0.0), LIFTED) / LIFTED if held else 0.0,
@@ -190,9 +193,20 @@ class GearArm(Task):
             "time": rewards.time_spent(self.control_dt),
         }
 
+    def measure_way(self) -> float:
+        """Return how far the tool is from above the object, and the nearer to its axis the lower above it [m].
+
+        Straight for the object, the fingers would push it away.
+        """
+        x, y, z = self.object - self.tool
+        aside = math.hypot(x, y)
+        return math.hypot(aside, z + min(max(2 * (aside - 0.01), 0.0), CLEARANCE))
+
     def is_held(self) -> bool:
-        """Both fingers touch the object."""
-        return self.stage != "reach" and self.arm.links_touching(self.cube) >= {"left_finger", "right_finger"}
+        """Both fingers touch the object, which is between them."""
+        if self.stage == "reach" or rewards.distance(self.tool, self.object) > HELD:
+            return False
+        return self.arm.links_touching(self.cube) >= {"left_finger", "right_finger"}
 
     def is_success(self) -> bool:
         """The tool is at the goal; or the object has been held, or held above the table, for half a second."""

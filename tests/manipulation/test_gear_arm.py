@@ -132,6 +132,30 @@ def test_an_object_can_be_grasped_and_lifted(stage):
     env.close()
 
 
+def test_closed_fingers_on_top_of_an_object_do_not_hold_it():
+    env = TaskEnv(GearArm(stage="grasp"))
+    env.reset(seed=0)
+    task = env.task
+    above = task.goal + np.array([0.0, 0.0, 0.06])
+    for step in range(240):
+        down = min(0.04, 0.0005 * max(0, step - 120))  # [m], to where the tips would be in the object
+        _, _, _, _, info = env.step(steer(task, above - np.array([0.0, 0.0, down]), -1.0))
+    assert task.arm.links_touching(task.cube) >= {"left_finger", "right_finger"}
+    assert info["metrics"]["grasp"] < 0.5
+    assert info["is_success"] is False
+    env.close()
+
+
+def test_the_way_to_an_object_goes_over_it(env):
+    task = env.task
+    task.object = task.tool + np.array([0.06, 0.08, 0.0])
+    # 0.1 m beside it: 0.06 m above it is the next place to go to
+    assert task.measure_way() == pytest.approx(math.hypot(0.1, 0.06))
+    task.object = task.tool + np.array([0.0, 0.02, -0.03])
+    # 0.02 m beside it: 2 * 0.01 m above it, so 0.01 m further down
+    assert task.measure_way() == pytest.approx(math.hypot(0.02, 0.01))
+
+
 def test_the_terms_by_hand(env):
     task = env.task
     task.goal = task.arm.link_position("tool") + np.array([0.03, 0.0, 0.04])
