@@ -87,29 +87,31 @@ def format_row(scores: dict[str, Any]) -> str:
         f"`{scores['task']}`",
         known[0]["algo"],
         ", ".join(str(each["seed"]) for each in known),
-        _format([each["steps"] for each in known if each["steps"] is not None], ",.0f"),
-        _format([each["seconds"] / 60 for each in known if each["seconds"] is not None], ".1f"),
-        "" if None in success else _format([100 * each for each in success], ".1f", " %", spread=True),
-        _format(returns, ".4g", spread=True),
-        _format([each["action_change"] for each in measured], ".3f"),
-        _format([100 * each for each in early], ".0f", " %"),
+        _list([each["steps"] for each in known if each["steps"] is not None], ",.0f"),
+        _list([each["seconds"] / 60 for each in known if each["seconds"] is not None], ".1f"),
+        "" if None in success else _list([100 * each for each in success], ".0f", " %", spread=True),
+        _list(returns, ".4g", spread=True),
+        _list([each["action_change"] for each in measured], ".2f"),
+        _list([100 * each for each in early], ".0f", " %"),
     ]
     return f"| {' | '.join(cells)} |\n"
 
 
-def _format(values: list[float], form: str, unit: str = "", *, spread: bool = False) -> str:
-    if not values:
-        return ""
-    text = f"{statistics.fmean(values):{form}}"
-    if spread:
-        text += f" ± {statistics.stdev(values):{form}}" if len(values) > 1 else " (one seed)"
-    return text + unit
+def _list(values: list[float], form: str, unit: str = "", *, spread: bool = False) -> str:
+    """Return the values of the seeds, once if all are alike, and with `spread` their mean and standard deviation."""
+    texts = [f"{value:{form}}" for value in values]
+    text = ", ".join(texts if spread or len(set(texts)) > 1 else texts[:1]) + (unit if texts else "")
+    if spread and len(values) > 1:
+        text += f" (mean {statistics.fmean(values):{form}} ± {statistics.stdev(values):{form}})"
+    return text
 
 
 def format_table(scores: Sequence[dict[str, Any]]) -> str:
     """Return the table of some tasks, with what its numbers are."""
     first = next((each["score"] for one in scores for each in one["seeds"] if each["score"] is not None), None)
-    note = "Means over the training seeds, ± the standard deviation between them"
+    note = (
+        "Values of the training seeds in their order, one where all are alike; ± is the standard deviation between them"
+    )
     if first is not None:
         note += f"; {first['episodes']} episodes each, which no training has seen"
     return HEAD + "".join(map(format_row, scores)) + f"\n{note}.\n"

@@ -24,13 +24,17 @@ def seed(number, success, returns, **more):
 def test_a_row_by_hand():
     scores = {"task": "walk", "seeds": [seed(1, 0.9, 10.0), seed(2, 1.0, 14.0), seed(3, 0.95, 12.0)]}
     # Success 90, 100, 95: mean 95, standard deviation 5. Return 10, 14, 12: mean 12, standard deviation 2.
-    assert format_row(scores) == "| `walk` | ppo | 1, 2, 3 | 1,000 | 2.0 | 95.0 ± 5.0 % | 12 ± 2 | 0.200 | 1 % |\n"
+    scores["seeds"][2]["steps"] = 2000
+    assert format_row(scores) == (
+        "| `walk` | ppo | 1, 2, 3 | 1,000, 1,000, 2,000 | 2.0 | 90, 100, 95 % (mean 95 ± 5) | 10, 14, 12 (mean 12 ± 2) "
+        "| 0.20 | 1 % |\n"
+    )
 
 
 @pytest.mark.parametrize(
     ("seeds", "row"),
     [
-        ([seed(1, None, 10.0)], "| `walk` | ppo | 1 | 1,000 | 2.0 |  | 10 (one seed) | 0.200 | 1 % |\n"),
+        ([seed(1, None, 10.0)], "| `walk` | ppo | 1 | 1,000 | 2.0 |  | 10 | 0.20 | 1 % |\n"),
         ([seed(1, 1.0, 1.0, score=None, problem="damaged")], "| `walk` | | | | | damaged | | | |\n"),
     ],
 )
