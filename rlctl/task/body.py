@@ -287,10 +287,6 @@ class Body(Motors):
         pybullet.resetBaseVelocity(self.id, np.add(linear, velocity).tolist(), angular, physicsClientId=self.client)
         self._cache.clear()
 
-    def apply_torque(self, torque: Sequence[float]) -> None:
-        """Turn the base by `torque` [N m], world frame, through the next control step. For `act`."""
-        pybullet.applyExternalTorque(self.id, -1, torque, pybullet.WORLD_FRAME, physicsClientId=self.client)
-
     def set_joints(self, positions: Array, velocities: Array | None = None) -> None:
         """Place the joints: `positions` and `velocities` of shape (joints,), at rest without the latter."""
         pybullet.resetJointStatesMultiDof(

@@ -26,8 +26,8 @@ def test_it_can_stand(env):
     earned = sum(env.step(STAND)[1] for _ in range(200))
     assert not env.task.is_terminated()
     assert {"left_foot", "right_foot"} == env.task.body.links_touching(env.task.ground)
-    # In each of 200 steps; the rest is small
-    assert earned == pytest.approx(200 * ALIVE, abs=0.8)
+    # In each of 200 steps; the rest is small, though the free one leans on one foot by 0.06 rad: -2 * 0.06^2 a step
+    assert earned == pytest.approx(200 * ALIVE, abs=1.5)
     assert 0.56 < env.task.trunk.position[2] < 0.58  # [m]
 
 
@@ -63,9 +63,9 @@ def test_the_terms_of_a_robot_that_moves(env):
     assert terms["progress"] == terms["forward_while_alive"] == pytest.approx(0.5, abs=1e-6)
     assert (terms["alive"], terms["fall"]) == (1.0, 0.0)
     assert terms["posture"] == pytest.approx(0.0, abs=1e-9)
-    move(task, 2.5)  # with a top speed of 1 m/s
+    move(task, 2.5)
     task.update()
-    assert task.rewards(np.zeros(4, np.float32))["progress"] == 1.0
+    assert task.rewards(np.zeros(4, np.float32))["progress"] == task.top_speed
 
 
 def test_smoothness_by_hand(env):
@@ -110,20 +110,6 @@ def test_the_rail_keeps_a_plane():
         assert env.task.trunk.angular_velocity[::2] == pytest.approx((0, 0), abs=1e-6)  # of roll and yaw
         if terminated:
             break
-    env.close()
-
-
-@pytest.mark.parametrize(("support", "stays_up"), [(0.0, False), (50.0, True)])
-def test_a_support_holds_the_free_biped(support, stays_up):
-    env = TaskEnv(Biped3D(support=support))
-    env.reset(seed=0)
-    terminated, step = False, 0
-    while not terminated and step < 100:
-        if step < 5:
-            env.task.body.apply_torque((20.0, 0.0, 0.0))  # [N m], for 0.1 s: feet 0.3 m wide give 10
-        terminated = env.step(STAND)[2]
-        step += 1
-    assert terminated is not stays_up
     env.close()
 
 
@@ -195,11 +181,6 @@ def test_mistakes(parameters, message):
     with pytest.raises(TaskError) as caught:
         TaskEnv(Biped(**parameters))
     assert str(caught.value) == message
-
-
-def test_a_support_that_pushes():
-    with pytest.raises(TaskError, match=r"^support: -1 N m/rad would turn the robot over\. Give 0 or more\.$"):
-        TaskEnv(Biped3D(support=-1.0))
 
 
 def test_nothing_is_wrong_with_the_models(env):
