@@ -2,6 +2,8 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
+# Tests start hundreds of processes, which would each compile all modules where writing them compiled is turned off.
+export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: demo test test-slow test-crash test-all lint format bench train-all clean
 

@@ -5,6 +5,7 @@ import os
 # Each of the processes that run the tests has a core: threads of a library would only wait for each other.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
+import gc
 import signal
 import subprocess
 import sys
@@ -18,6 +19,11 @@ from rlctl.rollout.process_start import set_default_start
 from tests import fork_server
 
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup what is started here would ignore it
+
+
+def pytest_collection_finish():
+    gc.collect()
+    gc.freeze()  # modules and tests stay: collections need not look through them again and again
 
 
 @pytest.fixture(scope="session", autouse=True)

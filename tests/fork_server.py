@@ -1,9 +1,9 @@
 """Processes forked from one that has imported what they import: started as by `subprocess.Popen`, in milliseconds.
 
 Most of the time of a small training is spent on imports, so tests start processes this way unless the start itself is
-what they test. A process has the folder, environment, descriptors, process group and signal mask that its caller gives
-it, and is the caller's child: exit codes, `getppid` and `psutil` see no difference. It differs from a fresh interpreter
-in that everything is imported already, and in that no `atexit` function runs. Linux only.
+what they test. A process has the folder, environment, descriptors, cores, process group and signal mask that its caller
+gives it, and is the caller's child: exit codes, `getppid` and `psutil` see no difference. It differs from a fresh
+interpreter in that everything is imported already, and in that no `atexit` function runs. Linux only.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ FOR_WORKERS = (
 )
 FOR_COMMANDS = (
     *("torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
-    *("rlctl.eval.evaluate", "rlctl.run.torch_policy", "typer.rich_utils", "yaml"),
+    *("rlctl.eval.evaluate", "rlctl.run.torch_policy", "typer.rich_utils", "yaml", "scipy.stats", "onnx"),
 )
 """What is imported when it is needed; one that is missing here costs time only."""
 HASH_SEED = "0"
@@ -159,6 +159,7 @@ class ForkServer:
                 "cwd": os.path.abspath(cwd or "."),
                 "process_group": process_group,
                 "session": start_new_session,
+                "cores": sorted(os.sched_getaffinity(0)),
                 "blocked": [int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, ())],
             }
             with self._lock, _adopting():
@@ -205,8 +206,9 @@ def close():
 
 
 def start(command, **options):
-    """Start a child process as `subprocess.Popen` does, by the server of this process."""
-    return for_workers().start(command, **options)
+    """Start a child process as `subprocess.Popen` does, by a server of this process."""
+    server = for_commands if list(command[1:3]) == ["-m", "rlctl"] else for_workers
+    return server().start(command, **options)
 
 
 @contextlib.contextmanager
@@ -298,6 +300,7 @@ def _take_surroundings(request):
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])
+    os.sched_setaffinity(0, request["cores"])
     signal.pthread_sigmask(signal.SIG_SETMASK, request["blocked"])  # first: what is held back must not end it
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in SIGNALS[1:]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 import shlex
 import tomllib
@@ -76,11 +77,17 @@ def commands(page: Path) -> list[str]:
     return [re.split(r"\s+[#|] ", line)[0] for line in found if line.startswith("rlctl ")]
 
 
-def parse(words: list[str], command: Any = None) -> None:
-    """Read a command line as rlctl does, and run nothing; raises what it raises for what does not exist."""
+@functools.cache
+def rlctl_command() -> Any:
+    """Return the command that is made of all of them: it takes half a second."""
     from rlctl.cli import app
 
-    command = command or typer.main.get_command(app)
+    return typer.main.get_command(app)
+
+
+def parse(words: list[str], command: Any = None) -> None:
+    """Read a command line as rlctl does, and run nothing; raises what it raises for what does not exist."""
+    command = command or rlctl_command()
     if not hasattr(command, "commands"):
         command.make_context(command.name, list(words))
     elif words and words[0].startswith("-"):

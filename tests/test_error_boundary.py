@@ -19,10 +19,11 @@ def shell(command, **environment):
 
 @pytest.mark.parametrize("encoding", ["ascii", "ascii:strict", "latin-1:strict"])
 def test_a_terminal_that_is_not_utf8(encoding):
-    for command in ("--help", "tasks", "eval nothing_of_the_name_é"):
-        done = shell(f"{RLCTL} {command}", PYTHONIOENCODING=encoding, PYTHONUTF8="0")
-        assert done.returncode in (0, 5), done.stderr
-        assert b"Traceback" not in done.stderr
+    commands = [["--help"], ["tasks"], ["eval", "nothing_of_the_name_é"]]
+    code = f"import sys; from rlctl.cli import run; print([run(each) for each in {commands!r}], file=sys.stderr)"
+    done = shell(f'{sys.executable} -c "{code}"', PYTHONIOENCODING=encoding, PYTHONUTF8="0")
+    assert done.stderr.endswith(b"[0, 0, 5]\n"), done.stderr
+    assert b"Traceback" not in done.stderr
 
 
 def test_progress_in_ascii(monkeypatch, capsys):

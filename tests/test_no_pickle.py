@@ -36,6 +36,7 @@ def test_the_life_of_a_run(tmp_path):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(
         "algo: sac\nn_envs: 2\neval: {episodes: 2, every_steps: 64}\nalgo_kwargs: {learning_starts: 16}\n"
+        "policy_kwargs: {net_arch: [16]}\n"
     )
     codes, found = watched(
         tmp_path,

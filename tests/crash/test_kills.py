@@ -49,7 +49,10 @@ def half_done(trials, whole, tmp_path_factory):
 
 
 @parts
-@pytest.mark.parametrize(("name", "saved"), [pytest.param("ppo", 0, marks=pytest.mark.crash), ("ppo", 16), ("sac", 16)])
+@pytest.mark.parametrize(
+    ("name", "saved"),
+    [("ppo", 16), *(pytest.param(name, saved, marks=pytest.mark.crash) for name, saved in (("ppo", 0), ("sac", 16)))],
+)
 def test_killed_again_while_resuming(trials, whole, half_done, folders, name, saved, part):
     before = half_done(name, saved)
     first = next(folders)

@@ -90,7 +90,7 @@ def test_a_signal_while_the_process_starts(tmp_path, number, part):
             with contextlib.suppress(psutil.NoSuchProcess):  # the first one that is asked may take the others along
                 each.send_signal(number)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            _, stderr = process.communicate(timeout=20)
+            _, stderr = process.communicate(timeout=3)
     # Until rlctl's first line runs, Python itself decides.
     assert process.returncode in (CODES[number], -number), stderr
     if process.returncode == CODES[number]:

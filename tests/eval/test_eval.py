@@ -1,5 +1,4 @@
 import json
-import subprocess
 import sys
 
 import numpy as np
@@ -12,6 +11,7 @@ from rlctl.eval.report import as_json
 from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
 from rlctl.rollout.workers import EpisodeResult
 from rlctl.train.request import TrainRequest, run_training
+from tests import fork_server
 from tests.train.conftest import ENVS, SMALL_PPO
 
 
@@ -100,10 +100,10 @@ def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
     assert [each.result.total_reward for each in shaken.episodes] != [
         each.result.total_reward for each in evaluation.episodes
     ]
-    plain = rlctl("eval", reach_run.path, "--episodes", 6)
-    assert "6 episodes, seed 0, not randomised" in plain.stdout
-    randomised = rlctl("eval", reach_run.path, "--episodes", 6, "--set", "randomize=true")
-    assert f"6 episodes, seed 0, randomised by {', '.join(offered)}" in randomised.stdout
+    plain = rlctl("eval", reach_run.path, "--episodes", 2)
+    assert "2 episodes, seed 0, not randomised" in plain.stdout
+    randomised = rlctl("eval", reach_run.path, "--episodes", 2, "--set", "randomize=true")
+    assert f"2 episodes, seed 0, randomised by {', '.join(offered)}" in randomised.stdout
 
 
 def test_stochastic_repeats_with_its_seed(reach_run):
@@ -179,10 +179,11 @@ def test_an_exported_policy_is_evaluated_alike_and_without_torch(reach_run, eval
     export_policy(str(reach_run.path), ["onnx"], checkpoint="best", output=exported)
     code = (
         "import sys; from rlctl.cli import run\n"
-        f"code = run(['eval', {str(exported)!r}, '--task', 'reach', '--episodes', '6', '--json', 'result.json'])\n"
+        f"code = run(['eval', {str(exported)!r}, '--task', 'reach', '--episodes', '6', '--n-envs', '1',"
+        " '--json', 'result.json'])\n"
         "sys.exit(99 if {'torch', 'stable_baselines3'} & set(sys.modules) else code)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    done = fork_server.for_workers().run([sys.executable, "-c", code], cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     alike = json.loads((tmp_path / "result.json").read_text())["episodes"]
     for ours, theirs in zip(alike, as_json(evaluation)["episodes"], strict=True):

@@ -11,7 +11,7 @@ from rlctl.runs.comparison import CompareRequest, compare
 from rlctl.runs.comparison_report import as_json, format_needed
 from rlctl.runs.statistics import Verdict
 from rlctl.train.request import TrainRequest, run_training
-from tests.train.conftest import TINY
+from tests.train.conftest import ENVS, TINY
 
 
 @pytest.fixture(scope="module")
@@ -21,12 +21,12 @@ def root(tmp_path_factory):
     for gamma in (0.9, 0.99):
         for seed in (0, 1):
             settings = merge(TINY, {"seed": seed, "algo_kwargs": {"gamma": gamma}})
-            run_training(TrainRequest("reach", settings=settings, root=root / str(gamma), check=False))
+            run_training(TrainRequest(f"{ENVS}:Line", settings=settings, root=root / str(gamma), check=False))
     return root
 
 
 def test_policies_are_compared_episode_by_episode(root):
-    one, two = sorted((root / "0.9/reach").iterdir())
+    one, two = sorted((root / "0.9/Line").iterdir())
     result = compare(CompareRequest([str(one), str(two)], episodes=5))
     assert not result.of_recipes
     (candidate,) = result.candidates
@@ -40,7 +40,7 @@ def test_policies_are_compared_episode_by_episode(root):
 
 
 def test_recipes_are_compared_seed_by_seed(root):
-    result = compare(CompareRequest([str(root / "0.9/reach"), f"{root}/0.99/reach/*"], episodes=3))
+    result = compare(CompareRequest([str(root / "0.9/Line"), f"{root}/0.99/Line/*"], episodes=3))
     assert result.of_recipes
     (candidate,) = result.candidates
     assert candidate.recipe_changes == {"algo_kwargs.gamma": (0.99, 0.9)}
@@ -62,13 +62,13 @@ def test_runs_of_several_recipes_as_one_are_pointed_out(root):
 
 
 def test_refusals(root, write_run):
-    one, _ = sorted((root / "0.9/reach").iterdir())
+    one, _ = sorted((root / "0.9/Line").iterdir())
     with pytest.raises(UsageError, match="two or more"):
         compare(CompareRequest([str(one)]))
     with pytest.raises(UsageError, match="cannot be compared with itself"):
         compare(CompareRequest([str(one), str(one)]))
     with pytest.raises(UsageError, match="one run beside a group"):
-        compare(CompareRequest([str(one), str(root / "0.99/reach")]))
+        compare(CompareRequest([str(one), str(root / "0.99/Line")]))
     with pytest.raises(ArtifactError, match="no run matches"):
         compare(CompareRequest([str(one), f"{root}/0.5*"]))
     other = write_run("ant/2026-01-01_00-00-00_s0")
@@ -77,7 +77,7 @@ def test_refusals(root, write_run):
 
 
 def test_gate(root):
-    one, two = sorted((root / "0.9/reach").iterdir())
+    one, two = sorted((root / "0.9/Line").iterdir())
     result = compare(CompareRequest([str(one), str(two)], episodes=4))
     swapped = compare(CompareRequest([str(two), str(one)], episodes=4))
     verdicts = {result.candidates[0].verdict, swapped.candidates[0].verdict}

@@ -30,17 +30,18 @@ ON_POLICY = {
     "recurrent_ppo": {"n_steps": 16, "batch_size": 16, "n_epochs": 1},
 }
 OFF_POLICY = {"learning_starts": 8, "buffer_size": 100, "batch_size": 8}
+TINY = {"policy_kwargs": {"net_arch": [8]}}
 CASES = [
     ("ppo", "vector", "box", {}),
     ("ppo", "vector", "box", {"use_sde": True, "policy_kwargs": {"activation_fn": torch.nn.ReLU, "net_arch": [8]}}),
     ("ppo", "dict", "discrete", {"learning_rate": lambda left: 1e-3 * left}),
     ("a2c", "vector", "discrete", {}),
     ("sac", "vector", "box", {"policy_kwargs": {"net_arch": {"pi": [8], "qf": [16]}}}),
-    ("td3", "vector", "box", {}),
-    ("ddpg", "vector", "box", {}),
-    ("dqn", "vector", "discrete", {}),
+    ("td3", "vector", "box", TINY),
+    ("ddpg", "vector", "box", TINY),
+    ("dqn", "vector", "discrete", TINY),
     ("tqc", "vector", "box", {"policy_kwargs": {"n_quantiles": 5, "n_critics": 3, "net_arch": [8]}}),
-    ("crossq", "vector", "box", {}),
+    ("crossq", "vector", "box", TINY),
     ("recurrent_ppo", "vector", "box", {"policy_kwargs": {"lstm_hidden_size": 8}}),
 ]
 
@@ -56,7 +57,7 @@ def save(tmp_path):
         parts = getattr(raw.observation_space, "spaces", {})
         keys = [key for key, space in parts.items() if space.dtype == np.float32] or None
         env = VecNormalize(raw, norm_reward=False, norm_obs_keys=keys)
-        settings = {**ON_POLICY.get(algo, OFF_POLICY), **kwargs}
+        settings = copy.deepcopy({**ON_POLICY.get(algo, OFF_POLICY), **kwargs})  # SB3 writes into policy_kwargs
         model = ALGORITHMS[algo](policy_name(algo, env.observation_space), env, device="cpu", seed=0, **settings)
         model.learn(32)
         model.save(tmp_path / "model.zip")

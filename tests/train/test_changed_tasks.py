@@ -153,6 +153,7 @@ SAC = {
     **TINY,
     "algo": "sac",
     "algo_kwargs": {"learning_starts": 8, "batch_size": 8, "buffer_size": 100, "train_freq": 4},
+    "policy_kwargs": {"net_arch": [16]},
 }
 
 

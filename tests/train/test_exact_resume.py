@@ -14,14 +14,15 @@ from tests.train.conftest import FAULTY, SMALL
 
 ON_POLICY = {"ppo": {"n_steps": 16, "batch_size": 32, "n_epochs": 2}, "a2c": {"n_steps": 16}}
 ON_POLICY["recurrent_ppo"] = ON_POLICY["ppo"]
-OFF_POLICY = {"learning_starts": 40, "batch_size": 16, "buffer_size": 200}
+OFF_POLICY = {"learning_starts": 24, "batch_size": 16, "buffer_size": 200}
+SHORT = {"total_timesteps": 128, "eval": {"episodes": 3, "every_steps": 64}}
 
 
 def settings(algo, **changes):
     if algo in ON_POLICY:
         return recipes.merge({**SMALL, "algo": algo, "algo_kwargs": ON_POLICY[algo]}, changes)
-    network = {"net_arch": [16]}
-    return recipes.merge({**SMALL, "algo": algo, "algo_kwargs": OFF_POLICY, "policy_kwargs": network}, changes)
+    given = {**SMALL, **SHORT, "algo": algo, "algo_kwargs": OFF_POLICY, "policy_kwargs": {"net_arch": [16]}}
+    return recipes.merge(given, changes)
 
 
 SDE = {"algo_kwargs": {"use_sde": True}}
@@ -41,7 +42,7 @@ CASES = {
     "ppo, curriculum": ("Staged", settings("ppo", **STAGES)),
     "ppo, stochastic evaluation": ("Line", settings("ppo", eval={"deterministic": False}, **SDE)),
     "ppo, other observations than declared": (f"{FAULTY}:Outside", settings("ppo")),
-    "ppo, on reach": ("reach", settings("ppo")),
+    "ppo, on reach": ("reach", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
     "a2c": ("Line", settings("a2c")),
     "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
     "sac": ("Line", settings("sac", policy_kwargs={"net_arch": [256, 256]})),
@@ -69,7 +70,7 @@ QUICK = {
 
 @pytest.fixture
 def kill_after(monkeypatch):
-    """End the training in the middle of a step, so many steps after it began."""
+    """End the training in the middle of a step, so many steps of each environment after it began."""
 
     def kill(steps):
         done = 0
@@ -110,11 +111,12 @@ def test_killed_and_resumed(train, resume, kill_after, case):
     undo()
     run = newest_other_than(whole)
     assert [int(each.name) for each in run.checkpoints()] == [0]
-    for steps in (37, 11):
+    for steps in (37, 11) if given["algo"] in ON_POLICY else (13, 5):
         undo = kill_after(steps)
         with pytest.raises(Killed):
             resume(run)
         undo()
+        assert int(run.checkpoints()[-1].name) > 0
     resume(run)
     assert_same_run(whole, run)
 

@@ -107,19 +107,19 @@ def test_kept_episodes_are_the_first_and_the_worst(finished):
     ],
 )
 def test_every_algorithm_trains_resumes_and_loads(train, resume, algo, env):
-    kwargs = {"n_steps": 16} if algo in recipes.ON_POLICY else {"learning_starts": 32, "batch_size": 16}
-    if algo == "ppo":
-        kwargs["batch_size"] = 32
+    kwargs = {"n_steps": 8} if algo in recipes.ON_POLICY else {"learning_starts": 16, "batch_size": 16}
+    if algo in ("ppo", "recurrent_ppo"):
+        kwargs |= {"batch_size": 16, "n_epochs": 2}
     network = {} if env == "Image" else {"policy_kwargs": {"net_arch": [16]}}
-    result = train(env, {**SMALL, "algo": algo, "algo_kwargs": kwargs, "total_timesteps": 128, **network})
-    assert result.steps == 128
-    longer = resume(result, total_timesteps=192)
-    assert longer.steps == 192
+    result = train(env, {**SMALL, "algo": algo, "algo_kwargs": kwargs, "total_timesteps": 64, **network})
+    assert result.steps == 64
+    longer = resume(result, total_timesteps=96)
+    assert longer.steps == 96
     steps = [int(row["steps"]) for row in rows(result.run.evals_file)]
     assert steps == sorted(set(steps))
     policy = load_policy(result.run.last_policy)
     assert policy.info.algo == algo
-    assert policy.info.training_steps == 192
+    assert policy.info.training_steps == 96
     assert policy.action_space.contains(policy.predict(policy.observation_space.sample()))
 
 
