@@ -44,6 +44,8 @@ HASH_SEED = "0"
 """Of all forks: that of check-env's processes but one."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PR_SET_CHILD_SUBREAPER = 36
+_MADV_COLLAPSE = 25
+_HUGE = 2**21  # bytes
 
 
 class ForkedProcess:
@@ -334,6 +336,18 @@ def _run(arguments):
     return 0
 
 
+def _use_huge_pages():
+    """Let this process's memory be a few huge pages: a fork of 40,000 small ones takes three times as long."""
+    madvise = ctypes.CDLL(None).madvise
+    madvise.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        addresses, access, _, _, _, *name = line.split()
+        if "w" in access and name in ([], ["[heap]"]):
+            first, last = (int(each, 16) for each in addresses.split("-"))
+            first = -(-first // _HUGE) * _HUGE
+            madvise(first, max(0, last // _HUGE * _HUGE - first), _MADV_COLLAPSE)  # without effect before Linux 6.1
+
+
 def main(descriptor, commands):
     """Import what the processes need, and serve."""
     for name in FOR_WORKERS + (FOR_COMMANDS if commands else ()):
@@ -345,4 +359,5 @@ def main(descriptor, commands):
             importlib.import_module(module.name)
     gc.collect()
     gc.freeze()
+    _use_huge_pages()
     serve(socket.socket(fileno=descriptor), commands)
