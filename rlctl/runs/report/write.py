@@ -66,10 +66,7 @@ def _values(report: Report, is_html: bool, pictures: bool) -> dict[str, Any]:
         "result": content.summarize_result(report),
         "notes": report.notes,
         "findings": content.collect_findings(report),
-        "runs": [
-            dict(zip(("name", "columns", "rows"), (each.summary.name, *tabulate(each.evaluations)), strict=True))
-            for each in report.runs
-        ],
+        "runs": [(each.summary.name, *tabulate(each.evaluations)) for each in report.runs],
         "robustness": [
             line for each in report.runs if each.robustness is not None for line in describe_robustness(each.robustness)
         ],
