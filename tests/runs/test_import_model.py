@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rlctl.env_spec import EnvChanges, EnvSpec
@@ -21,7 +22,7 @@ from rlctl.run.torch_policy import ALGORITHMS, policy_name
 from rlctl.runs import pickle_data
 from rlctl.runs.import_model import ImportRequest, import_model
 from rlctl.runs.pickle_data import NotPlainData, read_array
-from rlctl.runs.sb3_model import read_model, read_normalization
+from rlctl.runs.sb3_model import read_model, read_normalization, read_space
 
 SMALL = f"{Path(__file__).parent.parent / 'export' / 'envs.py'}:Small"
 ON_POLICY = {
@@ -214,6 +215,24 @@ def test_arrays_of_every_protocol(protocol, value):
 def test_damaged_pickles_are_refused(content):
     with pytest.raises(NotPlainData):
         pickle_data.read(content)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(-2.0, np.array([1.0, 3.0], np.float32), (2,)),
+        spaces.Discrete(4),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.Dict({"a": spaces.Box(0, 255, (2, 2), np.uint8), "b": spaces.Discrete(2)}),
+    ],
+    ids=lambda space: type(space).__name__,
+)
+def test_spaces_of_the_old_gym_and_of_an_older_numpy(space):
+    space.seed(0)  # its generator, which is in the pickle too, is not looked at
+    content = pickle.dumps(space, 2)  # names of this protocol are plain text
+    old = content.replace(b"gymnasium.spaces", b"gym.spaces").replace(b"numpy._core", b"numpy.core")
+    assert old != content
+    assert read_space(pickle_data.read(old)) == space
 
 
 def test_objects_are_data():
