@@ -20,12 +20,14 @@ def write_run(folder: Path, task: str) -> RunDirectory:
     spec = EnvSpec(task)
     env = spec.make()
     try:
-        info, tensors = linear(describe(env), np.zeros((env.action_space.shape[0], env.observation_space.shape[0])))
+        info, tensors = linear(
+            describe(env), np.zeros((env.action_space.shape[0], env.observation_space.shape[0])), 0.0
+        )
     finally:
         env.close()
     run = RunDirectory(folder)
     run.best_policy.parent.mkdir(parents=True)
-    run.status_file.write_text(json.dumps({"task": task, "status": "done", "algo": "ppo", "seed": 0}))
+    run.status_file.write_text(json.dumps({"task": task, "status": "finished", "algo": "ppo", "seed": 0}))
     save_policy(run.best_policy, info.model_copy(update={"spec": spec}), tensors)
     return run
 
