@@ -59,7 +59,7 @@ def evaluate(
     `task` (its parameters), `reward_weights`, `randomize`, `events`.
     """
     from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
-    from rlctl.run.recipe import check_changes
+    from rlctl.run.recipe_sources import check_changes
 
     request = EvalRequest(
         run=None if run is None else str(run),

@@ -12,7 +12,7 @@ from rlctl.export.policy_file import export_actor
 from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo, read_info, read_policy, save_policy
-from rlctl.run.recipe import resolve_packaged
+from rlctl.run.recipe_sources import resolve_packaged
 from rlctl.run.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
 
 OURS = [name for name in list_shipped() if registry.find(name).distribution == "rlctl"]

@@ -100,9 +100,9 @@ def _normalizes(task: str) -> bool | None:
     """Say whether the recipe that comes with a task normalises observations."""
     if registry.find_recipe_file(task) is None:
         return None
-    from rlctl.run import recipe  # takes a quarter of a second
+    from rlctl.run import recipe_sources  # takes a quarter of a second
 
-    normalize = recipe.resolve(task, None, {}).normalize
+    normalize = recipe_sources.resolve(task, None, {}).normalize
     return normalize is not None and normalize.observation
 
 

@@ -75,6 +75,6 @@ def parse_changes(settings: list[str]) -> EnvChanges:
 
     if not settings:
         return UNCHANGED
-    from rlctl.run.recipe import parse_changes  # takes a quarter of a second
+    from rlctl.run.recipe_sources import parse_changes  # takes a quarter of a second
 
     return parse_changes(settings)

@@ -81,7 +81,7 @@ def train(
     """Train a policy, evaluate as it goes, and keep the best and the last."""
     claim_stdout()
     from rlctl.run.directory import is_group
-    from rlctl.run.recipe import merge_flags
+    from rlctl.run.recipe_sources import merge_flags
     from rlctl.train.request import TrainRequest, run_training
     from rlctl.train.summary import show
 

@@ -10,7 +10,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.rollout.baselines import BASELINES, SERVER, load_function
 from rlctl.rollout.workers import Workers
-from rlctl.run.recipe import resolve_packaged
+from rlctl.run.recipe_sources import resolve_packaged
 
 if TYPE_CHECKING:
     from rlctl.eval.evaluate import EvalRequest

@@ -108,7 +108,8 @@ class RunDirectory:
 
     def recipe(self) -> Recipe:
         """Read the resolved recipe; raises `ArtifactError` if it is not the one that the training began with."""
-        from rlctl.run.recipe import read, validate
+        from rlctl.run.recipe import validate
+        from rlctl.run.recipe_sources import read
 
         content = read(self.recipe_file)
         if not files.is_as_sealed(self.recipe_file):

@@ -14,6 +14,7 @@ from rlctl.check_env.leaves import Leaf, find_leaves
 from rlctl.errors import TaskError
 from rlctl.plugin_code import call_plugin
 from rlctl.run import recipe as recipes
+from rlctl.run import recipe_sources
 from rlctl.run.policy import PolicyInfo, read_info
 from rlctl.tasks import parameters
 from rlctl.tasks.definition import Definition, describe_definition
@@ -76,7 +77,7 @@ def describe(task: str) -> Description:
     Raises `UsageError` for a name that stands for nothing, `TaskError` for a task that cannot be built.
     """
     constructor: Any = registry.load(task)
-    recipe = recipes.resolve_packaged(task)
+    recipe = recipe_sources.resolve_packaged(task)
     # The last stage is what is wanted. The parts of stacked observations have no names.
     spec = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1, time_feature=False)
     env = spec.make()

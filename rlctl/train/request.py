@@ -18,7 +18,7 @@ from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.recipe import describe_rounding, resolve
+from rlctl.run.recipe_sources import describe_rounding, resolve
 from rlctl.train import status
 from rlctl.train.display import Display, make_display
 from rlctl.train.precheck import Precheck

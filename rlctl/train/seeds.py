@@ -23,7 +23,7 @@ from rlctl.rollout.process_start import Process, default_start
 from rlctl.rollout.workers import available_cores
 from rlctl.run import files
 from rlctl.run.group import Group, create_group, parse_seeds, read_group
-from rlctl.run.recipe import resolve
+from rlctl.run.recipe_sources import resolve
 from rlctl.train.process_state import preserve_process_state
 from rlctl.train.request import TrainRequest
 from rlctl.train.warm_start import find_source

@@ -66,7 +66,7 @@ def _off_policy(algo: str, repeat: int) -> Row:
 def shipped_settings(task: str) -> dict[str, Any]:
     """Return the recipe that comes with a task, as it is written."""
     from rlctl import registry
-    from rlctl.run.recipe import read
+    from rlctl.run.recipe_sources import read
 
     file = registry.find_recipe_file(task)
     assert file is not None

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rlctl.run import recipe
+from rlctl.run import recipe_sources
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
@@ -163,7 +163,7 @@ def dynamics(body):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_packaged_recipe(name):
-    packaged = recipe.resolve(name, None, {})
+    packaged = recipe_sources.resolve(name, None, {})
     assert packaged.algo == "ppo"
     assert packaged.n_envs * packaged.algo_kwargs["n_steps"] % packaged.algo_kwargs["batch_size"] == 0
 

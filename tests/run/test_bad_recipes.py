@@ -3,7 +3,7 @@
 import pytest
 
 from rlctl.errors import RecipeError, UsageError
-from rlctl.run.recipe import parse_settings, resolve
+from rlctl.run.recipe_sources import parse_settings, resolve
 from rlctl.train.request import TrainRequest, run_training
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(

@@ -6,8 +6,9 @@ import pytest
 
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, RecipeError
-from rlctl.run import recipe
-from rlctl.run.recipe import Recipe, parse_changes, parse_settings, resolve, validate
+from rlctl.run import recipe, recipe_sources
+from rlctl.run.recipe import Recipe, validate
+from rlctl.run.recipe_sources import parse_changes, parse_settings, resolve
 
 
 @pytest.fixture
@@ -157,7 +158,7 @@ def test_what_can_be(kwargs):
 
 
 def test_numbers_of_the_command_line():
-    values = recipe.merge_flags(["n_envs=4", "seed=1"], seed=7, total_timesteps="1e6", algo=None)
+    values = recipe_sources.merge_flags(["n_envs=4", "seed=1"], seed=7, total_timesteps="1e6", algo=None)
     assert values == {"n_envs": 4, "seed": 7, "total_timesteps": 1e6}
     assert validate(values, "recipe").total_timesteps == 1_000_000
 

@@ -5,7 +5,8 @@ import pytest
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError
 from rlctl.run import yaml_text
-from rlctl.run.recipe import resolve, validate
+from rlctl.run.recipe import validate
+from rlctl.run.recipe_sources import resolve
 
 RULE = {"success": 0.8, "window": 100}
 

@@ -10,6 +10,7 @@ import pytest
 from rlctl.errors import RecipeError, TaskError
 from rlctl.rollout.workers import Workers
 from rlctl.run import recipe as recipes
+from rlctl.run import recipe_sources
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.policy import load_policy
 from rlctl.train import checkpoint
@@ -39,7 +40,7 @@ def build():
     started = []
 
     def model(env: str, **settings):
-        recipe = recipes.fill_defaults(recipes.validate({**SMALL_HER, **settings}, "test"))
+        recipe = recipe_sources.fill_defaults(recipes.validate({**SMALL_HER, **settings}, "test"))
         started.append(Workers(recipe.env_specs(env if ":" in env else f"{ENVS}:{env}")[0], recipe.n_envs))
         return build_model(recipe, WorkerVecEnv(started[-1], recipe.seed), "cpu")
 
@@ -132,7 +133,7 @@ def test_an_episode_that_ended_with_its_stage_is_over(build):
 
 
 def test_learning_starts_by_which_every_first_episode_is_over():
-    recipe = recipes.fill_defaults(recipes.validate({"algo": "sac", "her": {}, "n_envs": 4}, "test"))
+    recipe = recipe_sources.fill_defaults(recipes.validate({"algo": "sac", "her": {}, "n_envs": 4}, "test"))
     assert replay_arguments(recipe, recipe.her, goals(max_steps=50))["learning_starts"] == 200
     assert replay_arguments(recipe, recipe.her, goals(max_steps=10))["learning_starts"] == 100  # SB3's own
     assert replay_arguments(recipe, recipe.her, goals(max_steps=None))["learning_starts"] == 100
@@ -220,7 +221,7 @@ def test_it_is_refused_before_there_is_a_run(train, tmp_path):
 def test_recipes_that_do_not_go_together_with_it(settings, message):
     recipe = recipes.validate({"algo": "sac", "her": {}, "n_envs": 4, **settings}, "test")
     with pytest.raises(RecipeError) as caught:
-        replay_arguments(recipes.fill_defaults(recipe), recipe.her, goals(max_steps=50))
+        replay_arguments(recipe_sources.fill_defaults(recipe), recipe.her, goals(max_steps=50))
     assert str(caught.value) == message
     assert caught.value.exit_code == 2
 

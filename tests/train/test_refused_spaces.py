@@ -5,7 +5,8 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.errors import RecipeError
-from rlctl.run.recipe import Recipe, describe_rounding, fill_defaults
+from rlctl.run.recipe import Recipe
+from rlctl.run.recipe_sources import describe_rounding, fill_defaults
 from rlctl.train.algorithms import check_spaces
 from rlctl.train.process_state import preserve_process_state
 

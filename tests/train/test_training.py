@@ -8,6 +8,7 @@ import pytest
 
 from rlctl.errors import DivergedError, RecipeError, TaskError, UsageError
 from rlctl.run import recipe as recipes
+from rlctl.run import recipe_sources
 from rlctl.run.acting import PolicyPlayer
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
@@ -247,7 +248,7 @@ def test_task_and_resume_exclude_each_other():
 
 
 def test_defaults_for_an_environment_without_a_recipe():
-    resolved = recipes.resolve(f"{ENVS}:Line", None, {})
+    resolved = recipe_sources.resolve(f"{ENVS}:Line", None, {})
     assert resolved.algo == "ppo"
     assert resolved.n_envs == 8
     assert 2048 <= resolved.n_envs * resolved.algo_kwargs["n_steps"] <= 16384

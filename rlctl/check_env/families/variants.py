@@ -52,7 +52,7 @@ def _find_stages(name: str, task: Any) -> Sequence[Any]:
     file = registry.find_recipe_file(name)
     stages = task.stages
     if file is not None and "stages" in file.read_text(encoding="utf-8", errors="replace"):
-        from rlctl.run.recipe import read  # pydantic's models take a quarter of a second to load
+        from rlctl.run.recipe_sources import read  # pydantic's models take a quarter of a second to load
 
         stages = read(file).get("stages", stages)
     return stages if isinstance(stages, list | tuple) else ()  # another type is refused with the recipe

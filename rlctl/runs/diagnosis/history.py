@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import RlctlError
-from rlctl.run import recipe as recipes
+from rlctl.run import recipe_sources
 from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.episode import RecordedEpisode, load_episode
@@ -80,7 +80,7 @@ class History:
     @functools.cached_property
     def recipe(self) -> Mapping[str, Any]:
         try:
-            return recipes.read(self._run.recipe_file)
+            return recipe_sources.read(self._run.recipe_file)
         except (RlctlError, OSError):
             return {}
 
