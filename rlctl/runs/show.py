@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rlctl import output
+from rlctl.errors import ArtifactError
 from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
 from rlctl.run.memory import format_bytes
@@ -39,15 +40,20 @@ class RunDescription:
 
 def describe(run: RunDirectory) -> RunDescription:
     """Read a run; raises `ArtifactError` if it is damaged."""
-    status, file = run.status(), run.robustness_file
+    status, measured, warnings = run.status(), None, []
+    if run.robustness_file.is_file():
+        try:
+            measured = robustness.read(run.robustness_file)
+        except ArtifactError as error:
+            warnings.append(str(error))
     return RunDescription(
         run=run,
         summary=summarize(run.path),
         metrics=read_table(run.metrics_file),
         evaluations=read_table(run.evals_file),
         findings=diagnose(run),
-        warnings=list(_list_warnings(status)),
-        robustness=robustness.read(file) if file.is_file() else None,
+        warnings=[*_list_warnings(status), *warnings],
+        robustness=measured,
     )
 
 

@@ -10,6 +10,7 @@ from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.eval.report import as_json
 from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
 from rlctl.rollout.workers import EpisodeResult
+from rlctl.runs.summary import read_table
 from rlctl.train.request import TrainRequest, run_training
 from tests import fork_server
 from tests.train.conftest import ENVS, SMALL_PPO
@@ -66,6 +67,10 @@ def test_an_episode_does_not_depend_on_what_runs_beside_it(reach_run, evaluation
         episode.result.total_reward for episode in evaluation.episodes
     ]
     assert len({episode.seed for episode in evaluation.episodes}) == 6
+
+
+def test_evaluations_of_a_training_say_how_far_bodies_overlap(reach_run):
+    assert {row["overlap"] for row in read_table(reach_run.evals_file)} == {0.0}  # the arm touches nothing
 
 
 def test_terms_add_up_to_the_return(evaluation):
