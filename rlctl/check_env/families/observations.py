@@ -90,70 +90,55 @@ def _has_wrong_dtype(leaf: Leaf, form: Form) -> bool:
 @check("RL103")
 def find_out_of_range(records: Records) -> Iterator[Finding]:
     """Find the observation that is farthest outside its bounds, per leaf."""
-    for index, leaf in enumerate(records.require_built().leaves):
-        if not leaf.supported:
+    built = records.require_built()
+    for index, leaf in enumerate(built.leaves):
+        recorded = [(*each, _excess(leaf, each[1].values)) for each in records.series(index) if leaf.supported]
+        if not any(excess.any() for *_, excess in recorded):
             continue
-        worst: tuple[float, Trajectory, Series, int, int] | None = None
-        outside = inner = total = 0
-        from_reset = False
-        for trajectory, series in records.series(index):
-            excess = _excess(leaf, series.values).reshape(len(series.values), -1)
-            rows = excess.max(axis=1, initial=0.0)
-            is_last = (series.steps == trajectory.steps) & trajectory.has_ended
-            outside, total = outside + int((rows > 0).sum()), total + len(rows)
-            inner += int((rows[~is_last] > 0).sum())
-            from_reset |= bool((rows[series.steps == 0] > 0).any())
-            if rows.size and rows.max() > (worst[0] if worst else 0.0):
-                row = int(rows.argmax())
-                worst = float(rows[row]), trajectory, series, row, int(excess[row].argmax())
-        if worst is not None:
-            is_large = from_reset or inner >= LARGE_SHARE * total
-            rare = Severity.WARNING if inner >= SMALL_SHARE * total else Severity.INFO
-            severity = Severity.ERROR if is_large else rare
-            yield _out_of_range(records, index, *worst[1:], outside=(outside, total), severity=severity)
+        trajectory, series, excess = max(recorded, key=lambda each: float(each[2].max(initial=0.0)))
+        row, flat = divmod(int(excess.argmax()), excess.shape[1])
+        step, value = int(series.steps[row]), float(series.values[row].flat[flat])
+        low, high = (float(np.ravel(np.asarray(bound))[flat]) for bound in (leaf.low, leaf.high))
+        bound = low if value < low else high
+        is_rounding = np.dtype(leaf.dtype).kind == "f" and abs(value - bound) <= ROUNDING * max(abs(bound), 1e-3)
+        outside = np.concatenate([each.any(axis=1) for *_, each in recorded])
+        count, total = int(outside.sum()), len(outside)
+        element = built.element(index, flat)
+        yield Finding(
+            "RL103",
+            f"{element} is {value:.9g} {_when(step)}; the space allows [{low:.9g}, {high:.9g}]"
+            f"{' (float rounding)' if is_rounding else ''}; {count} of {total} observations are outside",
+            trajectory.at(
+                step,
+                element=element,
+                value=value,
+                expected=[low, high],
+                observations_outside=count,
+                observations=total,
+            ),
+            Severity.WARNING if is_rounding else _severity_of_outside(recorded, outside),
+        )
+
+
+def _severity_of_outside(
+    recorded: list[tuple[Trajectory, Series, NDArray[np.float64]]], outside: NDArray[np.bool_]
+) -> Severity:
+    """Return how bad it is that some observations are outside. Shape of `outside`: all that were recorded."""
+    is_first = np.concatenate([series.steps == 0 for _, series, _ in recorded])
+    is_last = np.concatenate([(series.steps == each.steps) & each.has_ended for each, series, _ in recorded])
+    share = float((outside & ~is_last).mean())
+    if share >= LARGE_SHARE or (outside & is_first).any():
+        return Severity.ERROR
+    return Severity.WARNING if share >= SMALL_SHARE else Severity.INFO
 
 
 def _excess(leaf: Leaf, values: NDArray[Any]) -> NDArray[np.float64]:
-    """How far values are outside their bounds; 0 inside, and for NaN, which is another rule's."""
+    """How far values are outside their bounds; 0 inside, and for NaN, which is another rule's. Shape: (n, elements)."""
     low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
     wide = values.astype(np.float64)
     with np.errstate(invalid="ignore"):
         excess = np.maximum(np.maximum(low - wide, wide - high), 0.0)
-    return np.where(np.isfinite(wide), excess, 0.0)
-
-
-def _out_of_range(
-    records: Records,
-    index: int,
-    trajectory: Trajectory,
-    series: Series,
-    row: int,
-    flat: int,
-    *,
-    outside: tuple[int, int],
-    severity: Severity,
-) -> Finding:
-    built = records.require_built()
-    leaf, step = built.leaves[index], int(series.steps[row])
-    value = float(series.values[row].flat[flat])
-    low, high = (float(np.ravel(np.asarray(bound))[flat]) for bound in (leaf.low, leaf.high))
-    bound = low if value < low else high
-    is_rounding = np.dtype(leaf.dtype).kind == "f" and abs(value - bound) <= ROUNDING * max(abs(bound), 1e-3)
-    element = built.element(index, flat)
-    return Finding(
-        "RL103",
-        f"{element} is {value:.9g} {_when(step)}; the space allows [{low:.9g}, {high:.9g}]"
-        f"{' (float rounding)' if is_rounding else ''}; {outside[0]} of {outside[1]} observations are outside",
-        trajectory.at(
-            step,
-            element=element,
-            value=value,
-            expected=[low, high],
-            observations_outside=outside[0],
-            observations=outside[1],
-        ),
-        Severity.WARNING if is_rounding else severity,
-    )
+    return np.where(np.isfinite(wide), excess, 0.0).reshape(len(values), -1)
 
 
 @check("RL104")
