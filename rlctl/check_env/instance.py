@@ -106,27 +106,18 @@ class Context:
         """What the experiment that is running may use."""
         self._instance: Instance | None = None
 
-    def make(self, render_mode: RenderMode | None = None) -> Any:
-        """Return a new environment; whatever the environment raises is an `RlctlError`."""
-        # Loaded before it is built, to distinguish an import error from a constructor's.
-        self.progress.enter("load")
-        registry.load(self.spec.task)
-        self.progress.enter("build")
-        env = self.spec.make(render_mode)
-        self.progress.leave()
-        return env
-
     def build(self, render_mode: RenderMode | None = None) -> Instance:
-        """Return a new instance; what its constructor raises is an `EnvironmentRaised`."""
+        """Return a new instance; what its import or constructor raises is an `EnvironmentRaised`."""
         try:
-            return Instance(self.make(render_mode), self.progress)
+            # Loaded before it is built, to distinguish an import error from a constructor's.
+            self.progress.enter("load")
+            registry.load(self.spec.task)
+            self.progress.enter("build")
+            env = self.spec.make(render_mode)
+            self.progress.leave()
+            return Instance(env, self.progress)
         except BaseException as error:
             raise EnvironmentRaised("build") from error
-
-    def build_first(self) -> Instance:
-        """Build the instance that this process keeps; raises what the constructor raises."""
-        self._instance = Instance(self.make(), self.progress)
-        return self._instance
 
     @property
     def instance(self) -> Instance:

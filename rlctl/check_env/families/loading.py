@@ -10,7 +10,7 @@ from typing import Any
 from rlctl import registry
 from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.experiment import RECORDING, check, experiment
-from rlctl.check_env.failures import find_missing_file, iterate_causes, lacks_display
+from rlctl.check_env.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
 from rlctl.check_env.finding import Finding
 from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.messages import Built, Message
@@ -31,10 +31,12 @@ WAIVERS = "rlctl_ignore"
 def build(context: Context) -> Iterator[Message]:
     """Build the first instance, which the process keeps. Raises `UsageError` for a name that does not exist."""
     try:
-        instance = context.build_first()
-    except RlctlError as error:
-        if isinstance(error, UsageError) and not isinstance(error, NoSuchClassError | OldGymError):
-            raise
+        instance = context.instance
+    except EnvironmentRaised as raised:
+        error = raised.__cause__ or raised
+        is_mistake = isinstance(error, UsageError) and not isinstance(error, NoSuchClassError | OldGymError)
+        if is_mistake or not isinstance(error, RlctlError):
+            raise error from None  # a name that does not exist, or a bug
         yield _explain(context, error)
         return
     yield describe_built(instance)
