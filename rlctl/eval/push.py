@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.rollout.workers import EpisodeResult
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.robustness import Interval, Outcome, PushLevel, PushTest
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.rollout.collect import Episode
-from rlctl.rollout.workers import EpisodeResult
+from rlctl.rollout.messages import EpisodeResult
 
 
 @dataclasses.dataclass(frozen=True)

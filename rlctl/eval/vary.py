@@ -19,8 +19,9 @@ from rlctl.eval.evaluate import EvalRequest, Gates, LoadedPolicy, choose_specs, 
 from rlctl.eval.statistics import mean_interval, mean_return, success_interval, success_rate
 from rlctl.registry import is_task
 from rlctl.rollout.collect import play_episodes
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.rollout.workers import Workers
 from rlctl.run import lookup, robustness
 from rlctl.run.acting import Exploration
 from rlctl.run.policy import collect_versions

@@ -10,8 +10,9 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.eval.evaluate import LoadedPolicy
 from rlctl.rollout.collect import play_episodes
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import EpisodeResult, Workers, available_cores
+from rlctl.rollout.workers import Workers, available_cores
 
 
 @dataclasses.dataclass(frozen=True)

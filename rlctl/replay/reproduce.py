@@ -57,13 +57,8 @@ def replay_failed(episode: RecordedEpisode) -> None:
     Raises the `TaskError` that it failed with if it fails again.
     """
     with Workers(episode.info.spec, 1) as workers:
-        check_actions(episode, workers.arrays.action.shape[1:])
-        workers.arrays.next_seed[:] = -1
-        workers.reset({0: episode.info.seed})
-        for action in episode.actions:
-            workers.arrays.action[0] = action
-            if workers.step():
-                return
+        check_actions(episode, workers.info.spaces()[1].shape or ())
+        workers.replay_actions({0: (episode.info.seed, episode.actions)})
 
 
 def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verification]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from rlctl.dict_spaces import Observations, join
 from rlctl.errors import EpisodeFailed
-from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.rollout.messages import EpisodeResult, Play, Segment
+from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
 
 _CONTACTS_MEASURED = 10
@@ -60,6 +61,9 @@ def play_episodes(
     second; it may raise to leave, and the workers have to be closed then.
     """
     steps = min(workers.info.max_steps or _SEGMENT, _SEGMENT)
+    terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms
+    segment = Segment(steps, exploration, until_end=True, record=terms)
+    measured = dataclasses.replace(segment, contacts=terms)
     waiting = list(enumerate(seeds))[::-1]
     running: dict[int, _Recorder] = {}
     episodes: dict[int, Episode] = {}
@@ -71,9 +75,8 @@ def play_episodes(
             play(env, seed)
 
     def play(env: int, seed: int) -> None:
-        terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms
-        contacts = terms and running[env].index < _CONTACTS_MEASURED
-        workers.start_playing({env: seed}, steps, exploration, until_end=True, record=terms, contacts=contacts)
+        is_measured = running[env].index < _CONTACTS_MEASURED
+        workers.start_playing(Play(measured if is_measured else segment, {env: seed}))
 
     for env in workers.first_envs:
         begin(env)

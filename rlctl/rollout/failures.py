@@ -1,10 +1,18 @@
-"""What a worker reports of an environment that failed."""
+"""An environment that failed: what its worker reports, and the error that the main process makes of it."""
 
 from __future__ import annotations
 
-from typing import Any
-
-from rlctl.errors import RlctlError, describe_exception, format_plugin_traceback
+from rlctl import errors
+from rlctl.errors import (
+    DivergedError,
+    EpisodeFailed,
+    PolicyError,
+    RlctlError,
+    TaskError,
+    describe_exception,
+    format_plugin_traceback,
+)
+from rlctl.rollout.messages import Failure
 from rlctl.rollout.returned_values import InvalidReturn
 
 
@@ -13,19 +21,40 @@ class FailedInEpisode(Exception):
 
     def __init__(self, env: int, seed: int, step: int) -> None:
         super().__init__()
-        self.where = {"env": env, "seed": seed, "step": step}
+        self.where = env, seed, step
 
     def __str__(self) -> str:
         cause = "" if self.__cause__ is None else f"{describe_exception(self.__cause__)} "
-        return "{}in environment {env}, episode seed {seed}, step {step},".format(cause, **self.where)
+        return "{}in environment {}, episode seed {}, step {},".format(cause, *self.where)
 
 
-def encode_error(error: BaseException) -> dict[str, Any]:
-    """Return what was raised, and where, as plain data for `Workers`."""
-    where: dict[str, int] = {}
+def describe_failure(error: BaseException) -> Failure:
+    """Return what was raised, and where, as plain data."""
+    where: tuple[int, int, int] | None = None
     if isinstance(error, FailedInEpisode):
         where, error = error.where, error.__cause__ or error
     if isinstance(error, RlctlError):
-        return {"message": str(error), "kind": type(error).__name__, "traceback": error.details, **where}
+        return Failure(str(error), type(error).__name__, error.details, where)
     text = f"ValueError: {error}" if isinstance(error, InvalidReturn) else describe_exception(error)
-    return {"message": text, "kind": None, "traceback": format_plugin_traceback(error) or None, **where}
+    return Failure(text, "", format_plugin_traceback(error) or None, where)
+
+
+def make_error(failure: Failure, task: str) -> RlctlError:
+    """Return the error of a failure, which names the task, and the episode if it was raised in one."""
+    message, details = failure.message, failure.details
+    kind = getattr(errors, failure.kind) if failure.kind else TaskError
+    if kind is TaskError and task not in message.partition("\n")[0]:
+        message = f"task {task!r}: {message}"
+    if failure.where is not None:
+        failed = EpisodeFailed(message, *failure.where, hint=format_hint(task), details=details)
+        if kind is TaskError:
+            return failed
+        # What the policy has done wrong, check-env does not show.
+        message = str(failed).rpartition("; ")[0] if kind in (DivergedError, PolicyError) else str(failed)
+    result: RlctlError = kind(message, details=details)
+    return result
+
+
+def format_hint(task: str) -> str:
+    """Return what to type to look at an environment without a training."""
+    return f"to see it alone: rlctl check-env {task}"

@@ -25,7 +25,7 @@ class ActionHistory:
     def of_episodes(cls, episodes: Sequence[NDArray[Any]], row: NDArray[Any]) -> ActionHistory:
         """Return the history after the actions of `episodes`, shape (steps, ...) each.
 
-        `row` is what `add` is given: an array with the actions of all environments in a step.
+        `row` is an array with the actions of all environments in a step.
         """
         history = cls(len(episodes))
         longest = max(len(actions) for actions in episodes)
@@ -36,12 +36,6 @@ class ActionHistory:
         history._rows.extend(rows)
         return history
 
-    def add(self, actions: NDArray[Any]) -> None:
-        """Store the actions of all environments in a step; shape (n_envs, ...)."""
-        self._rows.append(actions.copy())
-        if len(self._rows) * actions.nbytes > MAX_BYTES:
-            self._drop(self._first + 1)
-
     def add_segment(self, actions: NDArray[Any], ended: Iterable[tuple[int, int]]) -> None:
         """Store a segment, shape (n_envs, steps, ...), in which episodes ended: (environment, row) each."""
         first = self._first + len(self._rows)
@@ -50,11 +44,6 @@ class ActionHistory:
             self._began[env] = first + row + 1
         if excess := max(0, len(self._rows) * actions[:, 0].nbytes - MAX_BYTES):
             self._drop(self._first + -(-excess // actions[:, 0].nbytes))
-        self._drop(int(self._began.min()))
-
-    def begin(self, envs: Iterable[int]) -> None:
-        """Begin episodes in some environments with the next step."""
-        self._began[list(envs)] = self._first + len(self._rows)
         self._drop(int(self._began.min()))
 
     def _drop(self, first: int) -> None:

@@ -1,24 +1,46 @@
-"""What the main process asks of a worker: each request a named message, sent as JSON."""
+"""What the main process asks of a worker, each request a named message, and what it answers; sent as JSON."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, get_args
+
+import pydantic
+
+from rlctl.env_spec import EnvSpec
+from rlctl.run.acting import Exploration
+from rlctl.run.env_info import EnvInfo
+from rlctl.run.policy import PolicyInfo
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What a worker is for: `count` of `total` environments, from number `first` on."""
+
+    memory: int
+    """Descriptor of the file of the shared arrays."""
+    numbers: int
+    """Descriptor of the file of a policy's numbers."""
+    first: int
+    count: int
+    total: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Build:
-    """Close the environments and build those of another spec."""
+    """Close the environments, if there are any, and build those of a spec."""
 
-    spec: dict[str, Any]
+    spec: EnvSpec
 
 
 @dataclasses.dataclass(frozen=True)
 class SetEvents:
     """Let the events of another spec act, which differs in nothing else."""
 
-    spec: dict[str, Any]
+    spec: EnvSpec
     push: dict[str, Any] | None = None
     """Parameters of `rlctl.task.events.push` and `every_s`: a push that the task does not offer."""
 
@@ -31,36 +53,21 @@ class Attach:
 
 
 @dataclasses.dataclass(frozen=True)
-class Reset:
-    """Begin episodes: pairs of environment and seed; a negative seed lets the environment rest."""
+class BeginEpisodes:
+    """Begin episodes, and take the steps of the actions that follow as bytes."""
 
-    seeds: list[list[int]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Step:
-    """Step every active environment with its row of `arrays.action`."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ReplayActions:
-    """Begin episodes and take the steps of the actions that follow as bytes: (environment, seed, steps) each."""
-
-    episodes: list[list[int]]
-
-
-@dataclasses.dataclass(frozen=True)
-class ComputeRewards:
-    """Compute the rewards of the goals that follow as bytes."""
+    episodes: list[tuple[int, int, int]]
+    """Environment, seed and number of actions of each."""
+    may_fail: bool = False
+    """Whether an episode that fails is only reported, as one that ended."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LoadPolicy:
     """Act with a policy from now on: one whose numbers are in shared memory, or another one by its name."""
 
-    info: dict[str, Any] | None = None
-    """A `PolicyInfo`."""
-    layout: list[Any] = dataclasses.field(default_factory=list)
+    info: PolicyInfo | None = None
+    layout: list[tuple[str, list[int], str]] = dataclasses.field(default_factory=list)
     """Name, shape and dtype of each array of numbers."""
     other: str = ""
     """An exported file, or a baseline; see `baselines.make_player`."""
@@ -75,38 +82,114 @@ class LimitActions:
 
 
 @dataclasses.dataclass(frozen=True)
-class Play:
-    """Play up to `steps` steps in some environments, one after the other."""
+class Segment:
+    """How a segment is played."""
 
-    envs: list[int]
-    begin: list[int]
-    """Seed of the episode to begin with, per environment; negative: the running one goes on."""
     steps: int
-    exploration: dict[str, Any]
-    until_end: bool
+    """Steps of each environment, at most."""
+    exploration: Exploration = dataclasses.field(default_factory=Exploration)
+    until_end: bool = False
     """Whether to stop where an episode ends."""
-    record: bool
+    record: bool = False
     """Whether to write reward terms."""
-    run_seed: int = 0
-    episodes_started: list[int] = dataclasses.field(default_factory=list)
-    """Per environment the number of the training episode that begins where one ends; empty: none begins."""
     contacts: bool = False
-    """Whether to measure, after every step, how far bodies overlap."""
+    """Whether to measure, after every step, how far bodies of a task overlap."""
 
 
-Message = Build | SetEvents | Attach | Reset | Step | ReplayActions | ComputeRewards | LoadPolicy | LimitActions | Play
-_TYPES: dict[str, type[Message]] = {
-    each.__name__: each
-    for each in (Build, SetEvents, Attach, Reset, Step, ReplayActions, ComputeRewards, LoadPolicy, LimitActions, Play)
-}
+@dataclasses.dataclass(frozen=True)
+class Play:
+    """Play a segment in some environments, one after the other."""
+
+    segment: Segment
+    begin: dict[int, int]
+    """Per environment the seed of the episode to begin with; negative: the running one goes on."""
+    next_episodes: dict[int, int] = dataclasses.field(default_factory=dict)
+    """Per environment the number of the training episode that begins where one ends; empty: none begins."""
+    run_seed: int = 0
 
 
-def encode(message: Message) -> bytes:
+@dataclasses.dataclass(frozen=True)
+class ComputeRewards:
+    """Compute the rewards of the goals that follow as bytes."""
+
+
+Message = Build | SetEvents | Attach | BeginEpisodes | LoadPolicy | LimitActions | Play | ComputeRewards
+_MESSAGES: dict[str, Any] = {each.__name__: each for each in get_args(Message)}
+FOLLOWED_BY_BYTES = (BeginEpisodes, ComputeRewards)
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeResult:
+    """How an episode ended. `terms` are sums over the episode, weighted: they add up to the return."""
+
+    env: int
+    seed: int
+    total_reward: float
+    length: int
+    success: bool | None
+    terms: dict[str, float]
+    final_distance: float | None
+    row: int = dataclasses.field(default=-1, compare=False)
+    """The row of the segment in which it ended."""
+    report: dict[str, Any] = dataclasses.field(default_factory=dict, compare=False)
+    """What the player has to say of it; see `acting.Player.report`."""
+    deepest_contact: float | None = None
+    """How far two bodies overlapped at most [m]; None where it was not measured."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """An exception in a worker."""
+
+    message: str
+    kind: str = ""
+    """Name of its class, if it is one of `rlctl.errors`."""
+    details: str | None = None
+    """The traceback of somebody else's code."""
+    where: tuple[int, int, int] | None = None
+    """Environment, episode seed and step, where it was raised in an episode."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """What a worker answers to a message; each fills in what is asked."""
+
+    ended: list[EpisodeResult] = dataclasses.field(default_factory=list)
+    """Episodes that ended while a segment was played."""
+    left: list[int] = dataclasses.field(default_factory=list)
+    """Environments that are not in the episode that they were to begin: it ended, or failed, on the way."""
+    info: EnvInfo | None = None
+    """What the environments are, where that has changed."""
+    rewards: list[float] = dataclasses.field(default_factory=list)
+    failure: Failure | None = None
+
+
+def encode(message: Message | Answer) -> bytes:
     """Return a message as JSON."""
-    return json.dumps({"message": type(message).__name__, **dataclasses.asdict(message)}).encode()
+    return json.dumps({"message": type(message).__name__, **vars(message)}, default=_to_plain).encode()
+
+
+def _to_plain(value: Any) -> Any:
+    if isinstance(value, pydantic.BaseModel):
+        return value.model_dump(mode="json")
+    return dict(value) if isinstance(value, Mapping) else vars(value)
 
 
 def decode(content: bytes) -> Message:
     """Return the message of some JSON."""
     fields = json.loads(content)
-    return _TYPES[fields.pop("message")](**fields)
+    message: Message = _reader(_MESSAGES[fields.pop("message")]).validate_python(fields)
+    return message
+
+
+def decode_answer(content: bytes) -> Answer:
+    """Return the answer of some JSON."""
+    fields = json.loads(content)
+    del fields["message"]
+    answer: Answer = _reader(Answer).validate_python(fields)
+    return answer
+
+
+@functools.cache
+def _reader(kind: Any) -> pydantic.TypeAdapter[Any]:
+    return pydantic.TypeAdapter(kind)

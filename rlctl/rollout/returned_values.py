@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import reprlib
 from collections.abc import Mapping
 from typing import Any
@@ -9,6 +10,9 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+
+from rlctl.dict_spaces import SINGLE, split, split_space
+from rlctl.rollout.shared_arrays import observation_fields
 
 STEP = ("observation", "reward", "terminated", "truncated", "info")
 RESET = ("observation", "info")
@@ -52,21 +56,51 @@ def check_info(info: Any) -> None:
         raise InvalidReturn(f"info is {reprlib.repr(info)}, not a dict")
 
 
-def check_numeric(value: NDArray[Any], what: str) -> None:
-    """Raise `InvalidReturn` if the elements of an observation are not numbers."""
-    if value.dtype.kind not in "biuf":
-        raise InvalidReturn(f"{what} is {reprlib.repr(value.tolist())}, not numbers")
+class ObservationWriter:
+    """Writes observations of a space into arrays, with a part for each key, and checks them.
+
+    `checked`: the environment has done that itself.
+    """
+
+    def __init__(self, space: spaces.Space[Any], *, checked: bool) -> None:
+        self._checked = checked
+        self._fields = observation_fields(space)
+        self._categories = {key: _category_bounds(part) for key, part in split_space(space).items()}
+
+    def write(self, target: Mapping[str, NDArray[Any]], index: int, observation: Any) -> None:
+        """Write an observation into row `index` of each array; raises `InvalidReturn` for one that does not fit."""
+        if self._checked:
+            target[SINGLE][index] = observation
+            return
+        parts = split(observation)
+        if parts.keys() != target.keys():
+            raise InvalidReturn(f"observation has the keys {sorted(parts)}, the space has {sorted(target)}")
+        for key, value in parts.items():
+            value = np.asarray(value)
+            self._check(key, value)
+            target[key][index] = value
+
+    def _check(self, key: str, value: NDArray[Any]) -> None:
+        shape, dtype = self._fields[key]
+        if value.shape != shape:
+            raise InvalidReturn(f"{_named(key)} has shape {value.shape}, the space has {shape}")
+        if value.dtype is not dtype and value.dtype.kind not in "biuf":
+            raise InvalidReturn(f"{_named(key)} is {reprlib.repr(value.tolist())}, not numbers")
+        # A sum is finite unless an element is not, or it overflows: the slow check decides.
+        if value.dtype.kind == "f" and not math.isfinite(np.add.reduce(value, None)):
+            bad = np.flatnonzero(~np.isfinite(value))
+            if bad.size:
+                raise InvalidReturn(f"{_named(key)} is not finite: element {bad[0]} is {value.ravel()[bad[0]]}")
+        limits = self._categories[key]
+        if limits is not None and not ((limits[0] <= value) & (value <= limits[1])).all():
+            raise InvalidReturn(f"{_named(key)} is {value}, the space has {limits[0]} to {limits[1]}")
 
 
-def find_not_finite(value: NDArray[Any], what: str) -> InvalidReturn | None:
-    """Return the error of an observation that has an element that is not finite."""
-    bad = np.flatnonzero(~np.isfinite(value))
-    if not bad.size:
-        return None
-    return InvalidReturn(f"{what} is not finite: element {bad[0]} is {value.ravel()[bad[0]]}")
+def _named(key: str) -> str:
+    return f"observation {key!r}" if key else "observation"
 
 
-def category_bounds(space: spaces.Space[Any]) -> NDArray[Any] | None:
+def _category_bounds(space: spaces.Space[Any]) -> NDArray[Any] | None:
     """Return the first and last value, shape (2, ...), of a space of categories: a network cannot take others."""
     if isinstance(space, spaces.Discrete):
         return np.array([space.start, space.start + space.n - 1])

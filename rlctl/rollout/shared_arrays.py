@@ -13,6 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.dict_spaces import split_space
+from rlctl.run.env_info import EnvInfo
 
 Fields = dict[str, tuple[tuple[int, ...], np.dtype[Any]]]
 
@@ -51,63 +52,42 @@ def map_arrays(descriptor: int, layout: Layout) -> dict[str, NDArray[Any]]:
 
 
 class SharedArrays:
-    """Per environment a row in each array, and `steps` rows for the segment it plays last.
+    """Per environment what it is in and observes, and `steps` rows for the segment it plays last.
 
     The file has no name, so nothing is left behind whatever kills the processes. Pages that nobody writes to take no
     memory.
     """
 
-    def __init__(
-        self, descriptor: int, n_envs: int, spaces_: tuple[spaces.Space[Any], spaces.Space[Any]], terms: int, steps: int
-    ) -> None:
-        observation, action = observation_fields(spaces_[0]), _leaf(spaces_[1])
-        stored = np.dtype(np.float32 if isinstance(spaces_[1], spaces.Box) else np.int64)
-        now: Fields = {
+    def __init__(self, descriptor: int, info: EnvInfo, n_envs: int, steps: int) -> None:
+        observation_space, action_space = info.spaces()
+        observation, action = observation_fields(observation_space), _leaf(action_space)
+        stored = np.dtype(np.float32 if isinstance(action_space, spaces.Box) else np.int64)
+        of_segment: Fields = {
+            "stored": ((max(1, int(np.prod(action[0]))),), stored),
             "action": action,
             "reward": ((), np.dtype(np.float64)),
             "terminated": ((), np.dtype(np.bool_)),
             "truncated": ((), np.dtype(np.bool_)),
-            "next_seed": ((), np.dtype(np.int64)),
-            "inside": ((3,), np.dtype(np.int64)),
-            "terms": ((terms,), np.dtype(np.float64)),
-            "record": ((), np.dtype(np.bool_)),
-            "cast": ((3,), np.dtype(np.int64)),
-            **{f"{kind}/{key}": field for key, field in observation.items() for kind in ("observation", "final")},
-        }
-        of_segment: Fields = {
-            "stored": ((max(1, int(np.prod(action[0]))),), stored),
-            **{name: now[name] for name in ("action", "reward", "terminated", "truncated", "terms")},
+            "terms": ((len(info.reward_weights),), np.dtype(np.float64)),
             **{f"final/{key}": field for key, field in observation.items()},
         }
+        # What every environment has comes first, so that it stays where it is when segments get longer.
         arrays = map_arrays(
             descriptor,
-            {name: ((n_envs, *shape), dtype) for name, (shape, dtype) in now.items()}
+            {"inside": ((n_envs, 3), np.dtype(np.int64))}
+            | {f"observation/{key}": ((n_envs, *shape), dtype) for key, (shape, dtype) in observation.items()}
             | {f"segment/{name}": ((n_envs, steps, *shape), dtype) for name, (shape, dtype) in of_segment.items()}
             | {f"segment/observation/{k}": ((n_envs, steps + 1, *shape), d) for k, (shape, d) in observation.items()},
         )
-        self.action = arrays["action"]
-        self.reward = arrays["reward"]
-        self.terminated = arrays["terminated"]
-        self.truncated = arrays["truncated"]
-        self.next_seed = arrays["next_seed"]
-        """Seed of the episode to start when the present one ends; negative: do not start one."""
         self.inside = arrays["inside"]
         """Episode seed, step and row of the segment of the call an environment is in, shape (n_envs, 3): to name it
         when its worker dies or hangs. Step 0 is the reset; a negative step: in no call."""
-        self.terms = arrays["terms"]
-        """Raw reward terms of the last step, shape (n_envs, terms), where `record` is set."""
-        self.record = arrays["record"]
-        self.cast = arrays["cast"]
-        """Observations of another dtype than their space's, shape (n_envs, 3): how many came, and of the last the
-        character of its dtype and the number of its key."""
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}
         """What the next action is chosen from."""
-        self.final = {key: arrays[f"final/{key}"] for key in observation}
-        """The observation an episode ended with, where one ended in the last step."""
-        self.segment = Segment(arrays, list(observation))
+        self.segment = SegmentArrays(arrays, list(observation))
 
 
-class Segment:
+class SegmentArrays:
     """What was played last: arrays of shape (n_envs, steps, ...)."""
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]], keys: Sequence[str]) -> None:
@@ -123,11 +103,7 @@ class Segment:
         self.terminated = arrays["segment/terminated"]
         self.truncated = arrays["segment/truncated"]
         self.terms = arrays["segment/terms"]
-
-    @property
-    def steps(self) -> int:
-        """The most steps that a segment can have."""
-        return int(self.reward.shape[1])
+        """Raw reward terms, shape (n_envs, steps, terms), where they were to be recorded."""
 
 
 def anonymous_file() -> int:

@@ -60,7 +60,6 @@ def describe(run: RunDirectory) -> RunDescription:
 def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
     counted = {
         "observations_outside": "observations outside their space",
-        "observations_cast": "observations of another dtype than their space's",
         "failed_evaluations": "evaluations that failed",
     }
     for key, what in counted.items():

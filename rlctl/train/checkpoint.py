@@ -250,7 +250,7 @@ def _environment_tensors(env: WorkerVecEnv) -> Tensors:
     """Return the episodes that environments are in, what was done in them, and what was observed last."""
     histories = env.history.all()
     nonempty = [actions for actions in histories if actions is not None and len(actions)]
-    row = env.workers.arrays.action[:0]
+    row = env.workers.arrays.segment.action[0, :0]
     tensors = {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),
         "environments/steps": np.array([-1 if actions is None else len(actions) for actions in histories], np.int64),

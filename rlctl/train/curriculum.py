@@ -13,7 +13,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
-from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.rollout.workers import Workers
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.stages import Stage, format_title
 from rlctl.train.display import percent

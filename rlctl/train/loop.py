@@ -135,7 +135,7 @@ class TrainingLoop(BaseCallback):
         self.curriculum.count(ended)
         if warning := self.curriculum.warning():
             self.display.message(warning)
-        for warning in self.env.monitor.report(self.env.workers.arrays, self.progress):
+        if warning := self.env.monitor.report(self.progress):
             self.display.message(warning)
 
     def _begin_next_stage(self, steps: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from rlctl.rollout.workers import EpisodeResult
+from rlctl.rollout.messages import EpisodeResult
 
 
 @dataclasses.dataclass
@@ -28,8 +28,6 @@ class Progress:
     """Why the first of the failed evaluations failed."""
     observations_outside: int = 0
     """How many training observations were outside their space."""
-    observations_cast: int = 0
-    """How many came with a dtype that their space's cannot hold without loss."""
     done: bool = False
     """Whether nothing is left to do."""
     seconds: float = 0.0

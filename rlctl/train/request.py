@@ -244,7 +244,7 @@ def _saver(
 
 def _learn_to_the_end(loop: TrainingLoop, request: TrainRequest, signals: StopSignals, display: Display) -> list[Path]:
     """Train, write that it is done, and return the requested recordings."""
-    from rlctl.train.space_monitor import summary
+    from rlctl.train.space_monitor import summarize
     from rlctl.train.tensorboard import silence_writer_thread
 
     if loop.recipe.stages:
@@ -255,7 +255,7 @@ def _learn_to_the_end(loop: TrainingLoop, request: TrainRequest, signals: StopSi
         _learn(loop)
     signals.end()
     steps, progress = loop.model.num_timesteps, loop.progress
-    if warning := summary(progress):
+    if warning := summarize(progress):
         display.message(warning)
     saver, run = loop.saver, loop.run_directory
     saver.retry(lambda: saver.attempt("run.json", lambda: status.write_end(run, steps, progress)))

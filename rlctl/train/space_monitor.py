@@ -9,7 +9,6 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.dict_spaces import split, split_space
-from rlctl.rollout.shared_arrays import SharedArrays, observation_fields
 from rlctl.train.progress import Progress
 
 
@@ -18,8 +17,6 @@ class SpaceMonitor:
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         leaves = split_space(space)
-        self._dtypes = [dtype for _, dtype in observation_fields(space).values()]
-        self._keys = list(leaves)
         self._bounds = {key: leaf for key, leaf in leaves.items() if isinstance(leaf, spaces.Box) and _can_exceed(leaf)}
         self._limits = {key: _uniform_bounds(box) for key, box in self._bounds.items()}
         self._outside = 0
@@ -49,27 +46,14 @@ class SpaceMonitor:
             )
         return [int(row) for row in np.flatnonzero(wrong.any(axis=1))]
 
-    def report(self, arrays: SharedArrays, progress: Progress) -> list[str]:
-        """Add what was counted since the last report to `progress`; return new warnings."""
-        warnings = []
+    def report(self, progress: Progress) -> str | None:
+        """Add what was counted since the last report to `progress`; return a warning the first time."""
+        warning = None
         if self._outside and not progress.observations_outside:
-            warnings.append(f"warning: {self._message}; such observations are counted, and taken as they are")
-        cast = int(arrays.cast[:, 0].sum())
-        if cast and not progress.observations_cast:
-            _, character, number = arrays.cast[int(arrays.cast[:, 0].argmax())].tolist()
-            dtype, name = np.dtype(chr(character)), _named(self._keys[number])
-            warnings.append(
-                f"warning: {name} comes as {dtype}, its space has {self._dtypes[number]}: cast, and counted"
-            )
+            warning = f"warning: {self._message}; such observations are counted, and taken as they are"
         progress.observations_outside += self._outside
-        progress.observations_cast += cast
-        self.forget(arrays)
-        return warnings
-
-    def forget(self, arrays: SharedArrays) -> None:
-        """Do not count what has come since the last report."""
         self._outside = 0
-        arrays.cast[:] = 0
+        return warning
 
 
 def _uniform_bounds(box: spaces.Box) -> tuple[Any, Any] | None:
@@ -90,8 +74,7 @@ def _named(key: str) -> str:
     return f"observation {key!r}" if key else "observation"
 
 
-def summary(progress: Progress) -> str | None:
+def summarize(progress: Progress) -> str | None:
     """Return the warning for the end of a training, or None."""
-    counts = {"outside their space": progress.observations_outside, "of another dtype": progress.observations_cast}
-    counted = [f"{count:,} {what}" for what, count in counts.items() if count]
-    return f"warning: observations {' and '.join(counted)}" if counted else None
+    count = progress.observations_outside
+    return f"warning: observations {count:,} outside their space" if count else None

@@ -83,7 +83,6 @@ def write_end(run: RunDirectory, steps: int, progress: Progress) -> None:
             "best_success": progress.best_success,
             "best_return": progress.best_return,
             "observations_outside": progress.observations_outside,
-            "observations_cast": progress.observations_cast,
             "failed_evaluations": progress.failed_evaluations,
             **({"stage": progress.stage} if progress.stage else {}),
         }

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.eval.statistics import mean_return, mean_terms, success_rate
-from rlctl.rollout.workers import EpisodeResult
+from rlctl.rollout.messages import EpisodeResult
 
 _LOSSES = (
     "learning_rate", "loss", "policy_gradient_loss", "policy_loss", "value_loss", "entropy_loss", "approx_kl",

@@ -14,8 +14,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from rlctl.dict_spaces import join
 from rlctl.errors import EpisodeFailed
 from rlctl.rollout.history import ActionHistory
+from rlctl.rollout.messages import EpisodeResult, Play, Segment
 from rlctl.rollout.seeds import EpisodeAddress, Stream
-from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
 from rlctl.run.policy import PolicyInfo
 from rlctl.train.space_monitor import SpaceMonitor
@@ -79,7 +80,7 @@ class WorkerVecEnv(VecEnv):
     def reset(self) -> Any:
         self.workers.reset({env: self._seed(env, number) for env, number in enumerate(self.episodes_started)})
         self.episodes_started = [number + 1 for number in self.episodes_started]
-        self.history.begin(range(self.num_envs))
+        self.history = ActionHistory(self.num_envs)
         return self.workers.observations()
 
     def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
@@ -90,9 +91,8 @@ class WorkerVecEnv(VecEnv):
         """
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
-        ended = self.workers.replay_actions(dict(enumerate(zip(seeds, actions, strict=True))))
-        self.monitor.forget(self.workers.arrays)  # counted the first time
-        self.history = ActionHistory.of_episodes(actions, self.workers.arrays.action)
+        ended = self.workers.replay_actions(dict(enumerate(zip(seeds, actions, strict=True))), may_fail=True)
+        self.history = ActionHistory.of_episodes(actions, self.workers.arrays.segment.action[:, 0])
         return ended
 
     def play(self, steps: int, exploration: Exploration, check: Callable[[], None] | None = None) -> PlayedSegment:
@@ -103,14 +103,9 @@ class WorkerVecEnv(VecEnv):
     def start(self, steps: int, exploration: Exploration, *, until_end: bool = False) -> None:
         """Begin to play up to `steps` steps, with `until_end` only up to the end of the running episode."""
         self._steps, self._until_end = steps, until_end
-        self.workers.start_playing(
-            dict.fromkeys(range(self.num_envs), -1),
-            steps,
-            exploration,
-            until_end=until_end,
-            run_seed=self.run_seed,
-            episodes_started=self.episodes_started,
-        )
+        segment = Segment(steps, exploration, until_end=until_end)
+        going_on = dict.fromkeys(range(self.num_envs), -1)
+        self.workers.start_playing(Play(segment, going_on, dict(enumerate(self.episodes_started)), self.run_seed))
 
     def finish(self, check: Callable[[], None] | None = None) -> PlayedSegment:
         """Wait for what `start` has begun; `check` is called several times a second."""

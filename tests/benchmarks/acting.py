@@ -10,11 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
+from rlctl.rollout.messages import Play, Segment
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run.acting import Exploration
 from rlctl.run.policy import PolicyInfo
 from tests.benchmarks.row import Row, side_by_side
+from tests.benchmarks.stepping_workers import SteppingWorkers
 
 MANY = 64
 STEPS = 40  # of each environment in a segment
@@ -52,9 +54,10 @@ def per_step(repeat: int) -> Row:
 def _row(task: str, target: float, repeat: int) -> Row:
     workers = Workers(EnvSpec(task), MANY)
     player = _Player(workers)
-    turns = _Turns(workers)
+    turns = _Turns(task, make_policy(workers))
     pair = side_by_side(lambda: player.play(2), lambda: turns.play(2), 2 * repeat + 1)
     workers.close()
+    turns.workers.close()
     return Row(
         f"playing {task}",
         f"{pair.ours:,.0f} steps/s",
@@ -72,7 +75,7 @@ class _Player:
 
     def __init__(self, workers: Workers) -> None:
         self.workers = workers
-        self._policy = _make_policy(workers)
+        self._policy = make_policy(workers)
         self._started = [0] * workers.n_envs
         self._begin()
 
@@ -82,7 +85,7 @@ class _Player:
 
     def _play(self, begin: dict[int, int]) -> None:
         self.workers.set_policy(*self._policy)
-        self.workers.start_playing(begin, STEPS, SAMPLES, run_seed=0, episodes_started=self._started)
+        self.workers.start_playing(Play(Segment(STEPS, SAMPLES), begin, dict(enumerate(self._started))))
         for result in self.workers.finish_playing():
             self._started[result.env] += 1
 
@@ -95,13 +98,13 @@ class _Player:
 
 
 class _Turns:
-    """All environments step by step, as before workers acted: the fixed program to compare with."""
+    """All environments step by step with a batched policy in torch, as before workers acted."""
 
-    def __init__(self, workers: Workers) -> None:
-        self._workers = workers
-        _, tensors = _make_policy(workers)
+    def __init__(self, task: str, policy: tuple[PolicyInfo, dict[str, NDArray[Any]]]) -> None:
+        self.workers = SteppingWorkers(task, MANY, available_cores())
+        info, tensors = policy
         self._weights = [torch.from_numpy(tensors[f"policy/{name}.weight"]) for name in _LAYERS]
-        self._low, self._high = workers.info.spaces()[1].low, workers.info.spaces()[1].high  # type: ignore[attr-defined]
+        self._low, self._high = info.env.spaces()[1].low, info.env.spaces()[1].high  # type: ignore[attr-defined]
         self._mean, self._scale = tensors["normalize//mean"], np.sqrt(tensors["normalize//var"] + 1e-8)
         torch.set_num_threads(1)
 
@@ -117,19 +120,18 @@ class _Turns:
 
     def play(self, segments: int) -> float:
         """Return steps per second."""
-        workers = self._workers
+        workers = self.workers
         began = time.perf_counter()
-        for step in range(segments * STEPS):
-            workers.arrays.next_seed[:] = step
-            workers.arrays.action[:] = self._act(workers.observations())  # type: ignore[arg-type]
+        for _ in range(segments * STEPS):
+            workers.action[:] = self._act(workers.observation.copy())
             workers.step()
-        return segments * STEPS * workers.n_envs / (time.perf_counter() - began)
+        return segments * STEPS * MANY / (time.perf_counter() - began)
 
 
 _LAYERS = ("mlp_extractor.policy_net.0", "mlp_extractor.policy_net.2", "action_net")
 
 
-def _make_policy(workers: Workers) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
+def make_policy(workers: Workers) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
     """Return a policy of random numbers."""
     rng = np.random.default_rng(0)
     observations, actions = (int(np.prod(space.shape or ())) for space in workers.info.spaces())

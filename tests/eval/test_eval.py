@@ -9,7 +9,7 @@ from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.eval.report import as_json
 from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
-from rlctl.rollout.workers import EpisodeResult
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.runs.summary import read_table
 from rlctl.train.request import TrainRequest, run_training
 from tests import fork_server

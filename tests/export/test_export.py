@@ -14,7 +14,8 @@ from rlctl.export.export import export_policy
 from rlctl.export.report import show
 from rlctl.export.verify import PolicyFiles, compare_episodes, verify
 from rlctl.rollout.collect import Episode
-from rlctl.rollout.workers import EpisodeResult, Workers
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.rollout.workers import Workers
 from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import read_policy
 from rlctl.run.torch_policy import TorchPolicy

@@ -6,7 +6,7 @@ from rlctl.errors import UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.replay.choice import Choice, select
 from rlctl.replay.replay import ReplayRequest, run_replay
-from rlctl.rollout.workers import EpisodeResult
+from rlctl.rollout.messages import EpisodeResult
 
 
 def results(*outcomes):

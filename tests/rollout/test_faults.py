@@ -11,17 +11,17 @@ import psutil
 import pytest
 
 from rlctl.errors import TaskError
+from rlctl.rollout.messages import Play, Segment
 from tests.rollout.conftest import ENVS
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
 
 
-def run_into_the_fault(workers):
-    """Environment 2 plays the faulty seed."""
-    workers.reset({env: env + 5 for env in range(4)})
-    workers.arrays.action[:] = 0.0
-    for _ in range(4):
-        workers.step()
+def play(workers, steps=4):
+    """Play episodes from seed 5 on: environment 2 plays the faulty seed."""
+    workers.set_other_policy("zero")
+    workers.start_playing(Play(Segment(steps), {env: env + 5 for env in range(workers.n_envs)}))
+    workers.finish_playing()
 
 
 PLACE = f"in environment 2, episode seed 7, step 3; to see it alone: rlctl check-env {ENVS}:Walk"
@@ -42,7 +42,7 @@ PLACE = f"in environment 2, episode seed 7, step 3; to see it alone: rlctl check
 def test_a_step_that_fails(spec, start, fault, message):
     workers = start(spec("Walk", fault=fault), 4, n_workers=2)
     with pytest.raises(TaskError) as caught:
-        run_into_the_fault(workers)
+        play(workers)
     assert str(caught.value) == f"task '{ENVS}:Walk': {message}\n{PLACE}"
     assert caught.value.exit_code == 3
 
@@ -50,7 +50,7 @@ def test_a_step_that_fails(spec, start, fault, message):
 def test_the_environments_own_traceback_comes_along(spec, start):
     workers = start(spec("Walk", fault="raise"), 4, n_workers=1)
     with pytest.raises(TaskError) as caught:
-        run_into_the_fault(workers)
+        play(workers)
     assert 'raise RuntimeError("the gripper fell off")' in caught.value.details
     assert "in fail" in caught.value.details
 
@@ -59,7 +59,7 @@ def test_a_hang_is_ended(spec, start):
     workers = start(spec("Walk", fault="hang"), 4, n_workers=2, timeout_s=1.0)
     began = time.monotonic()
     with pytest.raises(TaskError) as caught:
-        run_into_the_fault(workers)
+        play(workers)
     assert time.monotonic() - began < 10
     assert str(caught.value) == (
         f"task '{ENVS}:Walk': no answer for 1 s while stepping; if that may take so long, raise --env-timeout\n{PLACE}"
@@ -72,9 +72,8 @@ def test_a_worker_that_is_killed_while_idle(spec, start, children):
     _, victim = children()
     victim.kill()
     os.waitid(os.P_PID, victim.pid, os.WEXITED | os.WNOWAIT)
-    workers.arrays.action[:] = 0.0
     with pytest.raises(TaskError) as caught:
-        workers.step()
+        play(workers)
     assert str(caught.value).startswith(f"task '{ENVS}:Walk': worker 1 died while ")
     assert "(SIGKILL: the system does that when memory runs out" in str(caught.value)
     assert str(caught.value).endswith("\nit ran the environments 2 to 3")
@@ -99,15 +98,17 @@ PARENT = textwrap.dedent(
     """
     import sys
     from rlctl.env_spec import EnvSpec
+    from rlctl.rollout.messages import Play, Segment
     from rlctl.rollout.workers import Workers
     workers = Workers(EnvSpec(sys.argv[1], {"fault": "hang"}), 4, n_workers=2)
-    workers.reset({env: env + int(sys.argv[2]) for env in range(4)})
-    workers.arrays.action[:] = 0.0
-    for _ in range(2):
-        workers.step()
+    workers.set_other_policy("zero")
+    envs, first = range(4), int(sys.argv[2])
+    workers.start_playing(Play(Segment(2), {env: env + first for env in envs}))
+    workers.finish_playing()
     print("stepping", flush=True)
     while True:
-        workers.step()
+        workers.start_playing(Play(Segment(1), dict.fromkeys(envs, -1), dict.fromkeys(envs, 1)))
+        workers.finish_playing()
     """
 )
 
@@ -138,7 +139,4 @@ def test_to_stop_is_for_the_main_process(spec, start, children, number, built):
         workers.reset({0: 0, 1: 1})
     for process in children():
         process.send_signal(number)
-    workers.reset({0: 0, 1: 1})
-    workers.arrays.action[:] = 0.0
-    for _ in range(3):
-        workers.step()
+    play(workers)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import TaskError
+from rlctl.rollout.messages import Play, Segment
 from tests.rollout.conftest import ENVS
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
@@ -44,13 +45,14 @@ def test_asking_changes_nothing_of_the_episodes(spec, start, goals):
     seen = []
     for asks in (False, True):
         workers = start(spec("Goals"), 3, n_workers=2)
+        workers.set_other_policy("zero")
         workers.reset({0: 1, 1: 2, 2: 3})
-        workers.arrays.action[:] = 0.1
         for _ in range(4):
             if asks:
                 workers.compute_rewards(*goals)
-            workers.step()
-        seen.append(np.column_stack([workers.observations(), workers.arrays.reward]))
+            workers.start_playing(Play(Segment(1), dict.fromkeys(range(3), -1)))
+            workers.finish_playing()
+        seen.append(np.column_stack([workers.observations(), workers.arrays.segment.reward]))
     np.testing.assert_array_equal(*seen)
 
 

@@ -6,11 +6,11 @@ import threading
 import pytest
 
 from rlctl.env_spec import EnvSpec
-from rlctl.rollout import messages
-from rlctl.rollout.failures import FailedInEpisode, encode_error
+from rlctl.rollout.failures import FailedInEpisode, describe_failure
+from rlctl.rollout.messages import Attach, Build, Failure, Job, LoadPolicy, Play, Segment
 from rlctl.rollout.shared_arrays import anonymous_file
+from rlctl.rollout.worker import Worker
 from rlctl.rollout.worker_output import MAX_LINE_BYTES, MAX_LINES_PER_S, forward, replace_control_characters
-from rlctl.rollout.worker_process import Job, Worker
 from tests.train import faulty_envs
 
 ENVS = faulty_envs.__file__
@@ -18,18 +18,13 @@ ENVS = faulty_envs.__file__
 
 def failure(env, **parameters):
     """Return what a worker reports of the episode of seed 7."""
-    worker = Worker(Job(anonymous_file(), -1, 0, 1, 1), EnvSpec(f"{ENVS}:{env}", parameters))
-    worker.attach(messages.Attach(1))
-    worker.arrays.next_seed[:] = -1
+    worker = Worker(Job(anonymous_file(), -1, 0, 1, 1))
+    worker.answer(Build(EnvSpec(f"{ENVS}:{env}", parameters)))
+    worker.answer(Attach(10))
+    worker.answer(LoadPolicy(other="zero"))
     with pytest.raises(FailedInEpisode) as caught:
-        live(worker)
-    return encode_error(caught.value)
-
-
-def live(worker):
-    worker.reset(messages.Reset([[0, 7]]))
-    for _ in range(10):
-        worker.step()
+        worker.answer(Play(Segment(10), {0: 7}))
+    return describe_failure(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -60,14 +55,7 @@ def live(worker):
     ],
 )
 def test_what_is_returned(fault, message):
-    assert failure("Faulty", fault=fault) == {
-        "message": f"ValueError: {message}",
-        "kind": None,
-        "traceback": None,
-        "env": 0,
-        "seed": 7,
-        "step": 7,
-    }
+    assert failure("Faulty", fault=fault) == Failure(f"ValueError: {message}", where=(0, 7, 7))
 
 
 @pytest.mark.parametrize(
@@ -87,14 +75,14 @@ def test_what_is_returned(fault, message):
 @pytest.mark.parametrize("at_reset", [False, True])
 def test_what_is_raised(fault, message, at_reset):
     found = failure("Faulty", fault=fault, at_reset=at_reset)
-    assert found["message"] == message
-    assert found["step"] == (0 if at_reset else 7)
-    assert found["traceback"].splitlines()[1].startswith(f'  File "{ENVS}"')
-    assert "worker_process.py" not in found["traceback"]
+    assert found.message == message
+    assert found.where == (0, 7, 0 if at_reset else 7)
+    assert found.details.splitlines()[1].startswith(f'  File "{ENVS}"')
+    assert "/rlctl/rollout/" not in found.details
 
 
 def test_a_category_that_the_space_has_not():
-    assert failure("Category")["message"] == "ValueError: observation is 3, the space has 0 to 2"
+    assert failure("Category").message == "ValueError: observation is 3, the space has 0 to 2"
 
 
 def test_functions_that_call_each_other_for_ever():

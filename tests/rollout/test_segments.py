@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import EpisodeFailed
+from rlctl.rollout.messages import Play, Segment
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.run.acting import Exploration, PolicyPlayer
 from tests.rollout.policies import linear
@@ -24,7 +25,7 @@ def play(workers, segments, steps):
     started, results, parts = [1] * workers.n_envs, [], []
     for number in range(segments):
         begin = {env: -1 if number else seed(env, 0) for env in range(workers.n_envs)}
-        workers.start_playing(begin, steps, SAMPLES, run_seed=3, episodes_started=list(started))
+        workers.start_playing(Play(Segment(steps, SAMPLES), begin, dict(enumerate(started)), run_seed=3))
         ended = workers.finish_playing()
         for each in ended:
             started[each.env] += 1
@@ -53,20 +54,25 @@ def test_workers_play_as_this_process_does(spec, start):
     played, ended = play(workers, 1, 30)
     env, player = spec("Walk").make(), PolicyPlayer(*linear(workers.info, WEIGHT, log_std=-1.0))
     player.exploration = SAMPLES
-    episode, step = 0, 0
+    results = [(row, each) for row, each in ended if each.env == 1]
+    episode, step, total = 0, 0, 0.0
     observation, _ = env.reset(seed=seed(1, 0))
     for row in range(30):
         np.testing.assert_array_equal(played["observation"][1, row], observation)
         stored, action = player.act(observation, seed(1, episode), step)
         np.testing.assert_array_equal(played["stored"][1, row], stored)
         np.testing.assert_array_equal(played["action"][1, row], np.clip(stored, -1, 1))
-        observation, reward, done, *_ = env.step(action)
+        observation, reward, done, _, info = env.step(action)
         assert (played["reward"][1, row], played["terminated"][1, row]) == (reward, done)
-        step += 1
+        step, total = step + 1, total + reward
         if done:
-            episode, step = episode + 1, 0
+            ended_in, result = results[episode]
+            assert (ended_in, result.seed, result.total_reward, result.length) == (row, seed(1, episode), total, step)
+            assert (result.success, result.final_distance) == (info["is_success"], info["distance"])
+            np.testing.assert_array_equal(workers.arrays.segment.final[""][1, row], observation)
+            episode, step, total = episode + 1, 0, 0.0
             observation, _ = env.reset(seed=seed(1, episode))
-    assert [each.seed for _, each in ended if each.env == 1] == [seed(1, number) for number in range(episode)]
+    assert len(results) == episode > 1
 
 
 def test_episodes_of_one_step(spec, start):
@@ -84,17 +90,28 @@ def test_a_segment_up_to_the_end_of_an_episode(spec, start):
     """As off-policy algorithms play whose `train_freq` counts episodes: the next one has begun then."""
     workers = start(spec("Walk"), 1)
     workers.set_policy(*linear(workers.info, WEIGHT))
-    workers.start_playing({0: seed(0, 0)}, 50, Exploration(), until_end=True, run_seed=3, episodes_started=[1])
+    workers.start_playing(Play(Segment(50, until_end=True), {0: seed(0, 0)}, {0: 1}, run_seed=3))
     (result,) = workers.finish_playing()
     assert result.row + 1 == result.length < 50
     first, _ = spec("Walk").make().reset(seed=seed(0, 1))
     np.testing.assert_array_equal(workers.observations()[0], first)
 
 
+def test_an_environment_stops_where_its_episode_ends_without_a_next_one(spec, start):
+    workers = start(spec("Walk"), 2, n_workers=1)
+    workers.set_policy(*linear(workers.info, WEIGHT))
+    workers.start_playing(Play(Segment(60), {0: 1, 1: 2}, {1: 5}, run_seed=3))
+    ended = workers.finish_playing()
+    assert [each.seed for each in ended if each.env == 0] == [1]
+    assert [each.seed for each in ended if each.env == 1][:3] == [2, seed(1, 5), seed(1, 6)]
+    last = workers.arrays.segment.observation[""][0, ended[0].row + 1]
+    np.testing.assert_array_equal(workers.observations([0])[0], last)
+
+
 def test_uniform_actions_of_a_warm_up(spec, start):
     workers = start(spec("Spaces", kind="discrete"), 2)
     workers.set_policy(*linear(workers.info, np.zeros((2, 7))))
-    workers.start_playing({0: 1, 1: 2}, 40, Exploration(warmup=True), run_seed=3, episodes_started=[1, 1])
+    workers.start_playing(Play(Segment(40, Exploration(warmup=True)), {0: 1, 1: 2}, {0: 1, 1: 1}, run_seed=3))
     workers.finish_playing()
     assert set(workers.arrays.segment.action[:, :40].ravel().tolist()) == {0, 1}
 
@@ -102,7 +119,7 @@ def test_uniform_actions_of_a_warm_up(spec, start):
 def test_the_step_of_a_segment_that_fails_is_named(spec, start):
     workers = start(spec("Walk", fault="raise"), 3, n_workers=2)
     workers.set_policy(*linear(workers.info, WEIGHT))
-    workers.start_playing({0: 5, 1: 6, 2: 7}, 20, Exploration(), run_seed=3, episodes_started=[1, 1, 1])
+    workers.start_playing(Play(Segment(20), {0: 5, 1: 6, 2: 7}, {0: 1, 1: 1, 2: 1}, run_seed=3))
     with pytest.raises(EpisodeFailed) as caught:
         workers.finish_playing()
     assert (caught.value.env, caught.value.seed, caught.value.step) == (2, 7, 3)

@@ -12,7 +12,7 @@ from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation, run_evaluati
 from rlctl.eval.report import show_all
 from rlctl.replay.reproduce import verify_episode
 from rlctl.rollout import workers
-from rlctl.rollout.workers import EpisodeResult
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.episode import load_episode
 from rlctl.run.policy import load_policy, read_policy
 from rlctl.run.recipe import validate

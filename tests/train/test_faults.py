@@ -136,11 +136,9 @@ def test_observations_outside_their_space_are_counted_and_reported(train, capfd)
         "warning: observation is outside its space: element 0 is 12.5, not -10 to 10; "
         "such observations are counted, and taken as they are"
     ) in printed
-    assert "warning: observation comes as float64, its space has float32: cast, and counted" in printed
-    # Each of two environments took 32 steps, in four episodes that began with an observation each; three had a fifth.
+    # Each of two environments took 32 steps, in four episodes; three had a fifth step.
     assert run.status()["observations_outside"] == 2 * 3
-    assert run.status()["observations_cast"] == 2 * (32 + 4)
-    assert "warning: observations 6 outside their space and 72 of another dtype" in printed
+    assert "warning: observations 6 outside their space" in printed
 
 
 def test_a_file_system_without_locks_is_warned_of(train, monkeypatch, capfd):

@@ -1,0 +1,91 @@
+"""An environment in a worker, and the episode that it is in."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from rlctl.rollout import returned_values
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.rollout.returned_values import InvalidReturn
+
+
+class RunningEpisode:
+    """One environment and the episode it is in; what it returns is checked, but for observations."""
+
+    def __init__(self, env: Any, index: int) -> None:
+        self.env = env
+        self.index = index
+        """Number of the environment."""
+        self.seed = -1
+        self.step = 0
+        """Steps that were begun in the episode."""
+        self._discrete = isinstance(env.action_space, spaces.Discrete)
+        self._return = 0.0
+        self._sums: dict[str, float] = {}
+        self._deepest_contact: float | None = None
+
+    def start(self, seed: int) -> Any:
+        """Begin the episode of a seed; return its first observation."""
+        self.seed, self.step = seed, 0
+        self._return, self._sums, self._deepest_contact = 0.0, {}, None
+        observation, info = returned_values.check_tuple(self.env.reset(seed=seed), returned_values.RESET, "reset")
+        returned_values.check_info(info)
+        return observation
+
+    def take_step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step the environment, and return what it returned."""
+        given = self.env.step(int(action) if self._discrete else action.copy())
+        if given.__class__ is not tuple or len(given) != 5:
+            given = returned_values.check_tuple(given, returned_values.STEP, "step")
+        observation, reward, terminated, truncated, info = given
+        if reward.__class__ is not float:
+            reward = returned_values.to_float(reward, "reward")
+        if not math.isfinite(reward):
+            raise InvalidReturn(f"reward is {reward}")
+        if info.__class__ is not dict:
+            returned_values.check_info(info)
+        if terminated.__class__ is not bool or truncated.__class__ is not bool:
+            terminated = returned_values.to_bool(terminated, "terminated")
+            truncated = returned_values.to_bool(truncated, "truncated")
+        self._count(reward, info)
+        return observation, reward, terminated, truncated, info
+
+    def _count(self, reward: float, info: dict[str, Any]) -> None:
+        self._return += reward
+        sums = self._sums
+        try:
+            for name, value in info.get("reward_terms", {}).items():
+                sums[name] = sums.get(name, 0.0) + value
+        except (TypeError, AttributeError):
+            raise InvalidReturn(f"info['reward_terms'] is {info['reward_terms']!r}, not a dict of numbers") from None
+
+    def measure_contact(self) -> None:
+        """Remember how far bodies overlap now, if it is the most so far."""
+        self._deepest_contact = max(self._deepest_contact or 0.0, self.env.unwrapped.sim.deepest_contact)
+
+    def summarize(self, info: dict[str, Any], row: int, report: dict[str, Any]) -> EpisodeResult:
+        """Return how the episode ended, with the `info` of its last step, in a row of a segment."""
+        success = info.get("is_success")
+        metrics = info.get("metrics")  # of a plain environment it may be anything
+        distance = (metrics if isinstance(metrics, dict) else info).get("distance")
+        if not isinstance(distance, int | float | np.number):  # a plain environment may mean something else by it
+            distance = None
+        terms = {
+            str(name): returned_values.to_float(value, f"reward term {name}") for name, value in self._sums.items()
+        }
+        return EpisodeResult(
+            self.index,
+            self.seed,
+            self._return,
+            self.step,
+            None if success is None else bool(returned_values.to_float(success, "info['is_success']")),
+            terms,
+            None if distance is None else float(distance),
+            row,
+            report,
+            self._deepest_contact,
+        )

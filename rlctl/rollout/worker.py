@@ -1,0 +1,262 @@
+"""A few environments, and a policy that plays them; runs in a process of its own (`worker_process.py`)."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.dict_spaces import SINGLE
+from rlctl.env_spec import EnvSpec, make_several
+from rlctl.errors import describe_exception
+from rlctl.rollout.baselines import make_player
+from rlctl.rollout.failures import FailedInEpisode
+from rlctl.rollout.goal_rewards import compute_answer
+from rlctl.rollout.messages import (
+    Answer,
+    Attach,
+    BeginEpisodes,
+    Build,
+    ComputeRewards,
+    EpisodeResult,
+    Job,
+    LimitActions,
+    LoadPolicy,
+    Message,
+    Play,
+    Segment,
+    SetEvents,
+)
+from rlctl.rollout.returned_values import ObservationWriter
+from rlctl.rollout.running_episode import RunningEpisode
+from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
+from rlctl.rollout.worker_output import write_stderr
+from rlctl.run.acting import Player, PolicyPlayer
+from rlctl.run.env_info import EnvInfo, describe
+from rlctl.task.env import TaskEnv
+from rlctl.task.events import Event, EventSettings, push
+
+
+class Worker:
+    """A few environments and what plays them; `Build` comes before all other messages."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._episodes: list[RunningEpisode] = []
+        self._player: Player | None = None
+        self._states: NDArray[np.float32] | None = None
+        self._info: EnvInfo
+        self._arrays: SharedArrays
+        self._writer: ObservationWriter
+
+    def answer(self, message: Message, data: bytes = b"") -> Answer:
+        """Do what is asked; `data` are the bytes that follow the message."""
+        match message:
+            case Play():
+                return Answer(ended=self._play(message))
+            case BeginEpisodes():
+                return Answer(left=self._begin_episodes(message, data))
+            case ComputeRewards():
+                return Answer(rewards=compute_answer(self._episodes[0].env, data))
+            case Build():
+                self._build(message.spec)
+                return Answer(info=self._info)
+            case SetEvents():
+                self._set_events(message)
+                return Answer(info=self._info)
+            case Attach():
+                self._arrays = SharedArrays(self._job.memory, self._info, self._job.total, message.steps)
+            case LoadPolicy():
+                self._load_policy(message)
+            case LimitActions():
+                self._limit_actions(message)
+        return Answer()
+
+    def _build(self, spec: EnvSpec) -> None:
+        self.close()
+        gc.unfreeze()
+        gc.collect()  # environments may hold themselves in cycles
+        envs = make_several(spec, self._job.count)
+        self._info = describe(envs[0])
+        self._episodes = [RunningEpisode(env, self._job.first + index) for index, env in enumerate(envs)]
+        space = envs[0].observation_space
+        # A task's environment has checked its observation itself.
+        checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
+        self._writer = ObservationWriter(space, checked=checked)
+        gc.freeze()  # what is there now stays; collections need not look at it again
+
+    def _set_events(self, message: SetEvents) -> None:
+        """Let other events act in all environments; none of them is in an episode then."""
+        spec, added = message.spec, {}
+        if message.push is not None:
+            added["push at mid-episode"] = Event("interval", push, enabled=True, **message.push)
+        for episode in self._episodes:
+            env = episode.env.unwrapped
+            if not isinstance(env, TaskEnv):
+                raise TypeError(f"{spec.task}: a plain Gymnasium environment has no events")
+            env.set_events(EventSettings(spec.randomize, spec.events), added)
+            env.set_level(spec.level)
+        self._info = describe(self._episodes[0].env)
+
+    def _load_policy(self, message: LoadPolicy) -> None:
+        """Act with another policy from now on."""
+        self._states = None
+        self._close_player()
+        if message.info is None:
+            env = self._episodes[0].env
+            self._player = make_player(message.other, env.action_space, env.observation_space)
+        else:
+            layout = {name: (tuple(shape), np.dtype(dtype)) for name, shape, dtype in message.layout}
+            tensors = map_arrays(self._job.numbers, layout)
+            self._states = tensors.pop("state", None)
+            self._player = PolicyPlayer(message.info, tensors)
+
+    def _limit_actions(self, message: LimitActions) -> None:
+        """Let the policy act within limits from now on."""
+        from rlctl.deploy.limited_player import LimitedPlayer  # few evaluations need it
+        from rlctl.deploy.limits import Limits
+
+        self._player = LimitedPlayer(self._loaded_player, self._info, Limits.model_validate(message.limits))
+
+    @property
+    def _loaded_player(self) -> Player:
+        assert self._player is not None  # a policy is loaded before anything is played
+        return self._player
+
+    def _begin_episodes(self, message: BeginEpisodes, data: bytes) -> list[int]:
+        """Begin episodes and take the steps that led to where they were; return the environments that left them."""
+        row = self._arrays.segment.action[0, 0]
+        actions = np.frombuffer(data, row.dtype).reshape(-1, *row.shape)
+        left, first = [], 0
+        for env, seed, steps in message.episodes:
+            episode = self._episodes[env - self._job.first]
+            try:
+                with self._within(episode):
+                    self._begin(episode, seed)
+                    if self._repeat(episode, actions[first : first + steps]):
+                        left.append(env)
+            except FailedInEpisode as failure:
+                if not message.may_fail:
+                    raise
+                # It did not fail the first time, so its state differs now: it may begin its next episode.
+                left.append(env)
+                write_stderr(f"{failure} when it was replayed")
+            first += steps
+        return left
+
+    def _begin(self, episode: RunningEpisode, seed: int) -> None:
+        """Begin an episode; its first observation is the present one."""
+        self._arrays.inside[episode.index] = seed, 0, -1
+        self._writer.write(self._arrays.observation, episode.index, episode.start(seed))
+
+    def _repeat(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
+        """Take steps with given actions; return whether the episode ended by them."""
+        for action in actions:
+            episode.step += 1
+            self._arrays.inside[episode.index, 1] = episode.step
+            observation, _, terminated, truncated, _ = episode.take_step(action)
+            self._writer.write(self._arrays.observation, episode.index, observation)
+            if terminated or truncated:
+                return True
+        return False
+
+    def _play(self, message: Play) -> list[EpisodeResult]:
+        """Play a segment in some environments, one after the other; return the episodes that ended."""
+        ended: list[EpisodeResult] = []
+        self._loaded_player.explore(message.segment.exploration)
+        for env, seed in message.begin.items():
+            episode = self._episodes[env - self._job.first]
+            number = message.next_episodes.get(env)
+            next_seeds = None if number is None else _training_seeds(message.run_seed, env, number)
+            with self._within(episode):
+                if seed >= 0:
+                    self._begin(episode, seed)
+                    if self._states is not None:
+                        self._states[env] = 0.0
+                ended += self._play_one(episode, message.segment, next_seeds)
+        return ended
+
+    def _play_one(
+        self, episode: RunningEpisode, asked: Segment, next_seeds: Iterator[int] | None
+    ) -> list[EpisodeResult]:
+        """Play a segment of one environment; without `next_seeds` no episode begins where one ends."""
+        arrays, index, player, write = self._arrays, episode.index, self._loaded_player, self._writer.write
+        segment, inside = arrays.segment, arrays.inside
+        now = {key: rows[index] for key, rows in segment.observation.items()}
+        final = {key: rows[index] for key, rows in segment.final.items()}
+        single = now.get(SINGLE)
+        stored, taken, rewards = segment.stored[index], segment.action[index], segment.reward[index]
+        state = None if self._states is None else self._states[index]
+        if player.state is not None and state is not None:
+            player.state[:] = state
+        for key, rows in now.items():
+            rows[0] = arrays.observation[key][index]
+        player.begin_segment(episode.seed, episode.step)
+        ended: list[EpisodeResult] = []
+        row, only_one = 0, asked.until_end or next_seeds is None
+        while row < asked.steps and not (only_one and ended):
+            observation = single[row] if single is not None else {key: rows[row] for key, rows in now.items()}
+            chosen, action = player.act(observation, episode.seed, episode.step)
+            stored[row] = np.ravel(chosen)
+            taken[row] = action
+            episode.step += 1
+            inside[index] = episode.seed, episode.step, row
+            observation, reward, terminated, truncated, info = episode.take_step(taken[row])
+            rewards[row] = reward
+            segment.terminated[index, row], segment.truncated[index, row] = terminated, truncated
+            if asked.record:
+                segment.terms[index, row] = list(info["metrics"].values())
+            if asked.contacts:
+                episode.measure_contact()
+            row += 1
+            if terminated or truncated:
+                ended.append(episode.summarize(info, row - 1, player.report()))
+                if next_seeds is not None:
+                    write(final, row - 1, observation)
+                    seed = next(next_seeds)
+                    inside[index] = seed, 0, row
+                    observation = episode.start(seed)
+                    if player.state is not None:
+                        player.state[:] = 0.0
+            write(now, row, observation)
+        for key, rows in now.items():
+            arrays.observation[key][index] = rows[row]
+        if player.state is not None and state is not None:
+            state[:] = player.state
+        return ended
+
+    @contextlib.contextmanager
+    def _within(self, episode: RunningEpisode) -> Iterator[None]:
+        """Run the code of an environment in its episode; raises `FailedInEpisode` for anything it raises."""
+        try:
+            yield
+        except BaseException as error:  # a plugin may raise anything, SystemExit too
+            raise FailedInEpisode(episode.index, episode.seed, episode.step) from error
+        self._arrays.inside[episode.index, 1] = -1
+
+    def _close_player(self) -> None:
+        if self._player is not None:
+            self._player.close()
+        self._player = None
+
+    def close(self) -> None:
+        """Close the environments, and what plays them."""
+        self._close_player()
+        for episode in self._episodes:
+            try:
+                episode.env.close()
+            except BaseException as error:  # its episodes are over
+                write_stderr(f"warning: closing environment {episode.index}: {describe_exception(error)}")
+        self._episodes = []
+
+
+def _training_seeds(run_seed: int, env: int, episode: int) -> Iterator[int]:
+    """Yield the seeds of an environment's training episodes, from a number on."""
+    for number in itertools.count(episode):
+        yield EpisodeAddress(run_seed, Stream.TRAIN, env, number).seed
