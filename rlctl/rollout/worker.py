@@ -14,24 +14,11 @@ from numpy.typing import NDArray
 from rlctl.dict_spaces import SINGLE
 from rlctl.env_spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
+from rlctl.rollout import messages
 from rlctl.rollout.baselines import make_player
 from rlctl.rollout.failures import FailedInEpisode
 from rlctl.rollout.goal_rewards import compute_answer
-from rlctl.rollout.messages import (
-    Answer,
-    Attach,
-    BeginEpisodes,
-    Build,
-    ComputeRewards,
-    EpisodeResult,
-    Job,
-    LimitActions,
-    LoadPolicy,
-    Message,
-    Play,
-    Segment,
-    SetEvents,
-)
+from rlctl.rollout.messages import Answer, EpisodeResult, Message
 from rlctl.rollout.returned_values import ObservationWriter
 from rlctl.rollout.running_episode import RunningEpisode
 from rlctl.rollout.seeds import EpisodeAddress, Stream
@@ -46,7 +33,7 @@ from rlctl.task.events import Event, EventSettings, push
 class Worker:
     """A few environments and what plays them; `Build` comes before all other messages."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: messages.Job) -> None:
         self._job = job
         self._episodes: list[RunningEpisode] = []
         self._player: Player | None = None
@@ -58,23 +45,23 @@ class Worker:
     def answer(self, message: Message, data: bytes = b"") -> Answer:
         """Do what is asked; `data` are the bytes that follow the message."""
         match message:
-            case Play():
+            case messages.Play():
                 return Answer(ended=self._play(message))
-            case BeginEpisodes():
+            case messages.BeginEpisodes():
                 return Answer(left=self._begin_episodes(message, data))
-            case ComputeRewards():
+            case messages.ComputeRewards():
                 return Answer(rewards=compute_answer(self._episodes[0].env, data))
-            case Build():
+            case messages.Build():
                 self._build(message.spec)
                 return Answer(info=self._info)
-            case SetEvents():
+            case messages.SetEvents():
                 self._set_events(message)
                 return Answer(info=self._info)
-            case Attach():
+            case messages.Attach():
                 self._arrays = SharedArrays(self._job.memory, self._info, self._job.total, message.steps)
-            case LoadPolicy():
+            case messages.LoadPolicy():
                 self._load_policy(message)
-            case LimitActions():
+            case messages.LimitActions():
                 self._limit_actions(message)
         return Answer()
 
@@ -91,7 +78,7 @@ class Worker:
         self._writer = ObservationWriter(space, checked=checked)
         gc.freeze()  # what is there now stays; collections need not look at it again
 
-    def _set_events(self, message: SetEvents) -> None:
+    def _set_events(self, message: messages.SetEvents) -> None:
         """Let other events act in all environments; none of them is in an episode then."""
         spec, added = message.spec, {}
         if message.push is not None:
@@ -104,7 +91,7 @@ class Worker:
             env.set_level(spec.level)
         self._info = describe(self._episodes[0].env)
 
-    def _load_policy(self, message: LoadPolicy) -> None:
+    def _load_policy(self, message: messages.LoadPolicy) -> None:
         """Act with another policy from now on."""
         self._states = None
         self._close_player()
@@ -117,7 +104,7 @@ class Worker:
             self._states = tensors.pop("state", None)
             self._player = PolicyPlayer(message.info, tensors)
 
-    def _limit_actions(self, message: LimitActions) -> None:
+    def _limit_actions(self, message: messages.LimitActions) -> None:
         """Let the policy act within limits from now on."""
         from rlctl.deploy.limited_player import LimitedPlayer  # few evaluations need it
         from rlctl.deploy.limits import Limits
@@ -129,7 +116,7 @@ class Worker:
         assert self._player is not None  # a policy is loaded before anything is played
         return self._player
 
-    def _begin_episodes(self, message: BeginEpisodes, data: bytes) -> list[int]:
+    def _begin_episodes(self, message: messages.BeginEpisodes, data: bytes) -> list[int]:
         """Begin episodes and take the steps that led to where they were; return the environments that left them."""
         row = self._arrays.segment.action[0, 0]
         actions = np.frombuffer(data, row.dtype).reshape(-1, *row.shape)
@@ -166,7 +153,7 @@ class Worker:
                 return True
         return False
 
-    def _play(self, message: Play) -> list[EpisodeResult]:
+    def _play(self, message: messages.Play) -> list[EpisodeResult]:
         """Play a segment in some environments, one after the other; return the episodes that ended."""
         ended: list[EpisodeResult] = []
         self._loaded_player.explore(message.segment.exploration)
@@ -183,7 +170,7 @@ class Worker:
         return ended
 
     def _play_one(
-        self, episode: RunningEpisode, asked: Segment, next_seeds: Iterator[int] | None
+        self, episode: RunningEpisode, asked: messages.Segment, next_seeds: Iterator[int] | None
     ) -> list[EpisodeResult]:
         """Play a segment of one environment; without `next_seeds` no episode begins where one ends."""
         arrays, index, player, write = self._arrays, episode.index, self._loaded_player, self._writer.write

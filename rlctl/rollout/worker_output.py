@@ -78,7 +78,7 @@ def replace_control_characters(text: str) -> str:
 
 
 def write_stderr(text: str) -> None:
-    """In a worker: write a line beside what its environments print."""
+    """Write a line beside what environments print."""
     # Not by print: an environment may have closed or replaced what that writes to.
     with contextlib.suppress(OSError):
         os.write(2, f"{text}\n".encode(errors="replace"))

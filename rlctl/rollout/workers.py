@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
-import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NoReturn
 
@@ -19,27 +18,15 @@ from numpy.typing import NDArray
 from rlctl.dict_spaces import Observations, join
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
-from rlctl.rollout import goal_rewards
+from rlctl.rollout import goal_rewards, messages
 from rlctl.rollout.failures import format_hint, make_error
-from rlctl.rollout.messages import (
-    Answer,
-    Attach,
-    BeginEpisodes,
-    Build,
-    ComputeRewards,
-    EpisodeResult,
-    Job,
-    LimitActions,
-    LoadPolicy,
-    Message,
-    Play,
-    SetEvents,
-)
+from rlctl.rollout.messages import Answer, EpisodeResult, Message
+from rlctl.rollout.policy_numbers import PolicyNumbers
 from rlctl.rollout.process_pool import ProcessPool, WorkerFault
 from rlctl.rollout.process_start import StartProcess
-from rlctl.rollout.shared_arrays import SharedArrays, anonymous_file, map_arrays
+from rlctl.rollout.shared_arrays import SharedArrays, anonymous_file
+from rlctl.rollout.worker_output import write_stderr
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.network import select_actor_tensors
 from rlctl.run.policy import PolicyInfo
 
 BUILD_TIMEOUT_S = 300.0
@@ -77,13 +64,12 @@ class Workers:
         self._ranges = list(itertools.pairwise(bounds))
         self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
         self._memory, self._numbers_memory = anonymous_file(), anonymous_file()
-        self._numbers: dict[str, NDArray[Any]] = {}
-        self._policy_layout: tuple[Any, ...] = ()
+        self._numbers = PolicyNumbers(self._numbers_memory, n_envs)
         self._steps = 1
         self._ready = False
-        jobs = [Job(self._memory, self._numbers_memory, low, high - low, n_envs) for low, high in self._ranges]
+        jobs = [messages.Job(self._memory, self._numbers_memory, low, high - low, n_envs) for low, high in self._ranges]
         try:
-            self._pool = ProcessPool(jobs, on_output or _to_stderr, self._read_progress, start)
+            self._pool = ProcessPool(jobs, on_output or write_stderr, self._read_progress, start)
         except BaseException as error:
             self._close_memory()
             if isinstance(error, OSError):
@@ -136,13 +122,13 @@ class Workers:
 
     def _begin_to_build(self) -> None:
         for worker in range(len(self._ranges)):
-            self._send(worker, Build(self._spec))
+            self._send(worker, messages.Build(self._spec))
 
     def _wait_until_built(self) -> None:
         if self._ready:
             return
         self._info = _info_of(self._wait("being built", max(BUILD_TIMEOUT_S, self.timeout_s)))
-        self._policy_layout = ()
+        self._numbers.forget()
         self._ready = True
         self._attach(self._steps)
 
@@ -150,7 +136,7 @@ class Workers:
         self._steps = steps
         self._arrays = SharedArrays(self._memory, self._info, self.n_envs, steps)
         self._arrays.inside[:] = -1
-        self._ask_all(Attach(steps), "attaching")
+        self._ask_all(messages.Attach(steps), "attaching")
 
     def set_events(self, spec: EnvSpec, push: Mapping[str, Any] | None = None) -> EnvInfo:
         """Let the events of `spec` act, which differs from the present one in nothing else; return what they are now.
@@ -160,7 +146,7 @@ class Workers:
         """
         self._wait_until_built()
         self._spec = spec
-        self._info = _info_of(self._ask_all(SetEvents(spec, dict(push) if push else None), "changing events"))
+        self._info = _info_of(self._ask_all(messages.SetEvents(spec, dict(push) if push else None), "changing events"))
         return self._info
 
     def reset(self, seeds: Mapping[int, int]) -> None:
@@ -183,48 +169,31 @@ class Workers:
         for worker, envs in self._by_worker(episodes).items():
             heads = [(env, episodes[env][0], len(episodes[env][1])) for env in envs]
             data = b"".join(episodes[env][1].astype(dtype).tobytes() for env in envs)
-            self._send(worker, BeginEpisodes(heads, may_fail), data)
+            self._send(worker, messages.BeginEpisodes(heads, may_fail), data)
         return {env for answer in self._wait(doing).values() for env in answer.left}
 
     def set_policy(self, info: PolicyInfo, tensors: Mapping[str, NDArray[Any]]) -> None:
         """Act with the present numbers of a policy, of a policy file's names, from the next segment on."""
         self._wait_until_built()
-        numbers = select_actor_tensors(info, tensors)
-        if (hidden := numbers.get("policy/lstm_actor.weight_hh_l0")) is not None:
-            layers = sum("weight_hh" in name for name in numbers)
-            numbers["state"] = np.zeros((self.n_envs, 2, layers, hidden.shape[1]), np.float32)
-        layout = [(name, list(values.shape), str(values.dtype)) for name, values in numbers.items()]
-        structure = (info.algo, info.policy_kwargs, info.clip_observation, layout)
-        if structure == self._policy_layout:
-            numbers.pop("state", None)
-            self._write_numbers(numbers)
-            return
-        self._policy_layout = structure
-        shapes = {name: (tuple(shape), np.dtype(dtype)) for name, shape, dtype in layout}
-        self._numbers = map_arrays(self._numbers_memory, shapes)
-        self._write_numbers(numbers)
-        self._ask_all(LoadPolicy(info, layout), "loading the policy")
-
-    def _write_numbers(self, numbers: Mapping[str, NDArray[Any]]) -> None:
-        for name, values in numbers.items():
-            self._numbers[name][...] = values
+        if layout := self._numbers.write(info, tensors):
+            self._ask_all(messages.LoadPolicy(info, layout), "loading the policy")
 
     def set_other_policy(self, name: str) -> None:
         """Act with an exported file, by its whole path, or a baseline: `zero`, `random`, `file.py:function`."""
         self._wait_until_built()
-        self._policy_layout = ()
-        self._ask_all(LoadPolicy(other=name), "loading the policy")
+        self._numbers.forget()
+        self._ask_all(messages.LoadPolicy(other=name), "loading the policy")
 
     def limit_actions(self, limits: Mapping[str, Any]) -> None:
         """Send the policy's actions through a safety filter, until another policy is set; `limits` are a `Limits`."""
-        self._ask_all(LimitActions(dict(limits)), "applying limits")
+        self._ask_all(messages.LimitActions(dict(limits)), "applying limits")
 
     @property
     def recurrent_state(self) -> NDArray[np.float32] | None:
         """Hidden and cell state of each environment's episode, shape (n_envs, 2, layers, hidden); None without."""
-        return self._numbers.get("state") if self._policy_layout else None
+        return self._numbers.state
 
-    def start_playing(self, play: Play) -> None:
+    def start_playing(self, play: messages.Play) -> None:
         """Begin to play a segment, into rows of `arrays.segment`, which are other arrays if it is a longer one.
 
         Where an episode ends the next one begins, by its address in the training of `play.run_seed`; without
@@ -252,7 +221,7 @@ class Workers:
         does not return n finite numbers.
         """
         self._wait_until_built()
-        self._send(0, ComputeRewards(), goal_rewards.encode_request(achieved, desired))
+        self._send(0, messages.ComputeRewards(), goal_rewards.encode_request(achieved, desired))
         return np.array(self._wait("in compute_reward")[0].rewards, np.float64)
 
     def _by_worker(self, envs: Iterable[int]) -> dict[int, list[int]]:
@@ -321,10 +290,6 @@ def _info_of(answers: Mapping[int, Answer]) -> EnvInfo:
     info = answers[0].info
     assert info is not None  # it is what was asked for
     return info
-
-
-def _to_stderr(line: str) -> None:
-    print(line, file=sys.stderr)
 
 
 def available_cores() -> int:

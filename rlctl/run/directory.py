@@ -197,12 +197,6 @@ class RunLock:
             os.pwrite(descriptor, f"pid {os.getpid()} on {os.uname().nodename}".encode(), 0)
         return descriptor
 
-    def renew(self) -> None:
-        """Claim the folder again if it, or its lock file, was removed meanwhile."""
-        if not self._file.exists():
-            self.release()
-            self._descriptor = self._claim()
-
     def release(self) -> None:
         """Let go of the folder; a second call does nothing."""
         if self._descriptor >= 0:

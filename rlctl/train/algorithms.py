@@ -15,22 +15,19 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from rlctl.dict_spaces import split_space
 from rlctl.errors import RecipeError, UsageError, short_repr
-from rlctl.run.recipe import ON_POLICY, Normalize, Recipe
+from rlctl.run.recipe import Normalize, Recipe
 from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
 from rlctl.train import footprint
 from rlctl.train.hindsight import replay_arguments
-from rlctl.train.off_policy import ChunkRollouts
-from rlctl.train.on_policy import SegmentRollouts
 from rlctl.train.vec_env import WorkerVecEnv
 
 _CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
-_DETERMINISTIC_EXPLORERS = frozenset({"td3", "ddpg"})
 
 
 def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm:
     """Build the model of a recipe on vector environments; raises `RecipeError` for what does not fit."""
     _check_device(device)
-    cls = _playing_class(recipe)
+    cls = ALGORITHMS[recipe.algo]
     kwargs = _algorithm_kwargs(recipe)
     if recipe.her is not None:
         kwargs = {**replay_arguments(recipe, recipe.her, env.workers.info), **kwargs}
@@ -77,19 +74,6 @@ def _use_fused_adam(model: BaseAlgorithm) -> None:
             if isinstance(optimizer, torch.optim.Adam):
                 for group in optimizer.param_groups:
                     group["fused"] = True
-
-
-def _playing_class(recipe: Recipe) -> type[BaseAlgorithm]:
-    """Return SB3's algorithm with our way to play: in workers, many steps at once."""
-    cls = ALGORITHMS[recipe.algo]
-    rollouts = SegmentRollouts if recipe.algo in ON_POLICY else ChunkRollouts
-    content: dict[str, Any] = {"algorithm_name": recipe.algo}
-    if rollouts is ChunkRollouts:
-        # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
-        content["overlap"] = recipe.overlap and recipe.her is None
-        default = 0.1 if recipe.algo in _DETERMINISTIC_EXPLORERS else 0.0  # else they would not explore at all
-        content["action_noise_scale"] = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
-    return type(cls.__name__, (rollouts, cls), content)
 
 
 def _check_device(device: str) -> None:

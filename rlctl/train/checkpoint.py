@@ -41,12 +41,8 @@ _POLICY, _STATE, _TENSORS = "policy.safetensors", "state.json", "state.safetenso
 class State(pydantic.BaseModel):
     """The content of `state.json`."""
 
-    model_config = pydantic.ConfigDict(extra="forbid")
-
     format: int = FORMAT
     step: int
-    at_end: bool
-    """Whether it was saved after the last update, and not between two."""
     model: dict[str, Any]
     """Plain data of `snapshot.take`."""
     progress: Progress
@@ -88,7 +84,7 @@ class Checkpoints:
         """How many transitions the replay buffer has been given: one for each step of all environments."""
         return self._model.num_timesteps // self._env.num_envs
 
-    def save(self, packed: tuple[PolicyInfo, Tensors], progress: Progress, *, at_end: bool) -> Path:
+    def save(self, packed: tuple[PolicyInfo, Tensors], progress: Progress) -> Path:
         """Write a checkpoint of the present boundary and remove the oldest; return its folder.
 
         Raises `OSError` if the disk does not take it, and `DivergedError` if a number in it is not finite.
@@ -106,7 +102,6 @@ class Checkpoints:
         }
         state = State(
             step=self._model.num_timesteps,
-            at_end=at_end,
             model=plain,
             progress=progress,
             segments=segments,

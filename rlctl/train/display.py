@@ -49,6 +49,8 @@ class Display(abc.ABC):
     def __init__(self, title: str, total: int) -> None:
         self.title = title
         self.total = total
+        self._steps = 0
+        self._first: tuple[float, int] | None = None
 
     def __enter__(self) -> Display:
         return self
@@ -62,9 +64,18 @@ class Display(abc.ABC):
     def run_folder(self, folder: Path, metrics: Path, evals: Path) -> None:  # noqa: B027
         """The run's folder is known; of a resumed run the tables hold its earlier rows."""
 
-    @abc.abstractmethod
     def steps(self, steps: int) -> None:
-        """So many environment steps are done; called after each step of all environments."""
+        """So many environment steps are done; called after each segment."""
+        if self._first is None:
+            self._first = (time.monotonic(), steps)
+        self._steps = steps
+
+    def time_left(self) -> str:
+        """Return how long the rest takes at the rate so far; empty where that is not known yet."""
+        if self._first is None or self._steps <= self._first[1]:
+            return ""
+        rate = (self._steps - self._first[1]) / max(time.monotonic() - self._first[0], 1e-9)
+        return duration(max(self.total - self._steps, 0) / rate)
 
     @abc.abstractmethod
     def metrics(self, row: Mapping[str, Any]) -> None:
@@ -101,15 +112,10 @@ class PlainDisplay(Display):
         super().__init__(title, total)
         self._last_line = 0.0
         self._stage = ""
-        self._started: tuple[float, int] | None = None
 
     def __enter__(self) -> Display:
         self._print(self.title)
         return self
-
-    def steps(self, steps: int) -> None:
-        if self._started is None:
-            self._started = (time.monotonic(), steps)
 
     def metrics(self, row: Mapping[str, Any]) -> None:
         steps, mean_return, success = row["steps"], row["return"], row["success"]
@@ -124,9 +130,8 @@ class PlainDisplay(Display):
             parts.append(f"success {percent(success)}")
         if mean_return is not None:
             parts.append(f"return {mean_return:.2f}")
-        if self._started is not None and steps > self._started[1]:
-            rate = (steps - self._started[1]) / max(now - self._started[0], 1e-9)
-            parts.append(f"{duration(max(self.total - steps, 0) / rate)} left")
+        if left := self.time_left():
+            parts.append(f"{left} left")
         self._print("  ".join(parts))
 
     def stage(self, title: str, why: str = "") -> None:
@@ -153,14 +158,12 @@ class LiveDisplay(Display):
         self._began = time.monotonic()
         self._phase: tuple[str, float] | None = None
         self._folder: Path | None = None
-        self._steps = 0
         self._fps = 0.0
         self._stage = ""
         self._terms: dict[str, float] = {}
         self._returns: deque[float] = deque(maxlen=_CURVE)
         self._successes: deque[float] = deque(maxlen=_CURVE)
         self._evaluations: list[tuple[int, float | None, float, bool]] = []
-        self._started: tuple[float, int] | None = None
         self._live = Live(self, console=output.err(), refresh_per_second=8, transient=False)
 
     def __enter__(self) -> Display:
@@ -187,10 +190,8 @@ class LiveDisplay(Display):
                 best = score if best is None else max(best, score)
 
     def steps(self, steps: int) -> None:
-        if self._started is None:
-            self._started = (time.monotonic(), steps)
+        super().steps(steps)
         self._phase = None
-        self._steps = steps
 
     def metrics(self, row: Mapping[str, Any]) -> None:
         self._phase = None
@@ -217,12 +218,6 @@ class LiveDisplay(Display):
 
         self._live.console.print(Text(text))
 
-    def _time_left(self) -> str:
-        if self._started is None or self._steps <= self._started[1]:
-            return "-:--"
-        rate = (self._steps - self._started[1]) / max(time.monotonic() - self._started[0], 1e-9)
-        return duration(max(self.total - self._steps, 0) / rate)
-
     def __rich_console__(self, console: Any, options: Any) -> Any:
         """Draw for a terminal of this width."""
         yield self._bar(options.max_width)
@@ -242,7 +237,7 @@ class LiveDisplay(Display):
             f"{self._steps:,}/{self.total:,}",
             f"{self._fps:,.0f} steps/s",
             *([elapsed] if wide else []),
-            f"{self._time_left()} left",
+            f"{self.time_left() or '-:--'} left",
         )
         return bar
 

@@ -8,23 +8,25 @@ from pathlib import Path
 import numpy as np
 
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import ArtifactError, EpisodeFailed
+from rlctl.errors import ArtifactError, EpisodeFailed, RlctlError
 from rlctl.rollout.collect import Episode
 from rlctl.run import files
 from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.run.policy import collect_versions
+from rlctl.train.saving import Saver
 
 _LATEST = 1000
 _POLICY = "training step "
 
 
 class EpisodeKeeper:
-    """Writes episodes into a run folder."""
+    """Writes episodes into a run folder; `spec` and `info` are what evaluations are played in."""
 
-    def __init__(self, run: RunDirectory, spec: EnvSpec, info: EnvInfo) -> None:
-        self.run = run
+    def __init__(self, saver: Saver, spec: EnvSpec, info: EnvInfo) -> None:
+        self.run = saver.run
+        self._saver = saver
         self.spec = spec
         self.info = info
         self._latest: deque[RecordedEpisode] = deque(maxlen=_LATEST)
@@ -39,21 +41,41 @@ class EpisodeKeeper:
         for index in dict.fromkeys((0, worst)):
             self._write(recorded[index])
 
-    def latest(self, count: int) -> list[tuple[Path, RecordedEpisode]]:
-        """Write the last `count` episodes of the last evaluation, and return them with their files."""
-        return [(self._write(episode), episode) for episode in list(self._latest)[-count:]] if count else []
+    def record(self, count: int) -> list[Path]:
+        """Write the last `count` episodes of the last evaluation, and recordings of them; return these."""
+        recordings = []
+        for episode in list(self._latest)[-count:] if count else []:
+            from rlctl.replay.reproduce import record_episode
 
-    def keep_failed(self, spec: EnvSpec, error: EpisodeFailed, evaluated_at: int | None = None) -> Path:
-        """Write `error.actions`, of an episode in which an environment failed; return the file."""
-        policy = "training" if evaluated_at is None else f"{_POLICY}{evaluated_at}"
-        failure = str(error).partition("\n")[0]
+            path = self._write(episode)
+            recording = path.with_suffix(".rrd")
+            title = f"{self.run.path.name} / episode {path.stem}"
+            record_episode(episode, recording, title=title, several=count > 1)
+            recordings.append(recording)
+        return recordings
+
+    def keep_failed(self, error: RlctlError, spec: EnvSpec, evaluated_at: int | None = None) -> RlctlError:
+        """Write the actions of an episode that failed, if they are known; return the error, with the file in its hint.
+
+        It was of environments of `spec`, in training or in the evaluation at a step.
+        """
+        if not isinstance(error, EpisodeFailed) or error.actions is None:
+            return error
         info = EpisodeInfo(
-            spec=spec, seed=error.seed, policy=policy, total_reward=0.0, versions=collect_versions(), failure=failure
+            spec=spec,
+            seed=error.seed,
+            policy="training" if evaluated_at is None else f"{_POLICY}{evaluated_at}",
+            total_reward=0.0,
+            versions=collect_versions(),
+            failure=str(error).partition("\n")[0],
         )
         nothing = np.zeros(0)
         # Of a reset that failed there is no action to take the shape from.
         actions = np.asarray(error.actions).reshape(-1, *(self.info.spaces()[1].shape or ()))
-        return self._write(RecordedEpisode(info, actions, nothing, nothing, nothing.reshape(0, 0)))
+        episode = RecordedEpisode(info, actions, nothing, nothing, nothing.reshape(0, 0))
+        files: list[Path] = []
+        self._saver.attempt("failed episode", lambda: files.append(self._write(episode)))
+        return error.with_hint(f"to reproduce it: rlctl replay {files[0]}") if files else error
 
     def _write(self, episode: RecordedEpisode) -> Path:
         path = self.run.episode_file(self.run.next_episode_number())

@@ -1,7 +1,6 @@
-"""What happens at the boundaries between updates: metrics, evaluation, checkpoints, stopping.
+"""A training: play, learn, and at the boundaries between updates write metrics, evaluate, save and stop.
 
-SB3 calls `on_rollout_start` after each update and before the next step. All of rlctl's own work is done there, so
-that a checkpoint never falls inside a rollout. What is decided there is decided by steps, never by the clock, but for
+A checkpoint never falls inside a segment. What is done at a boundary is decided by steps, never by the clock, but for
 when to write a checkpoint, which changes nothing: so a run that was resumed is the run that was never stopped.
 """
 
@@ -9,18 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import time
-
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from pathlib import Path
+from typing import Any
 
 from rlctl.errors import ArtifactError, Interrupted, RlctlError, TaskError, UsageError
 from rlctl.eval.statistics import mean_return, success_rate
 from rlctl.rollout.collect import Episode
-from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
-from rlctl.train import faults, measurements, snapshot, table_rows
-from rlctl.train.checkpoint import Checkpoint
+from rlctl.train import measurements, space_monitor, status, table_rows
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
 from rlctl.train.episodes import EpisodeKeeper
@@ -29,8 +25,8 @@ from rlctl.train.findings import FindingReporter
 from rlctl.train.finite import check_finite
 from rlctl.train.pack import pack
 from rlctl.train.progress import Progress
+from rlctl.train.rollouts import Rollouts
 from rlctl.train.saving import Packed, Saver
-from rlctl.train.vec_env import WorkerVecEnv
 
 _OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
 
@@ -39,199 +35,187 @@ _OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy upda
 class Learner:
     """What learns, where it learns, and how far it has come."""
 
-    model: BaseAlgorithm
-    env: WorkerVecEnv
+    recipe: Recipe
+    rollouts: Rollouts
     curriculum: Curriculum
     progress: Progress
-
-
-class TrainingStopped(Exception):
-    """Ends SB3's `learn` at a boundary; nothing is wrong."""
 
 
 class _StopRequested(Exception):
     """A signal came while evaluation episodes were played."""
 
 
-class TrainingLoop(BaseCallback):
-    """Runs at every boundary; raises `TrainingStopped` when the recipe's success rate holds."""
+class TrainingLoop:
+    """A training that is prepared, with its run folder."""
 
-    def __init__(
-        self,
-        run: RunDirectory,
-        recipe: Recipe,
-        learner: Learner,
-        evaluator: Evaluator,
-        saver: Saver,
-        display: Display,
-        resumed: Checkpoint | None = None,
-    ) -> None:
-        super().__init__()
-        self.run_directory = run
-        self.recipe = recipe
-        self.model = learner.model
-        self.env = learner.env
+    def __init__(self, learner: Learner, evaluator: Evaluator, saver: Saver, display: Display) -> None:
+        self.recipe = learner.recipe
+        self.rollouts = learner.rollouts
         self.curriculum = learner.curriculum
         self.progress = learner.progress
         self.saver = saver
-        self.display = display
         self.stop_signal: int | None = None
-        self.episodes = EpisodeKeeper(run, learner.curriculum.goal_spec, learner.curriculum.goal)
+        """The number of the signal that asks to stop at the next boundary."""
+        self._model: Any = learner.rollouts.model
+        self._env = learner.rollouts.env
         self._evaluator = evaluator
-        self._findings = FindingReporter(run, display.message)
-        self._resumed = resumed
+        self._display = display
+        self._episodes = EpisodeKeeper(saver, learner.curriculum.goal_spec, learner.curriculum.goal)
+        self._findings = FindingReporter(saver.run, display.message)
         self._stop_announced = False
         self._started = time.monotonic() - self.progress.seconds
-        self._last_row = (time.monotonic(), self.model.num_timesteps)
+        self._last_row = (time.monotonic(), self.steps)
 
-    def _on_step(self) -> bool:
-        self.display.steps(self.model.num_timesteps)
-        self.announce_stop()
-        return True
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self._model.num_timesteps)
 
-    def announce_stop(self) -> None:
-        """Show, once, that a signal has been taken."""
-        if self.stop_signal is not None and not self._stop_announced:
-            self._stop_announced = True
-            self.display.message(
-                "stopping after this update, with a checkpoint; press Ctrl-C again to stop immediately"
-            )
+    def run(self) -> None:
+        """Play and learn until the recipe's steps are done, or its success rate holds.
 
-    def _on_rollout_start(self) -> None:
-        resumed, self._resumed = self._resumed, None
-        if resumed is not None and not resumed.state.at_end:
-            # gSDE has just drawn, as it had when the checkpoint was taken.
-            snapshot.restore_randomness(self.model, resumed.tensors, resumed.state.model)
-        if self.model.num_timesteps > 0:
-            self.boundary()
-        elif self.saver.saved_step is None:
-            # The first update may be minutes away: better to know now what cannot be saved.
-            self._take_ended()
+        Raises `Interrupted` after a signal, when the state is saved.
+        """
+        total = self.recipe.total_timesteps
+        if self.recipe.stages:
+            self._display.stage(self.curriculum.title)
+        self._display.phase("first steps")
+        try:
+            self.rollouts.begin(total)
+            while self.steps < total:
+                if self.boundary():
+                    return
+                self.rollouts.advance(self._announce_stop)
+                self._display.steps(self.steps)
+            self.finish()
+        except TaskError as error:
+            raise self._explain_fault(error) from None
+        except ValueError:
+            self._check_finite()  # SB3 notices NaN weights by a distribution's complaint
+            raise
+
+    def boundary(self) -> bool:
+        """Do what is due between two updates and was not done before a resume; return whether nothing is left to do."""
+        steps = self.steps
+        self._take_ended()
+        if steps == 0:
+            self._begin()
+            return False
+        stage_done = self.curriculum.is_due(steps)
+        if stage_done or self.recipe.algo in ON_POLICY or steps >= self.progress.next_row:
+            self._write_metrics()
+        if stage_done:
+            self._begin_next_stage()
+        self._stop_if_requested()
+        if steps >= self.progress.next_eval:
+            self.evaluate()
+            if self.recipe.stop_success is not None and self.progress.good_in_a_row >= 2:
+                self._save_the_end()
+                return True
+            self._stop_if_requested()
+        if self.saver.checkpoint_is_due():
+            self.save_checkpoint()
+        return False
+
+    def _begin(self) -> None:
+        """Save what the training begins with: better to know now what cannot be saved than after the first update."""
+        if self.saver.saved_step is None:
             if self.progress.next_eval == 0:
                 self.evaluate()
             self.save_checkpoint()
 
-    def boundary(self) -> None:
-        """Do everything that is due after an update, except what the resumed checkpoint has done already."""
-        steps = self.model.num_timesteps
+    def finish(self) -> None:
+        """Evaluate and save what the training ended with; raises `ArtifactError` if it cannot be saved."""
         self._take_ended()
-        stage_done = self.curriculum.is_due(steps)
-        self._write_metrics_if_due(steps, stage_done)
-        if stage_done:
-            self._begin_next_stage(steps)
-        self._stop_if_requested()
-        if steps >= self.progress.next_eval:
+        stage_done = self.curriculum.is_due(self.steps)
+        self._write_metrics()
+        if stage_done:  # for a resume that makes the run longer
+            self._begin_next_stage()
+        if self.progress.last_eval < self.steps:
             self.evaluate()
-            if self._is_good_enough():
-                self._save_the_end(at_end=False)
-                raise TrainingStopped
-            self._stop_if_requested()
-        if self.saver.checkpoint_is_due():
-            self.save_checkpoint()
+        self._save_the_end()
 
     def _take_ended(self) -> None:
-        ended = self.env.take_ended()
+        ended = self._env.take_ended()
         self.progress.recent += ended
         self.curriculum.count(ended)
-        if warning := self.curriculum.warning():
-            self.display.message(warning)
-        if warning := self.env.monitor.report(self.progress):
-            self.display.message(warning)
+        for warning in (self.curriculum.warning(), self._env.monitor.report(self.progress)):
+            if warning:
+                self._display.message(warning)
 
-    def _begin_next_stage(self, steps: int) -> None:
-        self.env.workers.rebuild(self.curriculum.next_spec())
-        begin_next_episodes(self.model)
-        self.display.stage(*self.curriculum.enter_next_stage(steps))
+    def _begin_next_stage(self) -> None:
+        self._env.workers.rebuild(self.curriculum.next_spec())
+        begin_next_episodes(self._model)
+        self._display.stage(*self.curriculum.enter_next_stage(self.steps))
 
-    def _is_good_enough(self) -> bool:
-        return self.recipe.stop_success is not None and self.progress.good_in_a_row >= 2
+    def _announce_stop(self) -> None:
+        """Show, once, that a signal has been taken."""
+        if self.stop_signal is not None and not self._stop_announced:
+            self._stop_announced = True
+            self._display.message(
+                "stopping after this update, with a checkpoint; press Ctrl-C again to stop immediately"
+            )
 
     def _stop_if_requested(self) -> None:
         if self.stop_signal is not None:
-            self._stop(self.stop_signal, at_end=False)
+            self._stop(self.stop_signal)
 
-    def _stop(self, number: int, *, at_end: bool) -> None:
-        saved = self.save_checkpoint(at_end=at_end)
+    def _stop(self, number: int) -> None:
+        saved = self.save_checkpoint()
         state = "checkpoint saved" if saved else "the last saved checkpoint stands"
         raise Interrupted(
-            f"interrupted at step {self.model.num_timesteps:,}; {state}. Go on with: "
-            f"rlctl train --resume {self.run_directory.path}",
+            f"interrupted at step {self.steps:,}; {state}. Go on with: rlctl train --resume {self.saver.run.path}",
             number,
         )
 
-    def finish(self) -> None:
-        """Evaluate and save what the training ended with; raises `ArtifactError` if it cannot be saved."""
-        steps = self.model.num_timesteps
-        self._take_ended()
-        stage_done = self.curriculum.is_due(steps)
-        self._write_metrics_if_due(steps, True)
-        if stage_done:  # for a resume that makes the run longer
-            self._begin_next_stage(steps)
-        if self.progress.last_eval < steps:
-            self.evaluate(at_end=True)
-        self.logger.dump(steps)
-        self._save_the_end(at_end=True)
-
-    def _save_the_end(self, *, at_end: bool) -> None:
-        self.progress.done = True
-        if not self.saver.retry(lambda: self.save_checkpoint(at_end=at_end)):
-            raise ArtifactError(
-                f"{self.run_directory.path}: the training is done, but could not be saved: {self.saver.problem}"
-            )
-
-    def _write_metrics_if_due(self, steps: int, anyway: bool) -> None:
-        due = anyway or self.recipe.algo in ON_POLICY or steps >= self.progress.next_row
-        if due and steps > self.progress.last_row:
-            check_finite(self.model, self.run_directory.path)
-            self._write_metrics(steps)
-            self.progress.last_row = steps
-            self.progress.next_row = steps + max(1, self.recipe.total_timesteps // _OFF_POLICY_ROWS)
-
-    def _write_metrics(self, steps: int) -> None:
+    def _write_metrics(self) -> None:
+        """Write a row of metrics, and the same to TensorBoard, if there were steps since the last one."""
+        steps, progress, logger = self.steps, self.progress, self._model.logger
+        if steps <= progress.last_row:
+            return
+        self._check_finite()
         now = time.monotonic()
         before, steps_before = self._last_row
         self._last_row = (now, steps)
-        recent, self.progress.recent = self.progress.recent, []
-        terms = list(self.env.workers.info.reward_weights)
         elapsed = max(now - before, 1e-9)
+        recent, progress.recent = progress.recent, []
         row = {
             "steps": steps,
             "seconds": round(now - self._started, 3),
             "fps": round((steps - steps_before) / elapsed, 1),
-            "playing": round(self.env.waited_s / elapsed, 3),
+            "playing": round(self._env.waited_s / elapsed, 3),
             **self.curriculum.columns(),
-            **table_rows.training_row(recent, terms, self.logger.name_to_value),
-            **measurements.measure(self.model, self.env, self.progress.last_row, self.recipe.total_timesteps),
+            **table_rows.training_row(recent, self._env.workers.info.reward_weights, logger.name_to_value),
+            **measurements.measure(self._model, self._env, progress.last_row, self.recipe.total_timesteps),
         }
-        self.env.waited_s = 0.0
+        self._env.waited_s = 0.0
         self.saver.row(self.saver.metrics, row)
-        for name, number in self.curriculum.columns().items():
-            self.logger.record(f"curriculum/{name}", number)
-        for column, name in (
-            ("distance", "rollout/final_distance"),
-            *((f"term/{t}", f"reward_terms/{t}") for t in terms),
-        ):
-            if (value := row[column]) is not None:
-                self.logger.record(name, value)
-        self.display.metrics(row)
+        for name, value in table_rows.tensorboard_values(row).items():
+            logger.record(name, value)
+        self._model.dump_logs()
+        self._display.metrics(row)
+        progress.last_row = steps
+        progress.next_row = steps + max(1, self.recipe.total_timesteps // _OFF_POLICY_ROWS)
 
-    def evaluate(self, *, at_end: bool = False) -> None:
+    def evaluate(self) -> None:
         """Play the evaluation episodes, save the best policy, and write the row and the episodes.
 
         An environment that fails costs this evaluation, not the training.
         """
-        steps, began = self.model.num_timesteps, time.monotonic()
+        steps, began = self.steps, time.monotonic()
         packed = self._pack()
-        self.display.phase("evaluating")
+        self._display.phase("evaluating")
         try:
-            self._record_evaluation(self._evaluator.run(*packed, self._raise_if_stop_requested), packed)
+            episodes = self._evaluator.run(*packed, self._raise_if_stop_requested)
         except _StopRequested:
             assert self.stop_signal is not None
-            self._stop(self.stop_signal, at_end=at_end)
+            self._stop(self.stop_signal)
         except (TaskError, UsageError, ArtifactError) as error:  # the last two where files were removed meanwhile
-            self._evaluation_failed(error)
+            self._note_failed_evaluation(error)
+        else:
+            self._note_evaluation(episodes, packed)
         self.progress.last_eval = steps
-        if not at_end:
+        if steps < self.recipe.total_timesteps:  # at the end all of it is said
             self._findings.report_new()
         while self.progress.next_eval <= steps:
             self.progress.next_eval += self.recipe.eval.every_steps or self.recipe.total_timesteps
@@ -243,18 +227,18 @@ class TrainingLoop(BaseCallback):
         if self.stop_signal is not None:
             raise _StopRequested
 
-    def _evaluation_failed(self, error: RlctlError) -> None:
-        progress, steps = self.progress, self.model.num_timesteps
+    def _note_failed_evaluation(self, error: RlctlError) -> None:
+        progress, steps = self.progress, self.steps
         progress.failed_evaluations += 1
         progress.first_failure = progress.first_failure or f"at step {steps:,}: {error}"
-        error = faults.keep_episode(error, self.curriculum.goal_spec, self.saver, self.episodes, steps)
-        self.display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
+        error = self._episodes.keep_failed(error, self.curriculum.goal_spec, steps)
+        self._display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
 
-    def _record_evaluation(self, episodes: list[Episode], packed: Packed) -> None:
-        progress, steps = self.progress, self.model.num_timesteps
+    def _note_evaluation(self, episodes: list[Episode], packed: Packed) -> None:
+        progress, steps, logger = self.progress, self.steps, self._model.logger
         results = [episode.result for episode in episodes]
         success, mean = success_rate(results), mean_return(results)
-        better = self._is_better(success, mean)
+        better = progress.is_better(success, mean)
         if better:
             info = packed[0].model_copy(update={"evaluation": Score(success=success, mean_return=mean)})
             self.saver.save_best((info, packed[1]))
@@ -269,30 +253,46 @@ class TrainingLoop(BaseCallback):
             **table_rows.evaluation_row(results),
         }
         self.saver.row(self.saver.evals, row)
-        self.logger.record("eval/mean_reward", mean)
+        logger.record("eval/mean_reward", mean)
         if success is not None:
-            self.logger.record("eval/success_rate", success)
-        self.saver.attempt("episodes", lambda: self.episodes.keep(episodes, steps))
-        self.display.evaluation(steps, success, mean, better)
+            logger.record("eval/success_rate", success)
+        logger.dump(steps)
+        self.saver.attempt("episodes", lambda: self._episodes.keep(episodes, steps))
+        self._display.evaluation(steps, success, mean, better)
 
     def _pack(self) -> Packed:
-        goal = self.curriculum
-        return pack(self.model, self.recipe.algo, goal.goal_spec, goal.goal, goal.specs())
+        info, tensors = pack(self._model, self.recipe.algo, self.curriculum.goal_spec, self.curriculum.goal)
+        return info.model_copy(update={"stages": self.curriculum.specs()}), tensors
 
-    def _is_better(self, success: float | None, mean: float) -> bool:
-        best = self.progress
-        if best.best_step is None:
-            return True
-        if success is not None and best.best_success is not None and success != best.best_success:
-            return success > best.best_success
-        return best.best_return is None or mean > best.best_return
-
-    def explain_fault(self, error: TaskError) -> TaskError:
-        """Keep the actions of the episode that failed, and return the error with what to do next."""
-        return faults.explain_fault(error, self.run_directory, self.env, self.saver, self.episodes)
-
-    def save_checkpoint(self, *, at_end: bool = False) -> bool:
+    def save_checkpoint(self) -> bool:
         """Write a checkpoint of the present boundary; False, with a warning, if the disk does not take it."""
-        check_finite(self.model, self.run_directory.path)
+        self._check_finite()
         self.progress.seconds = time.monotonic() - self._started
-        return self.saver.checkpoint(self._pack, self.progress, at_end=at_end)
+        return self.saver.checkpoint(self._pack, self.progress)
+
+    def _check_finite(self) -> None:
+        check_finite(self._model, self.saver.run.path)
+
+    def _save_the_end(self) -> None:
+        self.progress.done = True
+        if not self.saver.retry(self.save_checkpoint):
+            raise ArtifactError(
+                f"{self.saver.run.path}: the training is done, but could not be saved: {self.saver.problem}"
+            )
+
+    def _explain_fault(self, error: TaskError) -> TaskError:
+        """Keep the actions of the training episode that failed, and return the error with what to do next."""
+        lines = [str(self._episodes.keep_failed(error, self._env.workers.spec))]
+        if step := self.saver.saved_step:  # at step 0 there is nothing to keep
+            lines.append(
+                f"the checkpoint of step {step:,} stands; go on with: rlctl train --resume {self.saver.run.path}"
+            )
+        return TaskError("\n".join(lines), details=error.details)
+
+    def write_end(self, recordings: int) -> list[Path]:
+        """Write that the training is done; return the requested recordings of the last evaluation's episodes."""
+        if warning := space_monitor.summarize(self.progress):
+            self._display.message(warning)
+        write = lambda: status.write_end(self.saver.run, self.steps, self.progress)  # noqa: E731
+        self.saver.retry(lambda: self.saver.attempt("run.json", write))
+        return self._episodes.record(recordings)

@@ -5,101 +5,74 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from rlctl.dict_spaces import join, split_space
 from rlctl.run.acting import Exploration
-from rlctl.train.segments import (
-    acting_statistics,
-    send_policy,
-    to_network_layout,
-    update_observation_statistics,
-    update_reward_statistics,
-)
+from rlctl.run.recipe import Recipe
+from rlctl.train.progress import Progress
+from rlctl.train.rollouts import Check, Rollouts, to_network_layout
 from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
 
 _LONGEST = 1000
 """Steps after which an episode without a time limit is stored in parts."""
+_DETERMINISTIC_EXPLORERS = frozenset({"td3", "ddpg"})
 
 
-class ChunkRollouts(OffPolicyAlgorithm):
-    """Replaces SB3's loop of one step and some updates, in which learner and environments wait for each other.
+class OffPolicyRollouts(Rollouts):
+    """Plays `train_freq` steps or episodes, a chunk, into the replay buffer.
 
     With `overlap` a chunk is played with the policy from before the updates that the chunk before it is due, while
     these are computed: it is one chunk older than without. The order follows from steps alone, so it repeats exactly.
+    The last chunk's updates stay due then: a run made longer does them beside its next chunk, as one that was that long
+    from the beginning.
     """
 
-    algorithm_name = ""
-    overlap = True
-    action_noise_scale = 0.0
-    policy_plays_warmup = False
-    """Whether the steps before the first update are played by the policy, which is a trained one, and not at random."""
-    steps_to_learn = 0
-    """Environment steps that are in the replay buffer and that no update is done for yet."""
+    def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
+        super().__init__(model, env, recipe, progress)
+        # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
+        self.overlap = recipe.overlap and recipe.her is None
+        default = 0.1 if recipe.algo in _DETERMINISTIC_EXPLORERS else 0.0  # else they would not explore at all
+        self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
 
-    def learn(self, total_timesteps: int, callback: Any = None, **options: Any) -> Any:  # type: ignore[override]
-        """Train until `total_timesteps` more environment steps are done."""
-        total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps=False, tb_log_name="run")
-        callback.on_training_start(locals(), globals())
-        while self.num_timesteps < total:
-            callback.on_rollout_start()
-            self._start_chunk()
-            if self.overlap:
-                self._learn_from_chunk()
-            self._finish_chunk(callback)
-            if not self.overlap:
-                self._learn_from_chunk()
-        # With overlap the last chunk's updates stay due: a run made longer does them beside its next chunk, as one that
-        # was that long from the beginning.
-        callback.on_training_end()
-        return self
-
-    @property
-    def _workers_env(self) -> WorkerVecEnv:
-        env: Any = self.env
-        found: WorkerVecEnv = env.unwrapped
-        return found
-
-    def _start_chunk(self) -> None:
-        self.policy.set_training_mode(False)
-        env = self._workers_env
-        send_policy(self, self.algorithm_name, env, acting_statistics(self))
-        frequency, unit = self.train_freq.frequency, self.train_freq.unit  # type: ignore[union-attr]
+    def start(self) -> None:
+        self.send_policy(self.acting_statistics())
+        frequency, unit = self.model.train_freq
         self._episodes_left = frequency if unit == TrainFrequencyUnit.EPISODE else 0
-        steps = env.workers.info.max_steps or _LONGEST if self._episodes_left else frequency
-        env.start(steps, self._exploration(), until_end=bool(self._episodes_left))
+        if self._episodes_left:
+            self._start_episode()
+        else:
+            self.env.start(frequency, self._exploration())
+
+    def _start_episode(self) -> None:
+        self.env.start(self.env.workers.info.max_steps or _LONGEST, self._exploration(), until_end=True)
 
     def _exploration(self) -> Exploration:
-        plays = self.policy_plays_warmup or (self.use_sde and self.use_sde_at_warmup)
+        model = self.model
+        plays = self.policy_plays_warmup or (model.use_sde and model.use_sde_at_warmup)
         return Exploration(
             stochastic=True,
-            warmup=self.num_timesteps < self.learning_starts and not plays,
-            epsilon=float(getattr(self, "exploration_rate", 0.0)),
-            action_noise=self.action_noise_scale,
-            sde_every=max(self.sde_sample_freq, 0) if self.use_sde else 0,
+            warmup=model.num_timesteps < model.learning_starts and not plays,
+            epsilon=float(getattr(model, "exploration_rate", 0.0)),
+            action_noise=self._action_noise,
+            sde_every=max(model.sde_sample_freq, 0) if model.use_sde else 0,
         )
 
-    def _finish_chunk(self, callback: BaseCallback) -> None:
-        env = self._workers_env
+    def finish(self, check: Check | None) -> None:
         while True:
-            segment = env.finish(getattr(callback, "announce_stop", None))
+            segment = self.env.finish(check)
             self._store(segment)
-            callback.on_step()
             self._episodes_left -= len(segment.infos)
             if self._episodes_left <= 0:
                 return
-            steps = env.workers.info.max_steps or _LONGEST
-            env.start(steps, self._exploration(), until_end=True)
+            self._start_episode()
 
     def _store(self, segment: PlayedSegment) -> None:
         """Put a chunk into the replay buffer, raw, and do what SB3 does after each step."""
-        spaces = split_space(self.observation_space)
+        model, spaces = self.model, split_space(self.model.observation_space)
         observation = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.observation.items()}
         final = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.final.items()}
         done, timeouts = segment.done, segment.truncated & ~segment.terminated
-        buffer: Any = self.replay_buffer
         for step in range(done.shape[1]):
             now = {key: rows[:, step] for key, rows in observation.items()}
             after = {key: rows[:, step + 1] for key, rows in observation.items()}
@@ -109,29 +82,21 @@ class ChunkRollouts(OffPolicyAlgorithm):
                     rows[ended] = final[key][ended, step]
             infos = [{"TimeLimit.truncated": bool(each)} for each in timeouts[:, step]]
             reward = segment.reward[:, step].astype(np.float32)
-            buffer.add(join(now), join(after), segment.stored[:, step], reward, ended, infos)
-            self.num_timesteps += len(reward)
-            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self._on_step()
-        self.steps_to_learn += done.size
-        update_reward_statistics(self, segment)
-        update_observation_statistics(self, segment)
-        self._last_obs = segment.last_observation
-        self._last_original_obs = segment.last_observation
-        self._last_episode_starts = done[:, -1]
-        self._log_episodes(segment)
+            model.replay_buffer.add(join(now), join(after), segment.stored[:, step], reward, ended, infos)
+            model.num_timesteps += len(reward)
+            model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
+            model._on_step()
+        self._progress.steps_to_learn += done.size
+        model._episode_num += len(segment.infos)
+        self.update_reward_statistics(segment)
+        self.finish_segment(segment)
+        model._last_original_obs = segment.last_observation
 
-    def _log_episodes(self, segment: PlayedSegment) -> None:
-        for info in segment.infos:
-            self._update_info_buffer([info], np.ones(1, np.bool_))
-            self._episode_num += 1
-            if self._episode_num % 4 == 0:  # as SB3 by default
-                self.dump_logs()
-
-    def _learn_from_chunk(self) -> None:
+    def learn(self) -> None:
         """Do the updates that are due for the last chunk."""
-        steps, self.steps_to_learn = self.steps_to_learn, 0
-        if steps and self.num_timesteps > self.learning_starts:
-            updates = self.gradient_steps if self.gradient_steps >= 0 else steps
+        model = self.model
+        steps, self._progress.steps_to_learn = self._progress.steps_to_learn, 0
+        if steps and model.num_timesteps > model.learning_starts:
+            updates = model.gradient_steps if model.gradient_steps >= 0 else steps
             if updates > 0:
-                self.train(batch_size=self.batch_size, gradient_steps=updates)
+                model.train(batch_size=model.batch_size, gradient_steps=updates)

@@ -11,21 +11,11 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
-from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from rlctl.dict_spaces import join, split, split_space
 from rlctl.run.acting import Exploration
-from rlctl.train.segments import (
-    Statistics,
-    acting_statistics,
-    send_policy,
-    to_network_layout,
-    update_observation_statistics,
-    update_reward_statistics,
-)
+from rlctl.train.rollouts import Check, Rollouts, Statistics, to_network_layout
 from rlctl.train.vec_env import PlayedSegment
 
 Arrays = dict[str, NDArray[Any]]
@@ -34,77 +24,82 @@ _ROWS = 4096
 """Observations in one forward pass."""
 
 
-class SegmentRollouts(OnPolicyAlgorithm):
-    """Replaces SB3's collection of rollouts, which asks the policy at every step."""
+class OnPolicyRollouts(Rollouts):
+    """Plays `n_steps` steps of each environment into the rollout buffer."""
 
-    algorithm_name = ""
+    _statistics: Statistics
 
-    def collect_rollouts(
-        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
-    ) -> bool:
-        """Let the workers play `n_rollout_steps` steps in each environment, and fill the buffer with them."""
-        self.policy.set_training_mode(False)
-        callback.on_rollout_start()
-        workers_env: Any = env.unwrapped
-        statistics = acting_statistics(self)
-        send_policy(self, self.algorithm_name, workers_env, statistics)
-        freq = self.sde_sample_freq if self.use_sde else 0
-        exploration = Exploration(stochastic=True, sde_every=max(freq, 0))
-        segment = workers_env.play(n_rollout_steps, exploration, getattr(callback, "announce_stop", None))
-        self.num_timesteps += env.num_envs * n_rollout_steps
-        self._update_info_buffer(segment.infos, np.ones(len(segment.infos), np.bool_))
-        callback.on_step()
-        rewards = update_reward_statistics(self, segment)
-        self._fill(rollout_buffer, segment, rewards, statistics)
-        update_observation_statistics(self, segment)
-        self._last_obs = segment.last_observation
-        self._last_episode_starts = segment.done[:, -1]
-        callback.on_rollout_end()
-        return True
+    def start(self) -> None:
+        model = self.model
+        self._statistics = self.acting_statistics()
+        self.send_policy(self._statistics)
+        every = model.sde_sample_freq if model.use_sde else 0
+        self.env.start(model.n_steps, Exploration(stochastic=True, sde_every=max(every, 0)))
 
-    def _fill(
-        self,
-        buffer: RolloutBuffer,
-        segment: PlayedSegment,
-        rewards: NDArray[np.float32],
-        statistics: Statistics,
-    ) -> None:
+    def finish(self, check: Check | None) -> None:
+        segment = self.env.finish(check)
+        self.model.num_timesteps += segment.reward.size
+        self._fill_buffer(segment, self.update_reward_statistics(segment))
+        self.finish_segment(segment)
+
+    def learn(self) -> None:
+        self.model.train()
+
+    def _fill_buffer(self, segment: PlayedSegment, rewards: NDArray[np.float32]) -> None:
         """Write a segment into SB3's buffer, whose arrays have the shape (steps, environments, ...)."""
-        prepare = _Preparation(self.observation_space, statistics, self.get_vec_normalize_env())
-        observations = {key: prepare(key, rows) for key, rows in segment.observation.items()}
-        truncated = np.argwhere(segment.truncated & ~segment.terminated)
-        final = {key: prepare(key, rows[tuple(truncated.T)]) for key, rows in segment.final.items()}
-        buffer.reset()
-        starts = np.concatenate([np.asarray(self._last_episode_starts)[:, None], segment.done[:, :-1]], axis=1)
+        model, buffer = self.model, self.model.rollout_buffer
+        inputs = self._prepare(segment)
         with torch.no_grad():
-            judge = _Recurrent if hasattr(self, "_last_lstm_states") else _FeedForward
-            judged = judge(self).judge(observations, segment.stored, starts, segment.done, truncated, final)
-        rewards[tuple(truncated.T)] += self.gamma * judged.final_values
-        self._write(buffer, observations, segment, starts, rewards, judged)
-        buffer.compute_returns_and_advantage(
-            last_values=torch.from_numpy(judged.last_values), dones=segment.done[:, -1].astype(np.float32)
-        )
-
-    def _write(
-        self,
-        buffer: RolloutBuffer,
-        observations: Arrays,
-        segment: PlayedSegment,
-        starts: NDArray[np.bool_],
-        rewards: NDArray[np.float32],
-        judged: Judgement,
-    ) -> None:
+            judge = _Recurrent if hasattr(model, "_last_lstm_states") else _FeedForward
+            judged = judge(model).judge(inputs)
+        rewards[tuple(inputs.truncated.T)] += model.gamma * judged.final_values
+        buffer.reset()
         targets: Any = split(buffer.observations)
-        for key, rows in observations.items():
+        for key, rows in inputs.observations.items():
             targets[key][...] = rows[:, :-1].swapaxes(0, 1).reshape(targets[key].shape)
-        buffer.actions[...] = segment.stored.swapaxes(0, 1)
+        buffer.actions[...] = inputs.actions.swapaxes(0, 1)
         buffer.rewards[...] = rewards.T
-        buffer.episode_starts[...] = starts.T
+        buffer.episode_starts[...] = inputs.starts.T
         buffer.values[...] = judged.values.T
         buffer.log_probs[...] = judged.log_probs.T
         for name, values in judged.states.items():
             getattr(buffer, name)[...] = values
         buffer.pos, buffer.full = buffer.buffer_size, True
+        buffer.compute_returns_and_advantage(
+            last_values=torch.from_numpy(judged.last_values), dones=segment.done[:, -1].astype(np.float32)
+        )
+
+    def _prepare(self, segment: PlayedSegment) -> Inputs:
+        model = self.model
+        prepare = _Preparation(model.observation_space, self._statistics, model.get_vec_normalize_env())
+        truncated = np.argwhere(segment.truncated & ~segment.terminated)
+        starts = np.concatenate([np.asarray(model._last_episode_starts)[:, None], segment.done[:, :-1]], axis=1)
+        return Inputs(
+            {key: prepare(key, rows) for key, rows in segment.observation.items()},
+            segment.stored,
+            starts,
+            segment.done,
+            truncated,
+            {key: prepare(key, rows[tuple(truncated.T)]) for key, rows in segment.final.items()},
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Inputs:
+    """A segment as the networks need it; arrays of shape (environments, steps, ...)."""
+
+    observations: Arrays
+    """Normalised; one row more than steps: what followed the last."""
+    actions: NDArray[Any]
+    """As the policy chose them."""
+    starts: NDArray[np.bool_]
+    """Where an episode began."""
+    done: NDArray[np.bool_]
+    """Where one ended."""
+    truncated: NDArray[np.int64]
+    """Environment and step of each that was truncated, shape (episodes, 2)."""
+    final: Arrays
+    """What those ended with, shape (episodes, ...)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,19 +136,13 @@ class _Preparation:
 class _FeedForward:
     """Judges all steps of a segment at once."""
 
-    def __init__(self, model: OnPolicyAlgorithm) -> None:
+    def __init__(self, model: Any) -> None:
         self._model = model
-        self._policy: Any = model.policy
+        self._policy = model.policy
 
-    def judge(
-        self,
-        observations: Arrays,
-        actions: NDArray[Any],
-        starts: NDArray[np.bool_],
-        done: NDArray[np.bool_],
-        truncated: NDArray[np.int64],
-        final: Arrays,
-    ) -> Judgement:
+    def judge(self, inputs: Inputs) -> Judgement:
+        """Return values and log-probabilities of a segment."""
+        observations, actions = inputs.observations, inputs.actions
         n_envs, steps = actions.shape[:2]
         flat = {key: rows[:, :-1].reshape(n_envs * steps, *rows.shape[2:]) for key, rows in observations.items()}
         chosen = self._actions(actions.reshape(n_envs * steps, -1))
@@ -167,7 +156,7 @@ class _FeedForward:
             torch.cat(values).cpu().numpy().reshape(shape),
             torch.cat(log_probs).cpu().numpy().reshape(shape),
             self._values({key: rows[:, -1] for key, rows in observations.items()}, n_envs),
-            self._values(final, len(truncated)),
+            self._values(inputs.final, len(inputs.truncated)),
         )
 
     def _values(self, observations: Arrays, count: int) -> NDArray[np.float32]:
@@ -187,17 +176,10 @@ class _FeedForward:
 class _Recurrent(_FeedForward):
     """Judges a segment step by step, as its LSTMs go on."""
 
-    def judge(
-        self,
-        observations: Arrays,
-        actions: NDArray[Any],
-        starts: NDArray[np.bool_],
-        done: NDArray[np.bool_],
-        truncated: NDArray[np.int64],
-        final: Arrays,
-    ) -> Judgement:
-        model: Any = self._model
-        policy, states = self._policy, model._last_lstm_states
+    def judge(self, inputs: Inputs) -> Judgement:
+        """Return values and log-probabilities of a segment, and the states that they came from."""
+        observations, actions, truncated = inputs.observations, inputs.actions, inputs.truncated
+        model, policy, states = self._model, self._policy, self._model._last_lstm_states
         n_envs, steps = actions.shape[:2]
         values, log_probs = np.zeros((2, n_envs, steps), np.float32)
         final_values = np.zeros(len(truncated), np.float32)
@@ -205,38 +187,38 @@ class _Recurrent(_FeedForward):
         for step in range(steps):
             before.append([part.cpu().numpy() for pair in (states.pi, states.vf) for part in pair])
             observed = self._tensor(observations, (slice(None), step))
-            begins = torch.as_tensor(starts[:, step].astype(np.float32), device=model.device)
-            value, log_prob, states = _recurrent_step(policy, observed, self._actions(actions[:, step]), states, begins)
+            begins = torch.as_tensor(inputs.starts[:, step].astype(np.float32), device=model.device)
+            value, log_prob, states = self._step(observed, self._actions(actions[:, step]), states, begins)
             values[:, step], log_probs[:, step] = value.cpu().numpy(), log_prob.cpu().numpy()
             for index in np.flatnonzero(truncated[:, 1] == step):
                 env = int(truncated[index, 0])
                 state = tuple(part[:, env : env + 1].contiguous() for part in states.vf)
-                ended = self._tensor(final, slice(index, index + 1))
+                ended = self._tensor(inputs.final, slice(index, index + 1))
                 final_values[index] = policy.predict_values(ended, state, torch.zeros(1, device=model.device)).item()
         model._last_lstm_states = states
-        begins = torch.as_tensor(done[:, -1].astype(np.float32), device=model.device)
+        begins = torch.as_tensor(inputs.done[:, -1].astype(np.float32), device=model.device)
         last = policy.predict_values(self._tensor(observations, (slice(None), -1)), states.vf, begins)
         names = ("hidden_states_pi", "cell_states_pi", "hidden_states_vf", "cell_states_vf")
         stored = {name: np.stack(parts) for name, parts in zip(names, zip(*before, strict=True), strict=True)}
         return Judgement(values, log_probs, last.flatten().cpu().numpy(), final_values, stored)
 
-
-def _recurrent_step(
-    policy: Any, observed: Any, actions: torch.Tensor, states: RNNStates, begins: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, RNNStates]:
-    """Return values, log-probabilities of given actions and the next states; as sb3-contrib's `forward` does."""
-    features = policy.extract_features(observed)
-    for_actor, for_critic = (features, features) if policy.share_features_extractor else features
-    latent_pi, after_pi = policy._process_sequence(for_actor, states.pi, begins, policy.lstm_actor)
-    if policy.lstm_critic is not None:
-        latent_vf, after_vf = policy._process_sequence(for_critic, states.vf, begins, policy.lstm_critic)
-    elif policy.shared_lstm:
-        latent_vf, after_vf = latent_pi.detach(), tuple(part.detach() for part in after_pi)
-    else:
-        latent_vf, after_vf = policy.critic(for_critic), after_pi
-    values = policy.value_net(policy.mlp_extractor.forward_critic(latent_vf)).flatten()
-    distribution = policy._get_action_dist_from_latent(policy.mlp_extractor.forward_actor(latent_pi))
-    return values, distribution.log_prob(actions), RNNStates(after_pi, after_vf)
+    def _step(
+        self, observed: Any, actions: torch.Tensor, states: RNNStates, begins: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, RNNStates]:
+        """Return values, log-probabilities of given actions and the next states; as sb3-contrib's `forward` does."""
+        policy = self._policy
+        features = policy.extract_features(observed)
+        for_actor, for_critic = (features, features) if policy.share_features_extractor else features
+        latent_pi, after_pi = policy._process_sequence(for_actor, states.pi, begins, policy.lstm_actor)
+        if policy.lstm_critic is not None:
+            latent_vf, after_vf = policy._process_sequence(for_critic, states.vf, begins, policy.lstm_critic)
+        elif policy.shared_lstm:
+            latent_vf, after_vf = latent_pi.detach(), tuple(part.detach() for part in after_pi)
+        else:
+            latent_vf, after_vf = policy.critic(for_critic), after_pi
+        values = policy.value_net(policy.mlp_extractor.forward_critic(latent_vf)).flatten()
+        distribution = policy._get_action_dist_from_latent(policy.mlp_extractor.forward_actor(latent_pi))
+        return values, distribution.log_prob(actions), RNNStates(after_pi, after_vf)
 
 
 def _slices(count: int) -> Iterator[slice]:

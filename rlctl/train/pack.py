@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from numpy.typing import NDArray
@@ -17,9 +16,7 @@ from rlctl.run.policy import PolicyInfo, collect_versions
 from rlctl.run.torch_policy import describe_network, policy_name
 
 
-def pack(
-    model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo, stages: Sequence[EnvSpec] = ()
-) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
+def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
     """Return description and tensors of a model's policy, with the normalisation it has now.
 
     The arrays are copies: training may go on.
@@ -38,7 +35,6 @@ def pack(
         normalized_keys=list(statistics),
         env=env,
         spec=spec,
-        stages=list(stages),
         training_steps=model.num_timesteps,
         versions=collect_versions(),
     )

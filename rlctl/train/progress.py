@@ -23,6 +23,7 @@ class Progress:
     best_return: float | None = None
     best_step: int | None = None
     good_in_a_row: int = 0
+    """Evaluations in a row that reached the recipe's `stop_success`."""
     failed_evaluations: int = 0
     first_failure: str = ""
     """Why the first of the failed evaluations failed."""
@@ -39,9 +40,19 @@ class Progress:
     """Of so much of them; empty where there was none yet."""
     recent: list[EpisodeResult] = dataclasses.field(default_factory=list)
     """Training episodes that ended after the last row of metrics."""
+    steps_to_learn: int = 0
+    """Environment steps that are in the replay buffer and that no update is done for yet."""
     stage: int = 0
     """Stage of the curriculum, from 1; 0 where there is none."""
     stage_began: int = 0
     """Environment steps before the stage began."""
     stage_episodes: list[float | None] = dataclasses.field(default_factory=list)
     """Success (0 or 1, None where not reported) or return of the stage's last episodes, as its rule wants them."""
+
+    def is_better(self, success: float | None, mean_return: float) -> bool:
+        """Say whether an evaluation is better than the best so far: by success, then by return."""
+        if self.best_step is None:
+            return True
+        if success is not None and self.best_success is not None and success != self.best_success:
+            return success > self.best_success
+        return self.best_return is None or mean_return > self.best_return

@@ -11,7 +11,7 @@ from typing import Any
 
 from rlctl.errors import ArtifactError
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import PolicyInfo, read_policy, save_policy
+from rlctl.run.policy import PolicyInfo, save_policy
 from rlctl.run.table import Table
 from rlctl.train.checkpoint import Checkpoints
 from rlctl.train.progress import Progress
@@ -29,52 +29,37 @@ _REMIND_EVERY_S = 60.0
 class Saver:
     """Writes tables, policies and checkpoints. What cannot be written costs a warning and is tried again."""
 
-    def __init__(
-        self,
-        run: RunDirectory,
-        checkpoints: Checkpoints,
-        warn: Callable[[str], None],
-        write_again: Callable[[], object],
-    ) -> None:
+    def __init__(self, run: RunDirectory, checkpoints: Checkpoints, warn: Callable[[str], None]) -> None:
+        self.run = run
         self.metrics = Table(run.metrics_file)
         self.evals = Table(run.evals_file)
         self.saved_step: int | None = None
         """Step of the last checkpoint that is whole on the disk."""
         self.problem = ""
         """What could not be written the last time, and why."""
-        self._run = run
         self._checkpoints = checkpoints
         self._warn = warn
-        self._write_again = write_again
         self._next_checkpoint = time.monotonic()
         self._uncounted_checkpoints = 1
         """Checkpoints that come whether they are due or not: the last one."""
         self._last_bytes = 0
         self._reminded = 0.0
-        self._best = _policy_of(run)
-        """The best policy: to be written again if the disk does not take it, or loses it."""
-        self._best_waits = False
+        self._unsaved_best: Packed | None = None
+        """The best policy, until the disk takes it."""
 
     def attempt(self, what: str, write: Callable[[], object]) -> bool:
-        """Write something; False, with a warning, if the disk does not take it."""
+        """Write something; False, with a warning, if the disk does not take it.
+
+        Raises `ArtifactError` if somebody has removed the run.
+        """
+        if not self.run.status_file.exists():
+            raise ArtifactError(f"{self.run.path}: was removed while it trained, so nothing can be saved; train anew")
         try:
-            if not self._run.status_file.exists():
-                self._restore_folder()
             write()
         except OSError as error:
             self._report(f"{what}: {error.strerror or error}")
             return False
         return True
-
-    def _restore_folder(self) -> None:
-        # What is in memory is all that is left of the run, so it is not the moment to give up.
-        gone = not self._run.recipe_file.exists()
-        os.makedirs(self._run.path, exist_ok=True)
-        self._write_again()
-        if gone:
-            self._warn(f"warning: {self._run.path} was removed while training: made anew, without what was in it")
-        else:
-            self._warn(f"warning: {self._run.status_file} was removed while training: written again")
 
     def _report(self, problem: str) -> None:
         if problem != self.problem or time.monotonic() - self._reminded > _REMIND_EVERY_S:
@@ -99,23 +84,23 @@ class Saver:
 
     def save_best(self, packed: Packed) -> None:
         """Write the best policy; one that the disk does not take now is written before the next checkpoint."""
-        self._best, self._best_waits = packed, True
+        self._unsaved_best = packed
         self.attempt("best policy", self._write_best)
 
     def _write_best(self) -> None:
-        if self._best is not None and (self._best_waits or not self._run.best_policy.exists()):
-            save_policy(self._run.best_policy, *self._best)
-        self._best_waits = False
+        if self._unsaved_best is not None:
+            save_policy(self.run.best_policy, *self._unsaved_best)
+        self._unsaved_best = None
 
     def checkpoint_is_due(self) -> bool:
         """Whether the time that checkpoints may take allows one."""
         return time.monotonic() >= self._next_checkpoint
 
-    def checkpoint(self, pack: Callable[[], Packed], progress: Progress, *, at_end: bool = False) -> bool:
+    def checkpoint(self, pack: Callable[[], Packed], progress: Progress) -> bool:
         """Write the last policy and a checkpoint; False, with a warning, if the disk does not take it."""
         began = time.monotonic()
         packed = pack()
-        saved = self.attempt("checkpoint", lambda: self._write_checkpoint(packed, progress, at_end))
+        saved = self.attempt("checkpoint", lambda: self._write_checkpoint(packed, progress))
         if saved:
             self._report_saved_again()
             self.attempt("old checkpoints", self._checkpoints.remove_old)
@@ -129,24 +114,16 @@ class Saver:
             self._warn(f"saved again, at step {self.saved_step:,}")
         self.problem = ""
 
-    def _write_checkpoint(self, packed: Packed, progress: Progress, at_end: bool) -> None:
+    def _write_checkpoint(self, packed: Packed, progress: Progress) -> None:
         # Whoever goes on from a checkpoint will not come by here again: everything before it must be on the disk.
         self.metrics.flush(sync=True)
         self.evals.flush(sync=True)
         progress.metrics_bytes, progress.evals_bytes = self.metrics.size, self.evals.size
         progress.metrics_sha256, progress.evals_sha256 = self.metrics.digest(), self.evals.digest()
         self._write_best()
-        save_policy(self._run.last_policy, *packed)
-        if shutil.disk_usage(self._run.path).free < 2 * self._last_bytes:
+        save_policy(self.run.last_policy, *packed)
+        if shutil.disk_usage(self.run.path).free < 2 * self._last_bytes:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        folder = self._checkpoints.save(packed, progress, at_end=at_end)
+        folder = self._checkpoints.save(packed, progress)
         self._last_bytes = sum(file.stat().st_size for file in folder.iterdir())
         self.saved_step = packed[0].training_steps
-
-
-def _policy_of(run: RunDirectory) -> Packed | None:
-    """Return the best policy that a run has already, when it is resumed."""
-    try:
-        return read_policy(run.best_policy)
-    except ArtifactError:  # there is none yet, or it is damaged: the next evaluation writes one
-        return None

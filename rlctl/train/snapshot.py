@@ -1,6 +1,6 @@
 """Everything in a training's memory that decides how it goes on, as tensors and plain data, and back.
 
-The environments' part is in `vec_env.py`, the replay buffer's in `replay_segments.py`.
+The environments' part is in `checkpoint.py`, the replay buffer's in `replay_segments.py`.
 """
 
 from __future__ import annotations
@@ -23,10 +23,7 @@ Tensors = dict[str, NDArray[Any]]
 
 _COUNTERS = (
     "num_timesteps", "_n_updates", "_episode_num", "_n_calls", "exploration_rate", "_current_progress_remaining",
-    "steps_to_learn",
 )  # fmt: skip
-# What gSDE explores with until it draws again.
-_EXPLORATION = ("exploration_mat", "exploration_matrices")
 
 
 def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
@@ -34,7 +31,7 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
     weights, structure = _flatten(model.get_parameters(), "parameters")
     tensors = {**weights, **_variables(model), **_normalizer_tensors(model)}
     _check_finite(tensors, model.num_timesteps)
-    tensors |= _randomness_tensors(model) | _rollout_tensors(model)
+    tensors |= _randomness_tensors() | _rollout_tensors(model)
     plain = {
         "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
         "parameters": structure,
@@ -60,7 +57,7 @@ def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> No
             if name in plain["counters"]:
                 setattr(model, name, plain["counters"][name])
         _restore_log(model, plain)
-        restore_randomness(model, tensors, plain)
+        _restore_randomness(model, tensors, plain)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise ArtifactError(f"does not fit this recipe: {' '.join(str(error).split())[:200]}") from None
 
@@ -83,44 +80,30 @@ def _log_values(model: BaseAlgorithm) -> list[Any]:
     ]
 
 
-def restore_randomness(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
-    """Restore all random generators and the exploration matrices of gSDE."""
+def _restore_randomness(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
+    """Restore all random generators; gSDE's matrices need not be: updates draw them anew."""
     torch.set_rng_state(torch.from_numpy(tensors["randomness/torch"].copy()))
     keys, position, has_gauss, cached = (tensors[f"randomness/numpy/{part}"] for part in _NUMPY)
     np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(cached)))  # noqa: NPY002 (SB3 draws there)
     version, numbers, gauss = plain["randomness"]["python"]
     random.setstate((version, tuple(numbers), gauss))
     model.action_space.np_random.bit_generator.state = plain["randomness"]["action_space"]
-    explorer = _explorer(model)
-    for name in _EXPLORATION:
-        if f"exploration/{name}" in tensors:
-            setattr(explorer, name, torch.from_numpy(tensors[f"exploration/{name}"].copy()).to(model.device))
 
 
 _NUMPY = ("keys", "position", "has_gauss", "cached")
 
 
-def _randomness_tensors(model: BaseAlgorithm) -> Tensors:
+def _randomness_tensors() -> Tensors:
     name, *state = np.random.get_state()  # noqa: NPY002 (SB3 draws from it)
     assert name == "MT19937"  # numpy's global generator has no other kind
     tensors = {f"randomness/numpy/{part}": np.asarray(value) for part, value in zip(_NUMPY, state, strict=True)}
     tensors["randomness/torch"] = torch.get_rng_state().numpy()
-    explorer = _explorer(model)
-    for attribute in _EXPLORATION:
-        if hasattr(explorer, attribute):
-            tensors[f"exploration/{attribute}"] = _array(getattr(explorer, attribute))
     return tensors
 
 
 def _python_state() -> list[Any]:
     version, numbers, gauss = random.getstate()
     return [version, list(numbers), gauss]
-
-
-def _explorer(model: BaseAlgorithm) -> Any:
-    """Return the distribution that holds gSDE's matrices; something without them where there is none."""
-    policy: Any = model.policy
-    return getattr(getattr(policy, "actor", policy), "action_dist", None)
 
 
 def _check_finite(tensors: Tensors, steps: int) -> None:

@@ -18,41 +18,36 @@ from rlctl.run.task_version import find_git_commit, identify_task
 
 if TYPE_CHECKING:
     from rlctl.train.progress import Progress
+    from rlctl.train.start import Start
 
 _STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
 
 
-def write_start(
-    run: RunDirectory, task: str, recipe: Recipe, device: str, resumed_at: int | None, source: Any = None
-) -> None:
-    """Write the recipe, and that a training runs.
-
-    `resumed_at` is the step it goes on from, `source` what `warm_start.find_source` says of the policy it began with.
-    """
+def write_start(run: RunDirectory, start: Start) -> None:
+    """Write the recipe, and that a training runs."""
+    recipe = start.recipe
     run.write_recipe(recipe)
     changes: dict[str, Any] = {
         "status": "running",
         "error": None,
-        "task": task,
-        **identify_task(task),
+        "task": start.task,
+        **identify_task(start.task),
         "algo": recipe.algo,
         "seed": recipe.seed,
-        "recipe_changes": _find_recipe_changes(task, recipe),
-        "device": device,
+        "recipe_changes": _find_recipe_changes(start.task, recipe),
+        "device": start.request.device,
         "versions": collect_versions(),
         "git_commit": find_git_commit(),
         "command": ["rlctl", *sys.argv[1:]],
         "host": platform.node(),
         "pid": os.getpid(),
     }
-    if resumed_at is not None:
-        changes["resumed"] = _now()
-        changes["resumed_at_step"] = resumed_at
+    if start.run is not None:
+        changes |= {"resumed": _now(), "resumed_at_step": start.step}
     else:
-        changes["started"] = _now()
-        if source is not None:
-            changes["from"] = source
-        changes["folder"] = os.getcwd()  # what a task's path may be relative to
+        changes |= {"started": _now(), "folder": os.getcwd()}  # what a task's path may be relative to
+        if start.source is not None:
+            changes["from"] = start.source
     run.write_status(changes)
 
 
@@ -68,7 +63,8 @@ def _find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
 def write_failure(run: RunDirectory, error: BaseException) -> None:
     """Write what ended a training before its time."""
     kind = _STATUS.get(type(error), "failed")
-    run.write_status({"status": kind, "error": str(error) or repr(error), "ended": _now()})
+    if run.status_file.exists():  # else somebody has removed the run
+        run.write_status({"status": kind, "error": str(error) or repr(error), "ended": _now()})
 
 
 def write_end(run: RunDirectory, steps: int, progress: Progress) -> None:

@@ -1,53 +1,58 @@
-"""SB3's logger, writing TensorBoard files; a full disk or a removed file costs that log, not the training."""
+"""SB3's logger, writing TensorBoard's event files; a full disk costs that log, not the training."""
 
 from __future__ import annotations
 
 import contextlib
-import threading
-from collections.abc import Callable, Iterator, Mapping
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
-from torch.utils.tensorboard.writer import SummaryWriter
+import numpy as np
+import torch
+from stable_baselines3.common.logger import KVWriter, Logger
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.record_writer import RecordWriter
+from torch.utils.tensorboard.summary import histogram
+
+_BINS = 40
 
 
-class _Format(TensorBoardOutputFormat):
-    def __init__(self, folder: Path, first_step: int) -> None:
-        # What was written of these steps before, by an earlier process for example, is not shown twice.
-        self.writer = SummaryWriter(log_dir=str(folder), purge_step=first_step or None)
-        self._is_closed = False
+class _EventFile(KVWriter):
+    """Writes each event when it comes: TensorBoard's own writer does it in a thread, whose errors nobody can catch.
 
-    @property
-    def file(self) -> Path:
-        assert self.writer.file_writer is not None  # it is there until the writer is closed
-        name: str | bytes = self.writer.file_writer.event_writer._file_name
-        return Path(name if isinstance(name, str) else name.decode())
+    Begins another file whenever the one before was not written whole.
+    """
 
-
-class _TensorBoard(KVWriter):
-    """Begins another file whenever the one before is gone or was not written whole."""
-
-    def __init__(self, folder: Path, warn: Callable[[str], None], first_step: int) -> None:
+    def __init__(self, folder: Path, warn: Callable[[str], None]) -> None:
         self._folder = folder
         self._warn = warn
         self._problem = ""
-        self._format: _Format | None = None
-        self._attempt(lambda: self._open(first_step))
-
-    def _open(self, first_step: int) -> _Format:
-        if self._format is None or not self._format.file.exists():
-            self.close()
-            self._folder.mkdir(parents=True, exist_ok=True)
-            self._format = _Format(self._folder, first_step)
-        return self._format
+        self._file: RecordWriter | None = None
 
     def write(self, key_values: dict[str, Any], key_excluded: Mapping[str, tuple[str, ...]], step: int = 0) -> None:
-        self._attempt(lambda: self._open(step).write(key_values, dict(key_excluded), step))
+        """Write the numbers and, of tensors, the distributions of a step."""
+        summary = Summary()
+        for tag, value in key_values.items():
+            if "tensorboard" in (key_excluded.get(tag) or ()):
+                continue
+            if isinstance(value, torch.Tensor):
+                summary.MergeFrom(histogram(tag, value, _BINS))
+            elif isinstance(value, int | float | np.number):
+                summary.value.add(tag=tag, simple_value=float(value))
+        self.add(Event(step=step, summary=summary))
 
-    def _attempt(self, write: Callable[[], object]) -> None:
+    def add(self, event: Event) -> None:
+        """Write an event; a disk that does not take it costs a warning."""
+        event.wall_time = time.time()
         try:
-            write()
+            if self._file is None:
+                self._file = self._open()
+            self._file.write(event.SerializeToString())
+            self._file.flush()
         except OSError as error:
             problem = error.strerror or str(error)
             if problem != self._problem:
@@ -57,29 +62,28 @@ class _TensorBoard(KVWriter):
         else:
             self._problem = ""
 
+    def _open(self) -> RecordWriter:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        # TensorBoard reads the files of a folder in the order of their names.
+        name = f"events.out.tfevents.{time.time():017.6f}.{platform.node()}.{os.getpid()}"
+        file = RecordWriter((self._folder / name).open("wb"))
+        file.write(Event(wall_time=time.time(), file_version="brain.Event:2").SerializeToString())
+        return file
+
     def close(self) -> None:
-        before, self._format = self._format, None
+        """Close the file."""
+        before, self._file = self._file, None
         if before is not None:
             with contextlib.suppress(OSError):  # reported when it happened first
                 before.close()
 
 
-@contextlib.contextmanager
-def silence_writer_thread() -> Iterator[None]:
-    """Silence errors of TensorBoard's own thread: `write` raises them again, and that is reported."""
-    before = threading.excepthook
+def make_logger(folder: Path, warn: Callable[[str], None], resumed_at: int | None = None) -> Logger:
+    """Return a logger that writes to a TensorBoard folder; `warn` is called if it cannot.
 
-    def hook(arguments: threading.ExceptHookArgs) -> None:
-        if not isinstance(arguments.exc_value, OSError):
-            before(arguments)
-
-    threading.excepthook = hook
-    try:
-        yield
-    finally:
-        threading.excepthook = before
-
-
-def make_logger(folder: Path, warn: Callable[[str], None], first_step: int = 0) -> Logger:
-    """Return a logger that writes to a TensorBoard folder from a step on; `warn` is called if it cannot."""
-    return Logger(str(folder), [_TensorBoard(folder, warn, first_step)])
+    What was written after the step that a training resumes at is not shown any more.
+    """
+    events = _EventFile(folder, warn)
+    if resumed_at is not None:
+        events.add(Event(step=resumed_at + 1, session_log=SessionLog(status=SessionLog.START)))
+    return Logger(str(folder), [events])

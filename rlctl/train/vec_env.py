@@ -18,7 +18,6 @@ from rlctl.rollout.messages import EpisodeResult, Play, Segment
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
-from rlctl.run.policy import PolicyInfo
 from rlctl.train.space_monitor import SpaceMonitor
 
 
@@ -68,8 +67,6 @@ class WorkerVecEnv(VecEnv):
         """What `finish` returned last; its arrays are overwritten by the next."""
         self.waited_s = 0.0
         """Time spent waiting for the environments to play [s], since it was set to 0."""
-        self.policy_info: PolicyInfo | None = None
-        """Describes the policy that plays, once it does."""
         self._steps, self._until_end = 0, False
         self.render_mode = None
         super().__init__(workers.n_envs, *workers.info.spaces())
@@ -78,7 +75,11 @@ class WorkerVecEnv(VecEnv):
         return EpisodeAddress(self.run_seed, Stream.TRAIN, env, episode).seed
 
     def reset(self) -> Any:
-        self.workers.reset({env: self._seed(env, number) for env, number in enumerate(self.episodes_started)})
+        try:
+            self.workers.reset({env: self._seed(env, number) for env, number in enumerate(self.episodes_started)})
+        except EpisodeFailed as error:
+            error.actions = []
+            raise
         self.episodes_started = [number + 1 for number in self.episodes_started]
         self.history = ActionHistory(self.num_envs)
         return self.workers.observations()
@@ -94,11 +95,6 @@ class WorkerVecEnv(VecEnv):
         ended = self.workers.replay_actions(dict(enumerate(zip(seeds, actions, strict=True))), may_fail=True)
         self.history = ActionHistory.of_episodes(actions, self.workers.arrays.segment.action[:, 0])
         return ended
-
-    def play(self, steps: int, exploration: Exploration, check: Callable[[], None] | None = None) -> PlayedSegment:
-        """Let the workers play `steps` steps in each environment with the policy they have."""
-        self.start(steps, exploration)
-        return self.finish(check)
 
     def start(self, steps: int, exploration: Exploration, *, until_end: bool = False) -> None:
         """Begin to play up to `steps` steps, with `until_end` only up to the end of the running episode."""

@@ -51,7 +51,7 @@ def _train(settings: dict) -> tuple[float, int, float, float, float]:
     saves: list[tuple[float, float]] = []
     evaluations: list[float] = []
     began: list[float] = []
-    save, evaluate, begin = Saver.checkpoint, TrainingLoop.evaluate, TrainingLoop._on_training_start
+    save, evaluate, begin = Saver.checkpoint, TrainingLoop.evaluate, TrainingLoop.run
 
     def timed_save(self, *arguments, **options):
         start = time.monotonic()
@@ -68,12 +68,12 @@ def _train(settings: dict) -> tuple[float, int, float, float, float]:
         began.append(time.monotonic())
         begin(self)
 
-    Saver.checkpoint, TrainingLoop.evaluate, TrainingLoop._on_training_start = timed_save, timed_evaluate, timed_begin
+    Saver.checkpoint, TrainingLoop.evaluate, TrainingLoop.run = timed_save, timed_evaluate, timed_begin
     try:
         with tempfile.TemporaryDirectory() as folder:
             run_training(TrainRequest("reach", settings=settings, root=Path(folder)))
     finally:
-        Saver.checkpoint, TrainingLoop.evaluate, TrainingLoop._on_training_start = save, evaluate, begin
+        Saver.checkpoint, TrainingLoop.evaluate, TrainingLoop.run = save, evaluate, begin
     each = [end - start for start, end in saves]
     trained = saves[-1][1] - began[0] - sum(evaluations)
     first, second = (end - began[0] for _, end in saves[:2])

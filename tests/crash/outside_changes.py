@@ -75,11 +75,8 @@ class _Unwilling:
 CHANGES = {
     "run removed": lambda run: shutil.rmtree(run.path),
     "all runs removed": lambda run: shutil.rmtree(run.path.parents[1]),
-    "run.json removed": lambda run: run.status_file.unlink(),
     "lock removed": lambda run: (run.path / ".lock").unlink(),
     "checkpoints removed": lambda run: shutil.rmtree(run.path / "checkpoints"),
-    "segments removed": lambda run: shutil.rmtree(run.replay_segments),
-    "policies removed": lambda run: shutil.rmtree(run.best_policy.parent),
     "episodes removed": lambda run: shutil.rmtree(run.episodes),
     "metrics removed": lambda run: run.metrics_file.unlink(),
     "metrics emptied": lambda run: edited(run.metrics_file, lambda content: b""),

@@ -19,7 +19,7 @@ PHASES = {
     "workers build": (rlctl.rollout.workers.Workers, "info", 1),
     "run folder": (rlctl.train.status, "write_start", 1),
     "first rollout": (rlctl.train.vec_env.WorkerVecEnv, "finish", 1),
-    "boundary": (rlctl.train.loop.TrainingLoop, "boundary", 1),
+    "boundary": (rlctl.train.loop.TrainingLoop, "boundary", 2),
     "evaluation": (rlctl.train.evaluation.Evaluator, "run", 1),
     "first checkpoint": (rlctl.run.files, "os.rename", 1),
     "checkpoint": (rlctl.run.files, "os.rename", 2),

@@ -17,6 +17,8 @@ from rlctl.train import checkpoint
 from rlctl.train.algorithms import build_model
 from rlctl.train.curriculum import begin_next_episodes
 from rlctl.train.hindsight import replay_arguments
+from rlctl.train.off_policy import OffPolicyRollouts
+from rlctl.train.progress import Progress
 from rlctl.train.request import TrainRequest, run_training
 from rlctl.train.vec_env import WorkerVecEnv
 from tests.task import tasks
@@ -39,14 +41,23 @@ def build():
     """Build the model of a small recipe on worker environments that are closed at the end."""
     started = []
 
-    def model(env: str, **settings):
+    def model(env: str, **settings) -> OffPolicyRollouts:
         recipe = recipe_sources.fill_defaults(recipes.validate({**SMALL_HER, **settings}, "test"))
         started.append(Workers(recipe.env_specs(env if ":" in env else f"{ENVS}:{env}")[0], recipe.n_envs))
-        return build_model(recipe, WorkerVecEnv(started[-1], recipe.seed), "cpu")
+        env = WorkerVecEnv(started[-1], recipe.seed)
+        return OffPolicyRollouts(build_model(recipe, env, "cpu"), env, recipe, Progress(next_eval=0))
 
     yield model
     for workers in started:
         workers.close()
+
+
+def learn(rollouts: OffPolicyRollouts, steps: int):
+    """Play and learn until so many environment steps are done; return the model."""
+    rollouts.begin(steps)
+    while rollouts.model.num_timesteps < steps:
+        rollouts.advance()
+    return rollouts.model
 
 
 @pytest.mark.parametrize(
@@ -54,17 +65,16 @@ def build():
     [("sac", "Plane"), ("td3", "Plane"), ("ddpg", "Plane"), ("tqc", "Plane"), ("dqn", "Corridor")],
 )
 def test_algorithms_train_in_hindsight(build, algo, env):
-    model = build(env, algo=algo)
-    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
-    model.learn(108)
+    rollouts = build(env, algo=algo)
+    before = {name: value.clone() for name, value in rollouts.model.policy.state_dict().items()}
+    model = learn(rollouts, 108)
     assert model._n_updates == 2 * 4  # after 104 and 108 steps, one for each of the four
     assert any((value != before[name]).any() for name, value in model.policy.state_dict().items())
 
 
 def test_goals_are_exchanged_and_rewarded_anew(build):
     """No goal that was wanted is reached within 1e-6: every reward of 0 is of one that was exchanged."""
-    model = build("Plane", task={"steps": 10, "tolerance": 1e-6})
-    model.learn(100)
+    model = learn(build("Plane", task={"steps": 10, "tolerance": 1e-6}), 100)
     assert set(model.replay_buffer.rewards[:25].ravel()) == {-1.0}
     batch = model.replay_buffer.sample(400)
     rewards = batch.rewards.numpy().ravel()
@@ -80,8 +90,7 @@ def test_goals_are_exchanged_and_rewarded_anew(build):
 
 @pytest.mark.parametrize(("goals", "real"), [(1, 100), (3, 50)])
 def test_the_final_goal_is_what_an_episode_ended_with(build, goals, real):
-    model = build("Plane", her={"n_sampled_goal": goals, "goal_selection_strategy": "final"})
-    model.learn(100)
+    model = learn(build("Plane", her={"n_sampled_goal": goals, "goal_selection_strategy": "final"}), 100)
     batch = model.replay_buffer.sample(200)
     rows = model.replay_buffer.next_observations["achieved_goal"]
     ends = {tuple(each) for each in rows[[9, 19]].reshape(-1, 2).tolist()}  # ten steps an episode
@@ -92,12 +101,12 @@ def test_the_final_goal_is_what_an_episode_ended_with(build, goals, real):
 
 
 def test_a_new_stage_leaves_no_episode_behind_that_spans_it(build):
-    model = build("Plane", task={"steps": 10})
-    model.learn(4 * 13)
+    rollouts = build("Plane", task={"steps": 10})
+    model = learn(rollouts, 4 * 13)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # SB3 warns of what is meant here
         begin_next_episodes(model)
-    model.learn(4 * 10, reset_num_timesteps=False)
+    learn(rollouts, 4 * 23)
     buffer = model.replay_buffer
     # 10 steps, 3 that are cut, and 10 of an episode of the next stage; nothing is in the other rows.
     for env in range(4):
@@ -123,8 +132,7 @@ def test_a_curriculum_in_hindsight(train):
 
 def test_an_episode_that_ended_with_its_stage_is_over(build):
     """Without hindsight too: only episodes that go on are cut short."""
-    model = build("Ending", her=None, task={})
-    model.learn(4 * 5)
+    model = learn(build("Ending", her=None, task={}), 4 * 5)
     ended = model.replay_buffer.dones[4].tolist()
     assert set(ended) == {0.0, 1.0}
     begin_next_episodes(model)

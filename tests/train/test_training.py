@@ -68,9 +68,10 @@ def test_tensorboard_has_distributions(finished):
 
     events = EventAccumulator(str(finished.run.tensorboard), size_guidance={"histograms": 0})
     events.Reload()
-    # SB3 writes after a rollout what was logged at the boundary before it; 4 environments played 16 steps.
     first = events.Histograms("histograms/actions")[0]
-    assert (first.step, first.histogram_value.num) == (128, 64)
+    assert (first.step, first.histogram_value.num) == (64, 64)  # 4 environments played 16 steps
+    assert [each.step for each in events.Scalars("train/approx_kl")] == [64, 128, 192, 256]
+    assert [each.step for each in events.Scalars("eval/success_rate")] == [128, 256]
     assert events.Histograms("histograms/values")
     assert {"rollout/action_change", "rollout/exploration"} <= set(events.Tags()["scalars"])
 

@@ -1,0 +1,132 @@
+"""Prepares a training: environments, model, and run folder, with what a checkpoint restores of them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from rlctl.env_spec import EnvSpec
+from rlctl.named_task import RUN
+from rlctl.rollout.workers import Workers, available_cores
+from rlctl.run import directory
+from rlctl.run.directory import RunDirectory
+from rlctl.run.policy import read_policy
+from rlctl.run.recipe import ON_POLICY
+from rlctl.train import status
+from rlctl.train.display import Display
+from rlctl.train.precheck import Precheck
+from rlctl.train.start import Start
+
+if TYPE_CHECKING:
+    from rlctl.train.checkpoint import Checkpoints
+    from rlctl.train.loop import Learner, TrainingLoop
+    from rlctl.train.saving import Saver
+
+
+@contextlib.contextmanager
+def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
+    """Prepare a training; at the end its processes are ended, and the run has what ended it before its time."""
+    recipe, request = start.recipe, start.request
+    specs = recipe.env_specs(start.task, named_by=RUN if start.run else "")
+    display.phase(f"building {recipe.n_envs} environments, importing PyTorch")
+    with contextlib.ExitStack() as stack:
+        # The workers build their environments, and the check runs, while this process imports torch.
+        workers = stack.enter_context(_make_workers(specs[start.stage - 1], recipe.n_envs, start, display))
+        precheck = Precheck(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
+        from rlctl.train.evaluation import Evaluator
+        from rlctl.train.loop import TrainingLoop
+
+        learner = _build_learner(start, specs, workers, display)
+        if precheck is not None:
+            display.phase("checking the environment")
+            precheck.refuse_errors(display)
+        run = start.run or directory.create(start.task, recipe.seed, request.root)
+        lock = start.lock or stack.enter_context(run.lock())
+        if not lock.keeps_out:
+            display.message(f"warning: {run.path}: no locks on this file system: let no second process write this run")
+        saver = _open_run(run, start, learner, display)
+        n_envs = min(recipe.eval.episodes, available_cores())
+        evaluator = Evaluator(recipe, lambda: _make_workers(specs[-1], n_envs, start, display))
+        stack.callback(evaluator.close)
+        display.run_folder(run.path, run.metrics_file, run.evals_file)
+        try:
+            yield TrainingLoop(learner, evaluator, saver, display)
+        except BaseException as error:
+            with contextlib.suppress(OSError):  # a full disk must not hide the error itself
+                status.write_failure(run, error)
+            raise
+
+
+def _make_workers(spec: EnvSpec, n_envs: int, start: Start, display: Display) -> Workers:
+    return Workers(spec, n_envs, timeout_s=start.request.env_timeout_s, on_output=display.message)
+
+
+def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display: Display) -> Learner:
+    from rlctl.run.torch_policy import pin_threads
+    from rlctl.train.algorithms import build_model
+    from rlctl.train.curriculum import Curriculum, check_stages
+    from rlctl.train.loop import Learner
+    from rlctl.train.off_policy import OffPolicyRollouts
+    from rlctl.train.on_policy import OnPolicyRollouts
+    from rlctl.train.progress import Progress
+    from rlctl.train.vec_env import WorkerVecEnv
+    from rlctl.train.warm_start import load_source
+
+    pin_threads()
+    recipe, goal = start.recipe, workers.info
+    if len(specs) > 1:  # a look at every stage now, not after hours of training
+        with _make_workers(specs[0], 1, start, display) as probe:
+            goal = check_stages(specs, probe)
+    # Of a plain environment it is not known before an episode has ended.
+    start.check_may_succeed(workers.info.has_success or not workers.info.reward_weights)
+    # What a training begins with is evaluated: it may be better than all that follows.
+    progress = Progress(next_eval=0 if start.source else recipe.eval.every_steps or recipe.total_timesteps)
+    if start.checkpoint is not None:
+        progress = start.checkpoint.progress
+    env = WorkerVecEnv(workers, recipe.seed)
+    model = build_model(recipe, env, start.request.device)
+    rollouts = (OnPolicyRollouts if recipe.algo in ON_POLICY else OffPolicyRollouts)(model, env, recipe, progress)
+    if start.source is not None:
+        rollouts.policy_plays_warmup = True
+        if start.checkpoint is None:
+            display.message(load_source(start.source, model, goal))
+    return Learner(recipe, rollouts, Curriculum(recipe.stages, specs, goal, progress), progress)
+
+
+def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Saver:
+    """Restore the checkpoint, if there is one, and return what writes from now on."""
+    from rlctl.train.checkpoint import Checkpoints
+    from rlctl.train.cut_back import cut_back
+    from rlctl.train.saving import Saver
+    from rlctl.train.tensorboard import make_logger
+
+    model = learner.rollouts.model
+    resumed_at = None if start.run is None else start.step
+    model.set_logger(make_logger(run.tensorboard, display.message, resumed_at))
+    checkpoints = Checkpoints(run, model, learner.rollouts.env, start.recipe.checkpoint.keep)
+    for note in start.notes:
+        display.message(note)
+    if start.checkpoint is not None:
+        display.message(_restore(start, checkpoints, learner))
+    if start.run is not None:
+        for note in cut_back(run, start.step, learner.progress):
+            display.message(note)
+    status.write_start(run, start)
+    saver = Saver(run, checkpoints, display.message)
+    saver.saved_step = start.step if start.checkpoint is not None else None
+    return saver
+
+
+def _restore(start: Start, checkpoints: Checkpoints, learner: Learner) -> str:
+    """Restore model and environments; return a message about how exactly the training goes on."""
+    from rlctl.train.checkpoint import find_differences
+
+    assert start.checkpoint is not None
+    file = start.checkpoint.folder / "policy.safetensors"
+    read_policy(file)[0].check_fits(learner.curriculum.goal, file)
+    mismatch = checkpoints.restore(start.checkpoint)
+    inexact = [*start.inexact, *find_differences(start.checkpoint.state.computed_with, checkpoints.computed_with())]
+    inexact += [mismatch] if mismatch else []
+    exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "as if it had never stopped"
+    return f"going on at step {start.step:,}, {exactness}"

@@ -1,0 +1,181 @@
+"""Where a training starts: at nothing, or at the newest good checkpoint of a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlctl import registry
+from rlctl.errors import ArtifactError, RecipeError, UsageError
+from rlctl.run import directory, lookup
+from rlctl.run.directory import RunDirectory, RunLock
+from rlctl.run.recipe import Recipe, validate
+from rlctl.run.recipe_sources import describe_rounding, resolve
+from rlctl.run.task_version import describe_task_changes
+from rlctl.train.process_state import preserve_process_state
+from rlctl.train.warm_start import find_source
+
+if TYPE_CHECKING:
+    from rlctl.train.checkpoint import Checkpoint
+
+_DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
+_MAY_CHANGE = ("total_timesteps", "stop_success")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainRequest:
+    """The arguments of `rlctl train`."""
+
+    task: str | None
+    resume: str | None = None
+    config: Path | None = None
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    device: str = "cpu"
+    record: int = 0
+    env_timeout_s: float = 60.0
+    root: Path = directory.ROOT
+    check: bool = False
+    """Whether to check the environment first, and to refuse one that has errors."""
+    force: bool = False
+    """Whether to go on with a run even if its task has changed."""
+    initial_policy: str | None = None
+    """A run, a policy file, or the name of a task that ships a policy: what the training begins with."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """Where a training starts; holds the lock of a run that is resumed, as long as it is entered."""
+
+    request: TrainRequest
+    task: str
+    recipe: Recipe
+    run: RunDirectory | None = None
+    """The run that is resumed."""
+    lock: RunLock | None = None
+    checkpoint: Checkpoint | None = None
+    notes: tuple[str, ...] = ()
+    """Messages for the user, before the first step."""
+    source: Mapping[str, Any] | None = None
+    """The policy that it began with; see `warm_start.find_source`."""
+    inexact: tuple[str, ...] = ()
+    """Why the run cannot go on as if it had never stopped, as far as is known before it goes on."""
+    began: float = dataclasses.field(default_factory=time.monotonic)
+
+    def __enter__(self) -> Start:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.lock is not None:
+            self.lock.release()
+
+    @property
+    def stage(self) -> int:
+        """Stage of the curriculum, from 1."""
+        return (self.checkpoint.progress.stage or 1) if self.checkpoint else 1
+
+    @property
+    def step(self) -> int:
+        """Environment steps that are done."""
+        return self.checkpoint.state.step if self.checkpoint else 0
+
+    def check_may_succeed(self, may_succeed: bool) -> None:
+        """Raise `RecipeError` where the recipe waits for success and the task does not report it."""
+        recipe = self.recipe
+        if may_succeed:
+            return
+        if recipe.stop_success is not None:
+            raise RecipeError(f"stop_success: {self.task} does not report success; leave it out")
+        for number, stage in enumerate(recipe.stages, start=1):
+            if stage.promote is not None and stage.promote.success is not None:
+                raise RecipeError(
+                    f"stage {number} of {len(recipe.stages)}: promote.success: {self.task} does not report success; "
+                    "promote by return: promote: {return: 50.0}"
+                )
+
+
+def find_start(request: TrainRequest) -> Start:
+    """Return where a request starts, after a look at all that can be wrong with it; nothing is changed yet."""
+    if (request.task is None) == (request.resume is None):
+        raise UsageError("give a task to train, or --resume RUN to go on with a run; one of the two")
+    if not _DEVICE.fullmatch(request.device):  # now, and not after half a minute of imports
+        raise UsageError(f"--device {request.device!r}: no such device; give cpu, cuda, cuda:1, or auto")
+    return _find_new(request) if request.task is not None else _find_checkpoint(request)
+
+
+def _find_new(request: TrainRequest) -> Start:
+    task = request.task or ""
+    with preserve_process_state():
+        constructor: Any = registry.load(task)
+    stages = constructor.stages if registry.is_task(constructor) else ()
+    recipe = resolve(task, request.config, request.settings, stages)
+    note = describe_rounding(recipe)
+    source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
+    return Start(request, task, recipe, notes=(note,) if note else (), source=source)
+
+
+def _find_checkpoint(request: TrainRequest) -> Start:
+    """Find a run, lock it, and read its newest good checkpoint.
+
+    Raises `UsageError` for settings that cannot be others now, and unless it is forced for a task that has changed.
+    """
+    from rlctl.train import checkpoint
+
+    _check_resume(request)
+    run = lookup.find_run(request.resume, request.root)
+    before = run.recipe()
+    lock = run.lock()  # before looking: a process that is training removes old checkpoints
+    try:
+        recipe = validate({**before.model_dump(by_alias=True), **request.settings}, "recipe")
+        status = run.status()
+        task = lookup.locate_task(_read_task(status, run), run)
+        changes = describe_task_changes(status, task)
+        if changes and not request.force:
+            raise UsageError(
+                f"{run.path}: {'; '.join(changes)}. What was learnt may not fit any more; --force goes on all the same"
+            )
+        run.recover()
+        found, damage = checkpoint.read_newest(run)
+        if found is not None and request.settings:
+            found = _reopen(found, before, recipe)
+        notes = _describe(found, damage)
+        return Start(request, task, recipe, run, lock, found, notes, status.get("from"), tuple(changes))
+    except BaseException:
+        lock.release()
+        raise
+
+
+def _check_resume(request: TrainRequest) -> None:
+    if request.config is not None:
+        raise UsageError("--resume goes on with the run's own recipe: leave out --config")
+    if request.initial_policy is not None:
+        raise UsageError("--from begins a new run, and --resume goes on with one: give one of the two")
+    for key in request.settings:
+        if key not in _MAY_CHANGE:
+            raise UsageError(f"--resume goes on with the run's own recipe: {key} cannot be changed, only -n")
+
+
+def _read_task(content: Mapping[str, Any], run: RunDirectory) -> str:
+    task = content["task"]
+    if not isinstance(task, str):
+        raise ArtifactError(f"{run.status_file}: damaged: its task is {task!r}")
+    return task
+
+
+def _describe(found: Checkpoint | None, damage: list[str]) -> tuple[str, ...]:
+    if found is None:
+        return ("no checkpoint yet: the training begins at its first step",)
+    return tuple(f"warning: {each}; going on from step {found.state.step:,}" for each in damage)
+
+
+def _reopen(found: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:
+    """Let a training that was done go on, if it is asked for more than it was."""
+    stricter = recipe.stop_success != before.stop_success
+    longer = recipe.total_timesteps > before.total_timesteps
+    if not found.progress.done or found.state.step >= recipe.total_timesteps or not (stricter or longer):
+        return found
+    progress = dataclasses.replace(found.progress, done=False, good_in_a_row=0)
+    return dataclasses.replace(found, state=found.state.model_copy(update={"progress": progress}))
