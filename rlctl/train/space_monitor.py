@@ -1,50 +1,37 @@
-"""Counts observations that contradict their space and warns once; training goes on."""
+"""Counts observations of a training that are outside their space and warns once; the training goes on."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import split, split_space
+from rlctl.dict_spaces import split_space
 from rlctl.train.progress import Progress
 
 
 class SpaceMonitor:
-    """Looks at the observations of all environments after each step: some microseconds, for all of them together."""
+    """Looks at what all environments observe."""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
-        leaves = split_space(space)
-        self._bounds = {key: leaf for key, leaf in leaves.items() if isinstance(leaf, spaces.Box) and _can_exceed(leaf)}
-        self._limits = {key: _uniform_bounds(box) for key, box in self._bounds.items()}
+        parts = split_space(space).items()
+        self._boxes = {key: part for key, part in parts if isinstance(part, spaces.Box) and _can_exceed(part)}
         self._outside = 0
         self._message = ""
 
-    def look(self, observations: Any) -> None:
-        """Count those that are outside; arrays have a row per environment."""
-        parts = split(observations)
-        rows: set[int] = set()
-        for key, box in self._bounds.items():
-            values = parts[key]
-            if (limits := self._limits[key]) is not None:  # one for all elements: that is faster
-                all_inside = limits[0] <= values.min() and values.max() <= limits[1]
-            else:
-                all_inside = not (np.count_nonzero(values < box.low) or np.count_nonzero(values > box.high))
-            if not all_inside:
-                rows.update(self._rows(key, box, values))
-        self._outside += len(rows)
-
-    def _rows(self, key: str, box: spaces.Box, values: NDArray[Any]) -> list[int]:
-        wrong = ((values < box.low) | (values > box.high)).reshape(len(values), -1)
-        if not self._message:
-            env, element = np.argwhere(wrong)[0]
-            value, low, high = (each.ravel()[element] for each in (values[env], box.low, box.high))
-            self._message = (
-                f"{_named(key)} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
-            )
-        return [int(row) for row in np.flatnonzero(wrong.any(axis=1))]
+    def look(self, observations: Mapping[str, NDArray[Any]]) -> None:
+        """Count the observations that are outside; arrays of shape (observations, ...)."""
+        outside: NDArray[np.bool_] | bool = False
+        for key, box in self._boxes.items():
+            values = observations[key]
+            wrong = (values < box.low) | (values > box.high)
+            if wrong.any():
+                outside |= wrong.reshape(len(values), -1).any(axis=1)
+                self._message = self._message or _describe(key, box, values, wrong)
+        self._outside += int(np.count_nonzero(outside))
 
     def report(self, progress: Progress) -> str | None:
         """Add what was counted since the last report to `progress`; return a warning the first time."""
@@ -56,9 +43,12 @@ class SpaceMonitor:
         return warning
 
 
-def _uniform_bounds(box: spaces.Box) -> tuple[Any, Any] | None:
-    low, high = box.low.min(), box.high.max()
-    return (low, high) if (box.low == low).all() and (box.high == high).all() else None
+def _describe(key: str, box: spaces.Box, values: NDArray[Any], wrong: NDArray[np.bool_]) -> str:
+    row = int(np.flatnonzero(wrong.reshape(len(values), -1).any(axis=1))[0])
+    element = int(np.flatnonzero(wrong[row])[0])
+    value, low, high = (each.ravel()[element] for each in (values[row], box.low, box.high))
+    name = f"observation {key!r}" if key else "observation"
+    return f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
 
 
 def _can_exceed(box: spaces.Box) -> bool:
@@ -70,11 +60,7 @@ def _can_exceed(box: spaces.Box) -> bool:
     return bool(np.isfinite(box.low).any() or np.isfinite(box.high).any())
 
 
-def _named(key: str) -> str:
-    return f"observation {key!r}" if key else "observation"
-
-
 def summarize(progress: Progress) -> str | None:
     """Return the warning for the end of a training, or None."""
     count = progress.observations_outside
-    return f"warning: observations {count:,} outside their space" if count else None
+    return f"warning: {count:,} observations were outside their space" if count else None

@@ -119,7 +119,7 @@ class WorkerVecEnv(VecEnv):
         self.history.add_segment(segment.action[:, :steps], [(each.env, each.row) for each in ended])
         self.ended += ended
         seen = {key: rows[:, 1 : steps + 1].reshape(-1, *rows.shape[2:]) for key, rows in segment.observation.items()}
-        self.monitor.look(join(seen))
+        self.monitor.look(seen)
         self.last_segment = PlayedSegment(
             {key: rows[:, : steps + 1] for key, rows in segment.observation.items()},
             {key: rows[:, :steps] for key, rows in segment.final.items()},
