@@ -171,7 +171,7 @@ def encode(message: Message | Answer) -> bytes:
 
 def _to_plain(value: Any) -> Any:
     if isinstance(value, pydantic.BaseModel):
-        return value.model_dump(mode="json")
+        return value.model_dump()  # not in its JSON mode, which has no infinite numbers
     return dict(value) if isinstance(value, Mapping) else vars(value)
 
 
