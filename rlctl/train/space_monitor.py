@@ -24,7 +24,7 @@ class SpaceMonitor:
 
     def look(self, observations: Mapping[str, NDArray[Any]]) -> None:
         """Count the observations that are outside; arrays of shape (observations, ...)."""
-        outside: NDArray[np.bool_] | bool = False
+        outside: Any = False  # of each observation, once there is one
         for key, box in self._boxes.items():
             values = observations[key]
             wrong = (values < box.low) | (values > box.high)

@@ -40,7 +40,7 @@ class _EventFile(KVWriter):
             if "tensorboard" in (key_excluded.get(tag) or ()):
                 continue
             if isinstance(value, torch.Tensor):
-                summary.MergeFrom(histogram(tag, value, _BINS))
+                summary.MergeFrom(histogram(tag, value, _BINS))  # type: ignore[no-untyped-call]
             elif isinstance(value, int | float | np.number):
                 summary.value.add(tag=tag, simple_value=float(value))
         self.add(Event(step=step, summary=summary))
