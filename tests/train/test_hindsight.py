@@ -260,16 +260,15 @@ def test_recipes_that_do_not_go_together_with_it(settings, message):
     ],
 )
 def test_learning_before_an_episode_is_over(build, task, kwargs, message):
-    model = build(task, algo_kwargs={**FAST, **kwargs}, task={"steps": 10} if task == "Plane" else {})
+    rollouts = build(task, algo_kwargs={**FAST, **kwargs}, task={"steps": 10} if task == "Plane" else {})
     with pytest.raises(RecipeError) as caught:
-        model.learn(256)
+        learn(rollouts, 256)
     assert str(caught.value) == message
 
 
 def test_what_will_do_does(build):
-    model = build(f"{tasks.__file__}:Place", algo_kwargs={**FAST, "learning_starts": 40}, task={})
-    model.learn(44)
-    assert model._n_updates == 4
+    rollouts = build(f"{tasks.__file__}:Place", algo_kwargs={**FAST, "learning_starts": 40}, task={})
+    assert learn(rollouts, 44)._n_updates == 4
 
 
 def test_learning_before_an_episode_is_over_ends_a_run(train, tmp_path):
