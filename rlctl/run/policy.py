@@ -220,8 +220,12 @@ class Policy(abc.ABC):
         zeros = {key: np.full(space.shape or (), getattr(space, "start", 0), space.dtype) for key, space in spaces}
         action = self.predict(join(zeros), deterministic=deterministic)
         self.reset()
-        if action.shape != (self.action_space.shape or ()) or not np.isfinite(action).all():
-            raise ValueError(f"its actions are {action.dtype} of shape {action.shape}, or not finite")
+        if action.shape != (self.action_space.shape or ()):
+            raise ValueError(
+                f"its actions have shape {action.shape}, those of its action space {self.action_space.shape}"
+            )
+        if not np.isfinite(action).all():
+            raise ValueError("its actions are not finite")
 
 
 def load_policy(path: str | Path) -> Policy:

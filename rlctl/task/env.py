@@ -10,15 +10,13 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, TaskError, did_you_mean
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
+from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_methods, check_parameters, has_compute_reward, has_success
-
-Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
 
 class TaskEnv(gymnasium.Env[Observation, Any]):
@@ -84,11 +82,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         except BaseException:
             self.sim.close()
             raise
-        self.observation_sizes = {name: int(np.size(value)) for name, value in first.items()}
-        self._shapes = {name: np.shape(value) for name, value in first.items()}
-        # Camera pictures: bytes, as every library that takes images expects them.
-        self._pictures = {name for name, value in first.items() if np.asarray(value).dtype == np.uint8}
-        self.observation_space = self._make_observation_space()
+        self._format = ObservationFormat(task, first)
+        self.observation_sizes, self.observation_space = self._format.sizes, self._format.space
 
     def set_level(self, level: float) -> None:
         """Set how far ranges written `{from: ..., to: ...}` have widened, in [0, 1], from the next reset on."""
@@ -116,31 +111,6 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             name: self.sim.add_marker((0, 0, -10), radius=0.03, color=(0.1, 0.8, 0.3, 0.8)) for name in names
         }
         self.sim.save()
-
-    def _make_observation_space(self) -> Any:
-        task = self.task
-        for name in [*task.observation_bounds, *task.observation_units]:
-            if name not in self._shapes:
-                raise TaskError(
-                    f"{self.name}: bounds or units for {name!r}, which is not observed."
-                    f"{did_you_mean(name, self._shapes)}"
-                )
-
-        def bounds(name: str) -> tuple[float, float]:
-            return task.observation_bounds.get(name, (-math.inf, math.inf))
-
-        if task.observation_layout == "dict":
-            return spaces.Dict(
-                {
-                    name: spaces.Box(0, 255, shape, np.uint8)
-                    if name in self._pictures
-                    else spaces.Box(*bounds(name), shape, np.float32)
-                    for name, shape in self._shapes.items()
-                }
-            )
-        low = np.concatenate([np.full(size, bounds(name)[0]) for name, size in self.observation_sizes.items()])
-        high = np.concatenate([np.full(size, bounds(name)[1]) for name, size in self.observation_sizes.items()])
-        return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -216,65 +186,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise TaskError(f"{self.name}: action is not finite at step {self._step + 1}")
         return action
 
-    def _dtype(self, name: str) -> type[np.uint8] | type[np.float32]:
-        return np.uint8 if name in self._pictures else np.float32
-
     def _observe(self) -> Observation:
-        parts = self._signals.observe(self.task.observe())
-        if self.task.observation_layout == "dict":
-            dictionary: dict[str, Any] = {name: np.array(value, self._dtype(name)) for name, value in parts.items()}
-            if {name: value.shape for name, value in dictionary.items()} != self._shapes:
-                raise self._shape_mismatch(parts)
-            if not all(math.isfinite(value.sum()) for value in dictionary.values()):
-                raise self._not_finite(parts)
-            for name, (lowest, highest) in self.task.observation_bounds.items():
-                dictionary[name] = self._clip_rounding(dictionary[name], lowest, highest, parts)
-            return dictionary
-        try:
-            observation = np.concatenate(list(parts.values()), axis=None, dtype=np.float32)
-        except ValueError:
-            raise self._shape_mismatch(parts) from None
-        if observation.shape != self.observation_space.shape:
-            raise self._shape_mismatch(parts)
-        if not math.isfinite(np.add.reduce(observation)):
-            raise self._not_finite(parts)
-        if self.task.observation_bounds:
-            low, high = self.observation_space.low, self.observation_space.high  # type: ignore[attr-defined]
-            observation = self._clip_rounding(observation, low, high, parts)
-        return observation
-
-    def _clip_rounding(self, values: NDArray[np.float32], low: Any, high: Any, parts: Mapping[str, Any]) -> Any:
-        # Float rounding only: a value well outside its declared range is an error of the task.
-        clipped = np.minimum(np.maximum(values, low), high)
-        if np.abs(clipped - values).max() > 1e-4:
-            raise self._out_of_bounds(parts)
-        return clipped
-
-    def _shape_mismatch(self, parts: Mapping[str, Any]) -> TaskError:
-        now = {name: np.shape(value) for name, value in parts.items()}
-        names = [name for name in {**self._shapes, **now} if self._shapes.get(name) != now.get(name)]
-        name = names[0] if names else "order"
-        return TaskError(
-            f"{self.name}: observation {name!r} has shape {now.get(name)} at step {self._step}, "
-            f"{self._shapes.get(name)} at the first observation"
-        )
-
-    def _not_finite(self, parts: Mapping[str, Any]) -> TaskError:
-        for name, value in parts.items():
-            if not np.isfinite(value).all():
-                return TaskError(f"{self.name}: observation {name!r} is not finite at step {self._step}: {value}")
-        return TaskError(f"{self.name}: observation overflows float32 at step {self._step}")
-
-    def _out_of_bounds(self, parts: Mapping[str, Any]) -> TaskError:
-        for name, (low, high) in self.task.observation_bounds.items():
-            values = np.ravel(parts[name])
-            worst = values[np.argmax(np.maximum(low - values, values - high))]
-            if worst < low or worst > high:
-                return TaskError(
-                    f"{self.name}: observation {name!r} is {worst:g} at step {self._step}, "
-                    f"outside its bounds [{low:g}, {high:g}]"
-                )
-        return TaskError(f"{self.name}: observation outside its bounds at step {self._step}")
+        return self._format.assemble(self._signals.observe(self.task.observe()), self._step)
 
     def move_markers(self) -> None:
         """Put the markers, which an environment that renders has in its world, where the task has them now."""

@@ -1,0 +1,114 @@
+"""What a task observes as the observation of its environment: one flat Box, or a Dict space; checked at every step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError, did_you_mean
+from rlctl.task.task import Task
+
+Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+
+
+class ObservationFormat:
+    """The space of a task's observations, and how they are put into it; `first` is one of them, by name."""
+
+    def __init__(self, task: Task, first: Mapping[str, Any]) -> None:
+        self._task = task
+        self._name = type(task).__name__
+        self._bounds = task.observation_bounds
+        self._shapes = {name: np.shape(value) for name, value in first.items()}
+        # Camera pictures: bytes, as every library that takes images expects them.
+        self._dtypes: dict[str, Any] = {
+            name: np.uint8 if np.asarray(value).dtype == np.uint8 else np.float32 for name, value in first.items()
+        }
+        self.sizes = {name: int(np.size(value)) for name, value in first.items()}
+        """Elements per name, in the order of the flat observation."""
+        self.space = self._make_space()
+
+    def _make_space(self) -> Any:
+        for name in [*self._bounds, *self._task.observation_units]:
+            if name not in self._shapes:
+                raise TaskError(
+                    f"{self._name}: bounds or units for {name!r}, which is not observed."
+                    f"{did_you_mean(name, self._shapes)}"
+                )
+        bounds = {name: self._bounds.get(name, (-math.inf, math.inf)) for name in self._shapes}
+        if self._task.observation_layout == "dict":
+            return spaces.Dict(
+                {
+                    name: spaces.Box(0, 255, shape, np.uint8)
+                    if self._dtypes[name] is np.uint8
+                    else spaces.Box(*bounds[name], shape, np.float32)
+                    for name, shape in self._shapes.items()
+                }
+            )
+        low, high = (
+            np.concatenate([np.full(size, bounds[name][end], np.float32) for name, size in self.sizes.items()])
+            for end in (0, 1)
+        )
+        return spaces.Box(low, high, dtype=np.float32)
+
+    def assemble(self, parts: Mapping[str, Any], step: int) -> Observation:
+        """Return the observation of what was observed at a step; raises `TaskError` for what is not in the space."""
+        if self._task.observation_layout == "dict":
+            observed: dict[str, Any] = {name: np.array(value, self._dtypes.get(name)) for name, value in parts.items()}
+            if {name: value.shape for name, value in observed.items()} != self._shapes:
+                raise self._shape_mismatch(parts, step)
+            if not all(math.isfinite(value.sum()) for value in observed.values()):
+                raise self._not_finite(parts, step)
+            for name, (lowest, highest) in self._bounds.items():
+                observed[name] = self._clip_rounding(observed[name], lowest, highest, parts, step)
+            return observed
+        try:
+            observation = np.concatenate(list(parts.values()), axis=None, dtype=np.float32)
+        except ValueError:
+            raise self._shape_mismatch(parts, step) from None
+        if observation.shape != self.space.shape:
+            raise self._shape_mismatch(parts, step)
+        if not math.isfinite(np.add.reduce(observation)):
+            raise self._not_finite(parts, step)
+        if self._bounds:
+            observation = self._clip_rounding(observation, self.space.low, self.space.high, parts, step)
+        return observation
+
+    def _clip_rounding(
+        self, values: NDArray[np.float32], low: Any, high: Any, parts: Mapping[str, Any], step: int
+    ) -> Any:
+        # Float rounding only: a value well outside its declared range is an error of the task.
+        clipped = np.minimum(np.maximum(values, low), high)
+        if np.abs(clipped - values).max() > 1e-4:
+            raise self._out_of_bounds(parts, step)
+        return clipped
+
+    def _shape_mismatch(self, parts: Mapping[str, Any], step: int) -> TaskError:
+        now = {name: np.shape(value) for name, value in parts.items()}
+        names = [name for name in {**self._shapes, **now} if self._shapes.get(name) != now.get(name)]
+        name = names[0] if names else "order"
+        return TaskError(
+            f"{self._name}: observation {name!r} has shape {now.get(name)} at step {step}, "
+            f"{self._shapes.get(name)} at the first observation"
+        )
+
+    def _not_finite(self, parts: Mapping[str, Any], step: int) -> TaskError:
+        for name, value in parts.items():
+            if not np.isfinite(value).all():
+                return TaskError(f"{self._name}: observation {name!r} is not finite at step {step}: {value}")
+        return TaskError(f"{self._name}: observation overflows float32 at step {step}")
+
+    def _out_of_bounds(self, parts: Mapping[str, Any], step: int) -> TaskError:
+        for name, (low, high) in self._bounds.items():
+            values = np.ravel(parts[name])
+            worst = values[np.argmax(np.maximum(low - values, values - high))]
+            if worst < low or worst > high:
+                return TaskError(
+                    f"{self._name}: observation {name!r} is {worst:g} at step {step}, "
+                    f"outside its bounds [{low:g}, {high:g}]"
+                )
+        return TaskError(f"{self._name}: observation outside its bounds at step {step}")
