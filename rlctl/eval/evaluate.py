@@ -14,12 +14,11 @@ from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.baseline import Baseline, choose_task, load_baseline
 from rlctl.eval.statistics import Spread, mean_action_change, mean_terms, success_interval, success_rate
-from rlctl.rollout.baselines import make_player
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import lookup
-from rlctl.run.acting import Exploration, Player, PolicyPlayer, check_playable
+from rlctl.run.acting import Exploration, check_playable
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo, load_policy, read_policy
 
@@ -159,13 +158,6 @@ class LoadedPolicy:
             workers.set_other_policy(str(self.path.resolve()))
         else:
             workers.set_policy(self.info, self.tensors)
-
-    def make_player(self) -> Player:
-        """Return what plays it in this process, with the same bits as in workers."""
-        if self.tensors is None:
-            observation_space, action_space = self.info.env.spaces()
-            return make_player(str(self.path.resolve()), action_space, observation_space)
-        return PolicyPlayer(self.info, self.tensors)
 
 
 def load_player(path: Path, deterministic: bool) -> LoadedPolicy:

@@ -14,7 +14,6 @@ from rlctl.replay.film import check_file, film_episodes, filmable_env
 from rlctl.replay.recorder import (
     Choose,
     Rollout,
-    copy_observation,
     drawable_env,
     play_episode,
     recorded_actions,
@@ -28,6 +27,7 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import describe
 from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import find_owner, find_policy, locate_task
+from rlctl.run.policy import load_policy
 
 _EPISODES_TO_CHOOSE_FROM = 100
 
@@ -158,9 +158,8 @@ class _Actor:
         found = find_policy(request.source, request.checkpoint)
         output.print_notes(found.notes)
         self._file, self._run = found.file, found.run
-        policy = load_player(self._file, deterministic=True)
-        info = policy.info
-        self._info, self._player = info, policy.make_player()
+        self._policy = load_policy(self._file)
+        info = self._policy.info
         self._spec: EnvSpec = found.locate(info.derive_spec(request.task, request.changes))
         self._name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
         self._described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
@@ -171,7 +170,8 @@ class _Actor:
             self._seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)
         else:
             episodes = request.episodes or _EPISODES_TO_CHOOSE_FROM
-            results, self._choice = choose_episodes(policy, self._spec, episodes, request.seed, request.choice)
+            player = load_player(self._file, deterministic=True)
+            results, self._choice = choose_episodes(player, self._spec, episodes, request.seed, request.choice)
             self._seeds = [result.seed for result in results]
             self._chosen = {result.seed: result.total_reward for result in results}
 
@@ -216,15 +216,11 @@ class _Actor:
         return ReplayResult(self._spec.task, self._name, episodes, policy_file=self._described, choice=self._choice)
 
     def _check_fits(self, env: Env) -> None:
-        self._info.check_fits(describe(env), self._file)
+        self._policy.info.check_fits(describe(env), self._file)
 
     def _begin(self, seed: int) -> Choose:
-        """Begin an episode as a worker does."""
-        player, (space, _) = self._player, self._info.env.spaces()
-        if player.state is not None:
-            player.state[:] = 0.0
-        player.begin_segment(seed, 0)
-        return lambda observation, step: player.act(copy_observation(observation, space), seed, step)[1]
+        self._policy.reset()
+        return lambda observation, step: self._policy.predict(observation)
 
     def _next_recording(self) -> Path:
         """Return `--output`, or the next number in that folder, in the run, or (without a run) in ./episodes."""

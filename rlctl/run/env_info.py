@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -160,38 +160,24 @@ def _count_elements(data: dict[str, Any]) -> int:
 
 
 def _build(data: dict[str, Any]) -> spaces.Space[Any]:
-    return _SPACES[data["type"]](data)
-
-
-def _build_box(data: dict[str, Any]) -> spaces.Space[Any]:
-    shape, dtype = _check_shape(data["shape"]), np.dtype(data["dtype"])
-    if dtype.kind not in "biuf":
-        raise ValueError(f"a Box of {dtype}")
-    low, high = _decode_bounds(data["low"], shape, dtype), _decode_bounds(data["high"], shape, dtype)
-    return spaces.Box(low, high, shape, dtype.type)
-
-
-def _build_discrete(data: dict[str, Any]) -> spaces.Space[Any]:
-    return spaces.Discrete(_check_whole(data["n"]), start=_check_whole(data["start"]))
-
-
-def _build_multi_binary(data: dict[str, Any]) -> spaces.Space[Any]:
-    shape = _check_shape(data["n"])
-    return spaces.MultiBinary(list(shape) if isinstance(data["n"], list) else shape[0])
-
-
-def _build_dict(data: dict[str, Any]) -> spaces.Space[Any]:
-    # Pairs: a mapping would be sorted by key, and the order is part of the space.
-    return spaces.Dict([(key, _build(value)) for key, value in data["spaces"].items()])
-
-
-_SPACES: dict[str, Callable[[dict[str, Any]], spaces.Space[Any]]] = {
-    "Box": _build_box,
-    "Discrete": _build_discrete,
-    "MultiDiscrete": lambda data: spaces.MultiDiscrete(data["nvec"]),
-    "MultiBinary": _build_multi_binary,
-    "Dict": _build_dict,
-}
+    match data["type"]:
+        case "Box":
+            shape, dtype = _check_shape(data["shape"]), np.dtype(data["dtype"])
+            if dtype.kind not in "biuf":
+                raise ValueError(f"a Box of {dtype}")
+            low, high = (_decode_bounds(data[end], shape, dtype) for end in ("low", "high"))
+            return spaces.Box(low, high, shape, dtype.type)
+        case "Discrete":
+            return spaces.Discrete(_check_whole(data["n"]), start=_check_whole(data["start"]))
+        case "MultiDiscrete":
+            return spaces.MultiDiscrete(data["nvec"])
+        case "MultiBinary":
+            shape = _check_shape(data["n"])
+            return spaces.MultiBinary(list(shape) if isinstance(data["n"], list) else shape[0])
+        case "Dict":
+            # Pairs: a mapping would be sorted by key, and the order is part of the space.
+            return spaces.Dict([(key, _build(value)) for key, value in data["spaces"].items()])
+    raise ValueError(f"no type {short_repr(data['type'])}")
 
 
 def _check_whole(value: Any) -> int:
