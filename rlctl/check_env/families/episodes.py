@@ -135,7 +135,7 @@ def _find_no_time_limit(records: Records) -> Iterator[Finding]:
     if built.max_steps is not None or any(each.ended != "terminated" for each in episodes):
         return  # those that did not end are RL503's
     lengths = [each.steps for each in episodes]
-    is_continuous = any(leaf.kind == "Box" for leaf in built.leaves)
+    is_continuous = any(leaf.kind == "Box" and leaf.dtype.startswith("float") for leaf in built.leaves)
     if len(set(lengths)) == 1 or (max(lengths) < SHORTEST_TIE and not is_continuous):
         return  # a bandit, or a game of a few moves
     _require_two_flags(records)
