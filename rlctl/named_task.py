@@ -42,7 +42,7 @@ def _make_error(task: str, named_by: str, why: str) -> ArtifactError:
     shown = task if len(task) <= 80 else f"{task[:80]}..."
     hint = "; if you know what it is, name it yourself with --task" if named_by == POLICY else ""
     return ArtifactError(
-        f"{named_by} names {shown!r} as its task, and {why}: not run, a file may not choose that{hint}"
+        f"{named_by} names {shown!r} as its task, and {why}: not run, because a file may name environments only{hint}"
     )
 
 

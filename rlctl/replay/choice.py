@@ -37,8 +37,7 @@ def choose_episodes(
     chosen = select(results, choice)
     known = [result.success for result in results if result.success is not None]
     successes = f", {sum(known)} of which succeeded" if known else ""
-    kind = "failures" if choice.kind == "failures" else choice.kind
-    return chosen, f"the {len(chosen)} {kind} of {episodes} episodes (seed {seed}){successes}"
+    return chosen, f"the {len(chosen)} {choice.kind} of {episodes} episodes (seed {seed}){successes}"
 
 
 def select(results: Sequence[EpisodeResult], choice: Choice) -> list[EpisodeResult]:

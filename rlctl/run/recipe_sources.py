@@ -94,7 +94,7 @@ def describe_rounding(recipe: Recipe) -> str | None:
 def read(path: Path) -> dict[str, Any]:
     """Read a recipe file as plain data, unchecked."""
     if not path.exists():
-        raise ArtifactError(f"no recipe file {path}")
+        raise ArtifactError(f"no recipe file {path}; presets: {', '.join(list_presets())}")
     return _check_mapping(yaml_text.load(yaml_text.read_text(path), str(path)), path)
 
 
