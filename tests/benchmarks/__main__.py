@@ -23,6 +23,7 @@ ROWS = {
     "workers": "stepping:many_environments",
     "playing": "acting:reach",
     "playing-half-cheetah": "acting:half_cheetah",
+    "evaluating": "acting:evaluation",
     "playing-256": "acting:per_step",
     "onnx": "inference:onnx_runtime",
     "c": "inference:c_function",

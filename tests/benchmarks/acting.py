@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
+from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import Play, Segment
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import Workers, available_cores
@@ -21,6 +22,7 @@ from tests.benchmarks.stepping_workers import SteppingWorkers
 MANY = 64
 STEPS = 40  # of each environment in a segment
 HIDDEN = 64
+EPISODES = 100
 SAMPLES = Exploration(stochastic=True)
 
 
@@ -32,6 +34,33 @@ def reach(repeat: int) -> Row:
 def half_cheetah(repeat: int) -> Row:
     """Count environment steps of `half-cheetah`, resets included."""
     return _row("half-cheetah", 1.5, repeat)
+
+
+def evaluation(repeat: int) -> Row:
+    """Count environment steps of 100 whole episodes of `reach`, as `rlctl eval` plays them."""
+    workers = Workers(EnvSpec("reach"), available_cores())
+    policy = make_policy(workers)
+    workers.set_policy(*policy)
+    turns = _Turns("reach", policy)
+
+    def play() -> float:
+        began = time.perf_counter()
+        steps = sum(episode.result.length for episode in play_episodes(workers, range(EPISODES)))
+        return steps / (time.perf_counter() - began)
+
+    pair = side_by_side(play, lambda: turns.play(2), 2 * repeat + 1)
+    workers.close()
+    turns.workers.close()
+    return Row(
+        "evaluating reach",
+        f"{pair.ours:,.0f} steps/s",
+        f"{pair.theirs:,.0f} steps/s",
+        f"{pair.ratio:.2f}x",
+        ">= 2.5x",
+        pair.ratio >= 2.5,
+        f"{EPISODES} episodes on {available_cores()} cores, each whole inside a worker, against one step of {MANY} "
+        "environments at a time and the policy in torch",
+    )
 
 
 def per_step(repeat: int) -> Row:
