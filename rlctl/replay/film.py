@@ -37,18 +37,13 @@ def check_file(path: Path) -> None:
             raise UsageError("--video: .mp4 needs PyAV: pip install 'rlctl[video]'; .gif needs nothing more") from None
 
 
-@contextlib.contextmanager
-def filmable_env(spec: EnvSpec) -> Iterator[Env]:
-    """Build an environment that can be filmed, and close it; raises `UsageError` for one that makes no pictures."""
+def make_filmable(spec: EnvSpec) -> Env:
+    """Build an environment that can be filmed; raises `UsageError` for one that makes no pictures."""
     try:
-        env = spec.make("rgb_array")
+        return spec.make("rgb_array")
     except RlctlError as error:
         spec.make().close()  # raises again if the pictures were not the reason
         raise UsageError(f"--video: {spec.task} makes no pictures: {str(error).splitlines()[0]}") from None
-    try:
-        yield env
-    finally:
-        env.close()
 
 
 def film_episodes(

@@ -59,17 +59,8 @@ class Rollout:
         return len(self.episode.rewards)
 
 
-@contextlib.contextmanager
-def drawable_env(spec: EnvSpec, warn: Warn) -> Iterator[Env]:
-    """Build an environment that can be drawn, and close it; `warn` receives why there will be no pictures."""
-    env = _build_drawable(spec, warn)
-    try:
-        yield env
-    finally:
-        env.close()
-
-
-def _build_drawable(spec: EnvSpec, warn: Warn) -> Env:
+def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
+    """Build an environment that can be drawn; `warn` receives why there will be no pictures."""
     if registry.is_task(spec.constructor()):
         return spec.make()  # its bodies are drawn; pictures would be slow and show less
     try:

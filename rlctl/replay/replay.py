@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import closing
 from pathlib import Path
 
 from rlctl import output
@@ -10,11 +11,11 @@ from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import UsageError
 from rlctl.eval.evaluate import load_player
 from rlctl.replay.choice import Choice, choose_episodes
-from rlctl.replay.film import check_file, film_episodes, filmable_env
+from rlctl.replay.film import check_file, film_episodes, make_filmable
 from rlctl.replay.recorder import (
     Choose,
     Rollout,
-    drawable_env,
+    make_drawable,
     play_episode,
     recorded_actions,
 )
@@ -135,7 +136,7 @@ def _record_episode(path: Path, where: Path | None) -> ReplayResult:
 def _show_episode(path: Path) -> ReplayResult:
     episode = _load_episode(path)
     info, spec = episode.info, episode.info.spec
-    with open_window(spec) as env:
+    with closing(open_window(spec)) as env:
         actions = recorded_actions(episode, env, path)
         rollouts = show_episodes(env, spec, [info.seed], lambda seed: actions)
     return ReplayResult(spec.task, info.policy, [_summarize(rollout) for rollout in rollouts])
@@ -144,7 +145,7 @@ def _show_episode(path: Path) -> ReplayResult:
 def _film_episode(path: Path, film_file: Path) -> ReplayResult:
     episode = _load_episode(path)
     info, spec = episode.info, episode.info.spec
-    with filmable_env(spec) as env:
+    with closing(make_filmable(spec)) as env:
         actions = recorded_actions(episode, env, path)
         rollouts, film = film_episodes(film_file, env, spec, [info.seed], lambda seed: actions, policy=info.policy)
     return ReplayResult(spec.task, info.policy, [_summarize(rollout) for rollout in rollouts], film=film)
@@ -176,7 +177,7 @@ class _Actor:
             self._chosen = {result.seed: result.total_reward for result in results}
 
     def show(self) -> ReplayResult:
-        with open_window(self._spec) as env:
+        with closing(open_window(self._spec)) as env:
             self._check_fits(env)
             rollouts = show_episodes(env, self._spec, self._seeds, self._begin)
         return self._report([_summarize(rollout) for rollout in rollouts])
@@ -184,7 +185,7 @@ class _Actor:
     def film(self, path: Path) -> ReplayResult:
         if not self._seeds:
             return self._report([])
-        with filmable_env(self._spec) as env:
+        with closing(make_filmable(self._spec)) as env:
             self._check_fits(env)
             rollouts, film = film_episodes(path, env, self._spec, self._seeds, self._begin, policy=self._name)
         return dataclasses.replace(self._report([_summarize(rollout) for rollout in rollouts]), film=film)
@@ -193,7 +194,7 @@ class _Actor:
         from rlctl.replay.rrd import write_rrd
 
         spec, done = self._spec, []
-        with drawable_env(spec, print_warning) as env:
+        with closing(make_drawable(spec, print_warning)) as env:
             self._check_fits(env)
             for seed in self._seeds:
                 rollout = play_episode(env, spec, seed, self._begin(seed), policy=self._name, draw=print_warning)

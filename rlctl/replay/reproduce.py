@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 from rlctl import output
@@ -11,7 +12,7 @@ from rlctl.replay.recorder import (
     Rollout,
     check_actions,
     current_versions,
-    drawable_env,
+    make_drawable,
     play_episode,
     recorded_actions,
 )
@@ -40,7 +41,7 @@ def record_episode(
     info, spec = episode.info, episode.info.spec
     if info.failure:
         replay_failed(episode)
-    with drawable_env(spec, warn) as env:
+    with closing(make_drawable(spec, warn)) as env:
         choose = recorded_actions(episode, env)
         rollout = play_episode(env, spec, info.seed, choose, policy=info.policy, draw=warn)
     if info.failure:
@@ -72,11 +73,8 @@ def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verif
             f"{path}: the episode failed ({info.failure}), so there is nothing to compare; "
             f"to see it fail again: rlctl replay {path}"
         )
-    env = spec.make()
-    try:
+    with closing(spec.make()) as env:
         rollout = play_episode(env, spec, info.seed, recorded_actions(episode, env, path), policy=info.policy)
-    finally:
-        env.close()
     now = current_versions(spec.task)
     other = {name: (version, now.get(name)) for name, version in info.versions.items() if now.get(name) != version}
     return rollout, Verification(path, find_difference(episode, rollout), other)

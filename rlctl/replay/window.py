@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rlctl import registry
@@ -20,16 +19,11 @@ _INSTEAD = "leave out --gui to write a recording instead"
 _DT = 1 / 30  # [s] a step, where an environment does not say
 
 
-@contextlib.contextmanager
-def open_window(spec: EnvSpec) -> Iterator[Env]:
-    """Build an environment that shows itself, and close it; raises `UsageError` where there is no display."""
+def open_window(spec: EnvSpec) -> Env:
+    """Build an environment that shows itself; raises `UsageError` where there is no display."""
     if sys.platform == "linux":
         _check_display(bullet=registry.is_task(spec.constructor()))
-    env = spec.make("human")
-    try:
-        yield env
-    finally:
-        env.close()
+    return spec.make("human")
 
 
 def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose]) -> list[Rollout]:

@@ -1,12 +1,13 @@
 import json
 import subprocess
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rlctl.env_spec import EnvSpec
-from rlctl.replay.recorder import Rollout, drawable_env, play_episode
+from rlctl.replay.recorder import Rollout, make_drawable, play_episode
 from rlctl.run.episode import save_episode
 from rlctl.task.bullet import pybullet
 from rlctl_manipulation.reach import JOINT_STEP
@@ -27,7 +28,7 @@ def strict(monkeypatch):
 def reach(seed: int = 5) -> Rollout:
     """Play an episode of reach that goes straight to the goal, by inverse kinematics."""
     spec = EnvSpec("reach")
-    with drawable_env(spec, print) as env:
+    with closing(make_drawable(spec, print)) as env:
         task, sim = env.unwrapped.task, env.unwrapped.sim
 
         def choose(observation, step):
@@ -43,7 +44,7 @@ def reach(seed: int = 5) -> Rollout:
 def play(name: str, *, seed: int = 3, **parameters) -> tuple[Rollout, list[str]]:
     """Play an episode of an environment of envs.py with random actions; returns also the warnings."""
     spec, warnings = EnvSpec(f"{ENVS}:{name}", parameters), []
-    with drawable_env(spec, warnings.append) as env:
+    with closing(make_drawable(spec, warnings.append)) as env:
         env.action_space.seed(0)
         rollout = play_episode(
             env, spec, seed, lambda o, k: env.action_space.sample(), policy="chance", draw=warnings.append

@@ -1,6 +1,7 @@
 """MJCF robots are drawn where PyBullet simulates them, and the camera goes along."""
 
 import dataclasses
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from rlctl.env_spec import EnvSpec
 from rlctl.replay.bodies import shape_centers
 from rlctl.replay.mjcf import Shape, read_shapes
-from rlctl.replay.recorder import drawable_env, play_episode
+from rlctl.replay.recorder import make_drawable, play_episode
 from rlctl.replay.rrd import write_rrd
 from rlctl.replay.scene import BodyMotion, SceneReader
 from rlctl.task.bullet import pybullet
@@ -119,7 +120,7 @@ def recordings(tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("mjcf"), {}
     for name in ("ant", "humanoid", "hopper"):
         spec, warnings = EnvSpec(name, {}), []
-        with drawable_env(spec, warnings.append) as env:
+        with closing(make_drawable(spec, warnings.append)) as env:
             env.action_space.seed(0)
             actions = iter([env.action_space.sample() for _ in range(1000)])
             rollout = play_episode(env, spec, 3, lambda o, k, a=actions: next(a), policy="chance", draw=warnings.append)
@@ -206,7 +207,7 @@ def test_file_that_only_pybullet_reads_costs_a_warning(tmp_path, monkeypatch, na
 
     monkeypatch.setattr("rlctl.replay.scene.read_shapes", refuse)
     warnings = []
-    with drawable_env(EnvSpec(name), warnings.append) as env:
+    with closing(make_drawable(EnvSpec(name), warnings.append)) as env:
         action = np.zeros(env.action_space.shape, np.float32)
         rollout = play_episode(env, EnvSpec(name), 3, lambda o, k: action, policy="none", draw=warnings.append)
     write_rrd(tmp_path / "r.rrd", rollout, title=name, warn=warnings.append)

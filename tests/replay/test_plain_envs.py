@@ -1,9 +1,11 @@
+from contextlib import closing
+
 import numpy as np
 import pytest
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.replay.recorder import drawable_env, play_episode
+from rlctl.replay.recorder import make_drawable, play_episode
 from rlctl.replay.rrd import write_rrd
 from tests.replay.conftest import ENVS, play
 from tests.replay.reading import column, entities, jpegs
@@ -63,7 +65,7 @@ def test_missing_pictures_cost_a_warning_and_nothing_else_is_missing(name, param
 @pytest.mark.parametrize("task", ["Pendulum-v1", "CartPole-v1"])
 def test_gymnasium_environments(task, tmp_path):
     spec = EnvSpec(task)
-    with drawable_env(spec, print) as env:
+    with closing(make_drawable(spec, print)) as env:
         env.action_space.seed(0)
         rollout = play_episode(env, spec, 1, lambda o, k: env.action_space.sample(), policy="", draw=print)
     _, observations = column(write(rollout, tmp_path), "/observation")
