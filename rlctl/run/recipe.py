@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -24,6 +24,7 @@ ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
 """What can learn in hindsight: what has a replay buffer, except crossq, which has no network for Dict spaces."""
 
+_ABSENT = "(not set)"
 _QUANTILES = 25  # per critic, where a recipe does not say
 _MOST_STEPS = 10**12
 _MOST_ENVS = 10_000
@@ -269,3 +270,19 @@ def _explain(problem: Any, path: Sequence[str | int], schema: schema_text.Schema
     given = repr(short_repr(given)) if isinstance(given, str) else short_repr(given)
     expected = f"expected {schema_text.describe_value(schema, part)}{examples}"
     return f"{label}{expected}, got {given}{close and f'.{close}'}"
+
+
+def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:
+    """Return per dotted key that differs the value in `recipe` and the one in `base`; the seed is not compared."""
+    ours, theirs = (dict(_flatten(each.model_dump(mode="json", by_alias=True))) for each in (recipe, base))
+    keys = dict.fromkeys([*theirs, *ours])
+    pairs = {key: (ours.get(key, _ABSENT), theirs.get(key, _ABSENT)) for key in keys if key != "seed"}
+    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flatten(value, f"{prefix}{key}.")
+        elif value != {}:
+            yield prefix + key, value

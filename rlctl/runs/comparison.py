@@ -20,8 +20,7 @@ from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
 from rlctl.run.directory import RunDirectory, is_group
 from rlctl.run.group import read_group
 from rlctl.run.lookup import find_run
-from rlctl.run.recipe import Recipe
-from rlctl.run.recipe_difference import find_difference
+from rlctl.run.recipe import Recipe, find_difference
 from rlctl.runs.statistics import (
     Difference,
     Verdict,

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rlctl.errors import DivergedError, Interrupted, RlctlError
 from rlctl.run.directory import RunDirectory
 from rlctl.run.policy import collect_versions
-from rlctl.run.recipe import Recipe
-from rlctl.run.recipe_difference import find_difference
+from rlctl.run.recipe import Recipe, find_difference
 from rlctl.run.recipe_sources import resolve_packaged
 from rlctl.run.task_version import find_git_commit, identify_task
 

@@ -57,7 +57,7 @@ def test_recipes_are_compared_seed_by_seed(root):
 
 
 def test_runs_of_several_recipes_as_one_are_pointed_out(root):
-    result = compare(CompareRequest([f"{root}/0.9*/reach/*_s0", f"{root}/0.9*/reach/*_s1"], episodes=2))
+    result = compare(CompareRequest([f"{root}/0.9*/Line/*_s0", f"{root}/0.9*/Line/*_s1"], episodes=2))
     assert result.baseline.mixed == ["algo_kwargs.gamma"]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.run.episode import RecordedEpisode, load_episode
-from rlctl.run.recipe_difference import find_difference
+from rlctl.run.recipe import find_difference
 from rlctl.runs.comparison import find_group
 from rlctl.runs.diagnosis import Finding
 from rlctl.runs.show import RunDescription, describe
