@@ -73,19 +73,22 @@ def kill_after(monkeypatch):
     """End the training in the middle of a step, so many steps of each environment after it began."""
 
     def kill(steps):
-        done = 0
+        done = asked = 0
         started, finished = WorkerVecEnv.start, WorkerVecEnv.finish
 
         def killed():
             raise Killed
 
         def start(env, count, exploration, **options):
-            nonlocal done
-            done += count
+            nonlocal asked
+            asked = 1 if options.get("until_end") else count  # of an episode it is not known how many there will be
             started(env, count, exploration, **options)
 
         def finish(env, check=None):
-            return finished(env, killed if done > steps else check)  # while the workers play
+            nonlocal done
+            segment = finished(env, killed if done + asked > steps else check)  # while the workers play
+            done += segment.reward.shape[1]
+            return segment
 
         def undo():
             monkeypatch.setattr(WorkerVecEnv, "start", started)
