@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -56,7 +55,7 @@ class ObservationLayout:
 
         Raises `ObservationError` that names what is missing, unknown, or of another size.
         """
-        if isinstance(given, Mapping):
+        if isinstance(given, dict):
             parts = self._read_names(given)
             if isinstance(self.space, spaces.Dict):
                 return parts
@@ -65,7 +64,7 @@ class ObservationLayout:
             raise ObservationError(f"this policy takes observations by name: {', '.join(self.shapes)}")
         return _convert(given, WHOLE, self.space.shape or (), self._dtype(SINGLE))
 
-    def _read_names(self, given: Mapping[Any, Any]) -> dict[str, Array]:
+    def _read_names(self, given: dict[Any, Any]) -> dict[str, Array]:
         known = self.shapes
         problems = []
         if unknown := [name for name in given if name not in known]:

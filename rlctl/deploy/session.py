@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -82,7 +82,7 @@ class Session:
 
     def _read(self, request: Any) -> tuple[Any, float]:
         """Return the observation of a request and its age; begin an episode where it says so."""
-        if not isinstance(request, Mapping):
+        if not isinstance(request, dict):
             raise ObservationError("a request is a map: observations by name, or observation: the flat vector")
         fields = dict(request)
         if fields.pop("reset", False):
