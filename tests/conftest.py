@@ -5,6 +5,7 @@ import os
 # Each of the processes that run the tests has a core: threads of a library would only wait for each other.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
+import contextlib
 import gc
 import signal
 import subprocess
@@ -19,6 +20,9 @@ from rlctl.rollout.process_start import set_default_start
 from tests import fork_server
 
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup what is started here would ignore it
+ALL_CORES = sorted(os.sched_getaffinity(0))
+if name := os.environ.get("PYTEST_XDIST_WORKER"):  # so what it trains and evaluates has one worker and not one per core
+    os.sched_setaffinity(0, {ALL_CORES[int(name.removeprefix("gw")) % len(ALL_CORES)]})
 
 
 def pytest_collection_finish():
@@ -94,6 +98,22 @@ def install(tmp_path):
         return folder
 
     return installed
+
+
+@pytest.fixture
+def use_cores():
+    """Let this process and those that it starts use so many cores only, or all, as long as the result is entered."""
+
+    @contextlib.contextmanager
+    def limit(count=None):
+        before = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, ALL_CORES[:count])
+        try:
+            yield
+        finally:
+            os.sched_setaffinity(0, before)
+
+    return limit
 
 
 @pytest.fixture

@@ -16,10 +16,16 @@ PARTS = 101
 ALGORITHMS = ["ppo", pytest.param("sac", marks=pytest.mark.crash)]
 
 
-def parts(function):
-    """Let a test run in parts: it takes those of its trials whose number leaves `part` when divided by `PARTS`."""
-    values = [pytest.param(part, marks=pytest.mark.crash if part else ()) for part in range(PARTS)]
-    return pytest.mark.parametrize("part", values)(function)
+parts = pytest.mark.parts
+"""Lets a test run in parts: it takes those of its trials whose number leaves `part` when divided by `PARTS`."""
+
+
+def pytest_generate_tests(metafunc):
+    """Make the parts of a test; those that only `make test-crash` runs are not even made where none of them is."""
+    if metafunc.definition.get_closest_marker("parts"):
+        count = 1 if "not crash" in metafunc.config.getoption("markexpr") else PARTS
+        values = [pytest.param(part, marks=pytest.mark.crash if part else ()) for part in range(count)]
+        metafunc.parametrize("part", values)
 
 
 @pytest.fixture(scope="session")

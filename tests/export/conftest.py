@@ -43,7 +43,7 @@ def small():
 def train():
     """Return a model of `steps` steps and its environments, normalised as far as the recipe's default would."""
 
-    def trained(algo, spec, steps=64, **kwargs):
+    def trained(algo, spec, steps=32, **kwargs):
         env = wrap_normalize(DummyVecEnv([spec.make]), Normalize(), 0.99)
         name = policy_name(algo, env.observation_space)
         settings = {**ON_POLICY.get(algo, OFF_POLICY), "policy_kwargs": {"net_arch": [16, 16]}, **kwargs}

@@ -121,7 +121,9 @@ def grasp_and_lift(env, seed):
 def test_an_object_can_be_grasped_and_lifted(stage):
     env = TaskEnv(GearArm(stage=stage))
     lifted = []
-    for seed in range(3):
+    for seed in range(3):  # two of three
+        if sum(lifted) == 2:
+            break
         _, info = grasp_and_lift(env, seed)
         lifted.append(info["is_success"])
         if info["is_success"]:

@@ -126,10 +126,10 @@ def test_nothing_is_left_open(spec):
     Workers(spec("Walk"), 1, start=subprocess.Popen).close()
     process = psutil.Process()
     files, threads = process.num_fds(), threading.active_count()
-    with Workers(spec("Walk"), 2, start=subprocess.Popen) as workers:
+    with Workers(spec("Walk"), 2, n_workers=1, start=subprocess.Popen) as workers:
         workers.replay_actions({0: still(0, 1), 1: still(1, 1)})
     del workers
-    workers = Workers(spec("Walk"), 2, start=subprocess.Popen)
+    workers = Workers(spec("Walk"), 1, start=subprocess.Popen)
     workers.close()  # before it was used
     workers.close()
     del workers

@@ -1,8 +1,5 @@
 """A run that was killed and resumed is the run that was never stopped, bit for bit."""
 
-import contextlib
-import os
-
 import pytest
 
 from rlctl.rollout.workers import available_cores
@@ -14,7 +11,7 @@ from tests.train.conftest import FAULTY, SMALL
 
 ON_POLICY = {"ppo": {"n_steps": 16, "batch_size": 32, "n_epochs": 2}, "a2c": {"n_steps": 16}}
 ON_POLICY["recurrent_ppo"] = ON_POLICY["ppo"]
-OFF_POLICY = {"learning_starts": 24, "batch_size": 16, "buffer_size": 200}
+OFF_POLICY = {"learning_starts": 24, "batch_size": 16, "buffer_size": 200, "train_freq": 4, "gradient_steps": 2}
 SHORT = {"total_timesteps": 128, "eval": {"episodes": 3, "every_steps": 64}}
 
 
@@ -43,9 +40,10 @@ CASES = {
     "ppo, stochastic evaluation": ("Line", settings("ppo", eval={"deterministic": False}, **SDE)),
     "ppo, other observations than declared": (f"{FAULTY}:Outside", settings("ppo")),
     "ppo, on reach": ("reach", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
+    "ppo, on hopper": ("hopper", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
     "a2c": ("Line", settings("a2c")),
     "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
-    "sac": ("Line", settings("sac", policy_kwargs={"net_arch": [256, 256]})),
+    "sac": ("Line", settings("sac", algo_kwargs={"train_freq": 1}, policy_kwargs={"net_arch": [256, 256]})),
     "sac with gSDE": ("Line", settings("sac", **SDE)),
     "sac, normalised": ("Line", settings("sac", **NORMALIZED)),
     "sac, dict": ("DictObservation", settings("sac", **NORMALIZED)),
@@ -61,10 +59,10 @@ CASES = {
     "tqc": ("Line", settings("tqc")),
     "crossq": ("Line", settings("crossq")),
 }
-# A kind of state each: noise matrices, stages, a world of PyBullet, hidden states, whole episodes with their goals and
-# statistics, a target network. Killed trainings of plain ppo and sac are in tests/crash.
+# A kind of state each: noise matrices, stages, a world of PyBullet with contacts, hidden states, whole episodes with
+# their goals and statistics, a target network. Killed trainings of plain ppo and sac are in tests/crash.
 QUICK = {
-    *("ppo with gSDE", "ppo, curriculum", "ppo, on reach", "recurrent_ppo", "sac, hindsight, normalised", "dqn"),
+    *("ppo with gSDE", "ppo, curriculum", "ppo, on hopper", "recurrent_ppo", "sac, hindsight, normalised", "dqn"),
 }
 
 
@@ -124,34 +122,19 @@ def test_killed_and_resumed(train, resume, kill_after, case):
     assert_same_run(whole, run)
 
 
-@pytest.fixture
-def one_core():
-    """Let this process and those that it starts use one core only, as long as the result is entered."""
-
-    @contextlib.contextmanager
-    def limit():
-        before = os.sched_getaffinity(0)
-        os.sched_setaffinity(0, {min(before)})
-        try:
-            assert available_cores() == 1
-            yield
-        finally:
-            os.sched_setaffinity(0, before)
-
-    return limit
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores can be chosen on Linux only")
 @pytest.mark.usefixtures("every_boundary")
-def test_on_one_core_and_resumed_on_all(train, resume, kill_after, one_core):
+def test_on_one_core_and_resumed_on_all(train, resume, kill_after, use_cores):
     env, given = CASES["ppo"]
     whole = train(env, given).run
     undo = kill_after(37)
-    with one_core(), pytest.raises(Killed):
-        train(env, given)
+    with use_cores(1):
+        assert available_cores() == 1
+        with pytest.raises(Killed):
+            train(env, given)
     undo()
     run = newest_other_than(whole)
-    resume(run)
+    with use_cores():
+        resume(run)
     assert_same_run(whole, run)
 
 

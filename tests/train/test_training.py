@@ -94,14 +94,14 @@ def test_kept_episodes_are_the_first_and_the_worst(finished):
 @pytest.mark.parametrize(
     ("algo", "env"),
     [
-        ("ppo", "Line"),
-        ("ppo", "Discrete"),
+        pytest.param("ppo", "Line", marks=pytest.mark.slow),
+        pytest.param("ppo", "Discrete", marks=pytest.mark.slow),
         ("ppo", "DictObservation"),
         ("ppo", "Image"),
         ("a2c", "Line"),
         ("sac", "Line"),
         ("td3", "Line"),
-        ("ddpg", "Line"),
+        pytest.param("ddpg", "Line", marks=pytest.mark.slow),
         ("dqn", "Discrete"),
         ("tqc", "Line"),
         ("crossq", "Line"),
