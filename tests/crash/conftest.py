@@ -17,13 +17,15 @@ ALGORITHMS = ["ppo", pytest.param("sac", marks=pytest.mark.crash)]
 
 
 parts = pytest.mark.parts
-"""Lets a test run in parts: it takes those of its trials whose number leaves `part` when divided by `PARTS`."""
+"""Lets a test run in parts: it takes those of its trials whose number leaves `part` when divided by `PARTS`, or by so
+many times `PARTS` as the argument says."""
 
 
 def pytest_generate_tests(metafunc):
     """Make the parts of a test; those that only `make test-crash` runs are not even made where none of them is."""
-    if metafunc.definition.get_closest_marker("parts"):
-        count = 1 if "not crash" in metafunc.config.getoption("markexpr") else PARTS
+    if marker := metafunc.definition.get_closest_marker("parts"):
+        times = marker.args[0] if marker.args else 1
+        count = 1 if "not crash" in metafunc.config.getoption("markexpr") else times * PARTS
         values = [pytest.param(part, marks=pytest.mark.crash if part else ()) for part in range(count)]
         metafunc.parametrize("part", values)
 

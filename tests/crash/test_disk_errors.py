@@ -13,10 +13,10 @@ def errors(part, operations, each=3):
     """Return the number of each operation, and an error, that a part tries: `each` of the errors by turns."""
     names = list(ERRORS)
     tried = [(at, names[(at + turn) % 3]) for at in range(1, operations + 2) for turn in range(each)]
-    return tried[part::PARTS]
+    return tried[part :: each * PARTS]
 
 
-@parts
+@parts(3)
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_error_once_costs_nothing(trials, whole, folders, name, part):
     before = whole(name)
