@@ -78,7 +78,8 @@ def make_loop() -> asyncio.AbstractEventLoop:
         import uvloop
     except ModuleNotFoundError:  # on Windows
         return asyncio.new_event_loop()
-    return uvloop.new_event_loop()
+    loop: asyncio.AbstractEventLoop = uvloop.new_event_loop()
+    return loop
 
 
 async def serve_until(
