@@ -50,9 +50,9 @@ CASES = {
     "sac, curriculum": ("Staged", settings("sac", **STAGES)),
     "sac, several steps": ("Line", settings("sac", algo_kwargs={"n_steps": 3})),
     "sac, one environment": ("Line", settings("sac", n_envs=1, algo_kwargs={"train_freq": [1, "episode"]})),
-    "sac, hindsight": ("Plane", settings("sac", her={}, task={"steps": 10})),
+    "sac, hindsight": ("Plane", settings("sac", her={}, task={"steps": 7})),
     "sac, hindsight, normalised": ("Plane", settings("sac", her={}, task={"steps": 7}, **NORMALIZED)),
-    "dqn, hindsight": ("Corridor", settings("dqn", her={"goal_selection_strategy": "final"}, task={"steps": 10})),
+    "dqn, hindsight": ("Corridor", settings("dqn", her={"goal_selection_strategy": "final"}, task={"steps": 7})),
     "td3": ("Line", settings("td3")),
     "ddpg": ("Line", settings("ddpg")),
     "dqn": ("Discrete", settings("dqn", algo_kwargs={"target_update_interval": 20})),
@@ -145,17 +145,19 @@ def newest_other_than(run):
     return RunDirectory(other)
 
 
-@pytest.mark.parametrize("case", ["ppo", pytest.param("dqn", marks=pytest.mark.slow)])
-def test_an_evaluation_after_the_last_checkpoint(train, resume, kill_after, monkeypatch, case):
+@pytest.mark.parametrize(
+    ("case", "steps", "evaluated"), [("ppo", 40, "128"), pytest.param("dqn", 20, "64", marks=pytest.mark.slow)]
+)
+def test_an_evaluation_after_the_last_checkpoint(train, resume, kill_after, monkeypatch, case, steps, evaluated):
     monkeypatch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e-9)
     env, given = CASES[case]
     whole = train(env, given).run
-    undo = kill_after(40)
+    undo = kill_after(steps)
     with pytest.raises(Killed):
         train(env, given)
     undo()
     run = newest_other_than(whole)
     assert [int(each.name) for each in run.checkpoints()] == [0]
-    assert [row["steps"] for row in rows(run.evals_file)] == ["128"]
+    assert [row["steps"] for row in rows(run.evals_file)] == [evaluated]
     resume(run)
     assert_same_run(whole, run)
