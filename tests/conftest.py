@@ -100,7 +100,7 @@ def install(tmp_path):
     return installed
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def use_cores():
     """Let this process and those that it starts use so many cores only, or all, as long as the result is entered."""
 

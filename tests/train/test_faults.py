@@ -22,6 +22,13 @@ PLACE = f"in environment 1, episode seed {SEED}, step 7; "
 pytestmark = pytest.mark.usefixtures("every_boundary")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _two_workers(use_cores):
+    """One environment each: what harms a worker is seen apart from what harms the other environment."""
+    with use_cores(2):
+        yield
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The run that nothing stops."""
