@@ -39,7 +39,8 @@ class TutorialReach(gymnasium.Env[np.ndarray, np.ndarray]):
         iterations = self.task.solver_iterations
         p.setPhysicsEngineParameter(numSolverIterations=iterations, physicsClientId=self.client)
         p.loadURDF("plane.urdf", physicsClientId=self.client)
-        self.arm = p.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True, physicsClientId=self.client)
+        inertia = p.URDF_USE_INERTIA_FROM_FILE  # as the shipped task; tutorials leave it out
+        self.arm = p.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True, flags=inertia, physicsClientId=self.client)
         start = reach.HOME + self.np_random.uniform(-reach.HOME_NOISE, reach.HOME_NOISE, JOINTS)
         p.changeDynamics(self.arm, -1, maxJointVelocity=reach.SPEED_LIMIT.max(), physicsClientId=self.client)
         for joint in range(JOINTS):
