@@ -196,9 +196,8 @@ class SafetyFilter:
         self.steps += 1
         wanted = self._manual if self._manual is not None else action
         if wanted is not None and self._command is not None:
-            wanted = np.array(
-                wanted, np.float64
-            ).ravel()  # a copy: a policy may write the next one into the same memory
+            # A copy: a policy may write the next one into the same memory.
+            wanted = np.array(wanted, np.float64).ravel()
         fault = self._fault or self._find_fault(wanted)
         if self.state != "stopped" and not self._ordered:
             self._follow(fault)

@@ -12,7 +12,7 @@ import numpy as np
 from rlctl.errors import ArtifactError
 from rlctl.run.acting import NumpyPolicy, check_playable
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.network import Network, select_actor_tensors
+from rlctl.run.network import DETERMINISTIC, Network, select_actor_tensors
 from rlctl.run.policy import Policy, PolicyInfo, read_policy
 
 
@@ -30,7 +30,7 @@ class ServedPolicy:
     def measure_spread(self, observation: Any) -> float | None:
         """Return the mean standard deviation of the actions that were trained with; None where there is none."""
         network, algo = self.network, self.info.algo
-        if network is None or algo in ("td3", "ddpg", "dqn") or self.info.policy_kwargs.get("use_sde"):
+        if network is None or algo in (*DETERMINISTIC, "dqn") or self.info.policy_kwargs.get("use_sde"):
             return None
         if network.log_std is not None:
             return float(np.exp(network.log_std).mean())

@@ -17,7 +17,7 @@ from rlctl.dict_spaces import join, split_space
 from rlctl.errors import ArtifactError, DivergedError, UsageError, short_repr
 from rlctl.run.c_policy import LIBRARY_SUFFIX, CPolicy
 from rlctl.run.layers import Array, apply
-from rlctl.run.network import Network, Tensors, select_actor_tensors
+from rlctl.run.network import DETERMINISTIC, Network, Tensors, select_actor_tensors
 from rlctl.run.policy import Policy, PolicyInfo, read_policy
 
 _BLOCK = 64
@@ -140,7 +140,7 @@ class PolicyPlayer(Player):
         value = apply(network.head, latent)
         if not isinstance(self._space, spaces.Box):
             return self._act_discrete(value, seed, step)
-        if exploration.stochastic and self._algo not in ("td3", "ddpg"):
+        if exploration.stochastic and self._algo not in DETERMINISTIC:
             value = value + self._sample(latent, seed, step)
         if not math.isfinite(np.add.reduce(value)):
             raise DivergedError(f"the policy's action is not finite: {short_repr(value.tolist())}")

@@ -21,8 +21,9 @@ Tensors = Mapping[str, Array]
 
 _BATCH_RENORM_EPSILON = 1e-3
 _SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq")
-_DETERMINISTIC = ("td3", "ddpg")
-_RELU_BY_DEFAULT = (*_SQUASHED_GAUSSIAN, *_DETERMINISTIC, "dqn")
+DETERMINISTIC = ("td3", "ddpg")
+"""Algorithms whose policy has no distribution to sample from."""
+_RELU_BY_DEFAULT = (*_SQUASHED_GAUSSIAN, *DETERMINISTIC, "dqn")
 _NATURE_STRIDES = {"0": 4, "2": 2, "4": 1}
 """Strides of the convolutions of SB3's NatureCNN, the only one here, by their index."""
 
@@ -34,7 +35,7 @@ def select_actor_tensors(info: PolicyInfo, tensors: Tensors) -> dict[str, Array]
 
 
 def _list_prefixes(algo: str) -> tuple[str, ...]:
-    if algo in (*_SQUASHED_GAUSSIAN, *_DETERMINISTIC):
+    if algo in (*_SQUASHED_GAUSSIAN, *DETERMINISTIC):
         return ("actor.",)
     if algo == "dqn":
         return ("q_net.",)
@@ -50,7 +51,7 @@ class Network:
     def __init__(self, info: PolicyInfo, tensors: Tensors) -> None:
         algo, read = info.algo, _Reader(info, tensors)
         extractor = {"dqn": "q_net.features_extractor"}.get(algo, "pi_features_extractor")
-        if algo in (*_SQUASHED_GAUSSIAN, *_DETERMINISTIC):
+        if algo in (*_SQUASHED_GAUSSIAN, *DETERMINISTIC):
             extractor = "actor.features_extractor"
         self.parts = {
             key: read.features(key, space, f"{extractor}.extractors.{key}" if key else extractor)
@@ -60,11 +61,11 @@ class Network:
         self.lstm = read.lstm("lstm_actor") if algo == "recurrent_ppo" else None
         self.trunk, self.head = _read_actor(algo, read)
         """The head's result is the mean of the action, the action of TD3 and DDPG, logits, or values."""
-        self.is_squashed = algo in (*_SQUASHED_GAUSSIAN, *_DETERMINISTIC) or bool(
+        self.is_squashed = algo in (*_SQUASHED_GAUSSIAN, *DETERMINISTIC) or bool(
             info.policy_kwargs.get("squash_output")
         )
         """Whether actions in a Box are in [-1, 1], and scaled to its bounds."""
-        self.ends_with_tanh = self.is_squashed and algo not in _DETERMINISTIC  # of these the head does
+        self.ends_with_tanh = self.is_squashed and algo not in DETERMINISTIC  # of these the head does
         """Whether tanh comes after the head, and after noise that is added to its result."""
         name = "actor.log_std" if algo in _SQUASHED_GAUSSIAN else "log_std"
         self.log_std = read.tensors.get(name)
@@ -97,7 +98,7 @@ def _read_actor(algo: str, read: _Reader) -> tuple[list[Layer], list[Layer]]:
             return trunk, [read.linear("actor.mu")]
         limit = float(read.info.policy_kwargs.get("clip_mean", 2.0))
         return trunk, [read.linear("actor.mu.0"), layers.Clip("actor.mu.1", limit)]
-    if algo in _DETERMINISTIC:
+    if algo in DETERMINISTIC:
         return [], read.sequence("actor.mu", end=Activation("tanh"))
     if algo == "dqn":
         return [], read.sequence("q_net.q_net")

@@ -9,6 +9,7 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from rlctl.dict_spaces import join, split_space
 from rlctl.run.acting import Exploration
+from rlctl.run.network import DETERMINISTIC
 from rlctl.run.recipe import Recipe
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, to_network_layout
@@ -16,7 +17,6 @@ from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
 
 _LONGEST = 1000
 """Steps after which an episode without a time limit is stored in parts."""
-_DETERMINISTIC_EXPLORERS = frozenset({"td3", "ddpg"})
 
 
 class OffPolicyRollouts(Rollouts):
@@ -32,7 +32,7 @@ class OffPolicyRollouts(Rollouts):
         super().__init__(model, env, recipe, progress)
         # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
         self.overlap = recipe.overlap and recipe.her is None
-        default = 0.1 if recipe.algo in _DETERMINISTIC_EXPLORERS else 0.0  # else they would not explore at all
+        default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # else they would not explore at all
         self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
 
     def start(self) -> None:
