@@ -135,6 +135,8 @@ class EpisodeResult:
     """What the player has to say of it; see `acting.Player.report`."""
     deepest_contact: float | None = None
     """How far two bodies overlapped at most [m]; None where it was not measured."""
+    acting: float = dataclasses.field(default=0.0, compare=False)
+    """The part of its time that the policy took, the environment the rest."""
 
 
 @dataclasses.dataclass(frozen=True)

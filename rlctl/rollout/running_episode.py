@@ -23,6 +23,8 @@ class RunningEpisode:
         self.seed = -1
         self.step = 0
         """Steps that were begun in the episode."""
+        self.acting_s, self.stepping_s = 0.0, 0.0
+        """Time that the policy and the environment took in the episode's steps [s]."""
         self._discrete = isinstance(env.action_space, spaces.Discrete)
         self._return = 0.0
         self._sums: dict[str, float] = {}
@@ -32,6 +34,7 @@ class RunningEpisode:
         """Begin the episode of a seed; return its first observation."""
         self.seed, self.step = seed, 0
         self._return, self._sums, self._deepest_contact = 0.0, {}, None
+        self.acting_s, self.stepping_s = 0.0, 0.0
         observation, info = returned_values.check_tuple(self.env.reset(seed=seed), returned_values.RESET, "reset")
         returned_values.check_info(info)
         return observation
@@ -88,4 +91,5 @@ class RunningEpisode:
             row,
             report,
             self._deepest_contact,
+            self.acting_s / max(self.acting_s + self.stepping_s, 1e-9),
         )

@@ -6,6 +6,7 @@ import contextlib
 import gc
 import itertools
 from collections.abc import Iterator
+from time import perf_counter
 
 import numpy as np
 from gymnasium import spaces
@@ -189,12 +190,16 @@ class Worker:
         row, only_one = 0, asked.until_end or next_seeds is None
         while row < asked.steps and not (only_one and ended):
             observation = single[row] if single is not None else {key: rows[row] for key, rows in now.items()}
+            began = perf_counter()
             chosen, action = player.act(observation, episode.seed, episode.step)
+            acted = perf_counter()
             stored[row] = np.ravel(chosen)
             taken[row] = action
             episode.step += 1
             inside[index] = episode.seed, episode.step, row
             observation, reward, terminated, truncated, info = episode.take_step(taken[row])
+            episode.acting_s += acted - began
+            episode.stepping_s += perf_counter() - acted
             rewards[row] = reward
             segment.terminated[index, row], segment.truncated[index, row] = terminated, truncated
             if asked.record:

@@ -24,6 +24,7 @@ def training_row(recent: Sequence[EpisodeResult], terms: Iterable[str], log: Map
     """
     means = mean_terms(recent) if recent else {}
     return {
+        "acting": float(np.mean([each.acting for each in recent])) if recent else None,
         "return": mean_return(recent) if recent else None,
         "length": _mean_length(recent) if recent else None,
         "success": success_rate(recent) if recent else None,

@@ -43,6 +43,7 @@ HEALTHY = {
     "value": RISING / 2,
     "gradient_norm": 0.5,
     "playing": 0.75,
+    "acting": 0.2,
     "fps": 3000,
 }
 FLAT = {"return": -50 + np.tile([0.5, -0.5, 1.0], 10), "success": 0.0}
@@ -175,6 +176,7 @@ def test_sick_training_is_found(write_training, id, metrics, more):
         ("Q4", {"playing": 0.97, "fps": 40}, {}),
         ("Q6", {}, {"observations_outside": 7}),
         ("Q13", {"playing": 0.1}, {}),
+        ("Q13", {"playing": 0.9, "acting": 0.6}, {}),
         ("Q11", {}, {"evaluations": {"return": [0, 90, 50, 40, 55]}}),
     ],
 )
@@ -225,7 +227,7 @@ def test_training_ends_with_warnings_in_full_and_the_rest_in_a_line(write_traini
     findings = diagnose(write_training({**FLAT, "explained_variance": 0.01, "playing": 0.1}))
     lines = format_end(findings, "runs/x")
     assert lines[0].startswith("warning: Q9 ")
-    assert lines[-1] == "noted: Q13 slow updates; more: rlctl runs show runs/x"
+    assert lines[-1] == "noted: Q13 slow updates or a slow policy; more: rlctl runs show runs/x"
     assert format_end([], "runs/x") == []
 
 

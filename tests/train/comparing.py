@@ -9,7 +9,7 @@ from safetensors.numpy import load_file
 from rlctl.run.directory import RunDirectory
 from rlctl.train import checkpoint
 
-OF_TIME = ("seconds", "fps", "playing")
+OF_TIME = ("seconds", "fps", "playing", "acting")
 
 
 class Killed(BaseException):

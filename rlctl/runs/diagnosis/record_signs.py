@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
@@ -9,20 +11,46 @@ from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
 
 def learner_slow(run: History) -> str | None:
     """Most of the time goes into updates."""
-    playing, fps = run.curve("playing"), run.curve("fps")
-    if len(playing) < LEAST_ROWS or (share := float(np.median(playing.values))) > 0.25:
-        return None
-    return (
-        f"the environments are waited for {share:.0%} of the time, updates take the rest; {_median(fps):,.0f} steps/s"
-    )
+    shares = _read_shares(run)
+    return shares.describe() if shares and shares.learner >= 0.75 else None
+
+
+def policy_slow(run: History) -> str | None:
+    """The environments' own time goes into choosing actions."""
+    shares = _read_shares(run)
+    return shares.describe() if shares and shares.policy > max(0.4, shares.environments) else None
 
 
 def environments_slow(run: History) -> str | None:
-    """Most of the time goes into slow environments, with the policy that acts in them."""
-    playing, fps = run.curve("playing"), run.curve("fps")
-    if len(playing) < LEAST_ROWS or (share := float(np.median(playing.values))) < 0.8 or _median(fps) > 300:
+    """Most of the time goes into slow environments."""
+    shares = _read_shares(run)
+    slow = shares is not None and shares.environments >= 0.5 and shares.learner <= 0.2 and shares.steps_per_s <= 300
+    return shares.describe() if shares and slow else None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shares:
+    """Parts of a training's time."""
+
+    environments: float
+    policy: float
+    learner: float
+    steps_per_s: float
+
+    def describe(self) -> str:
+        """Return the shares as text."""
+        return (
+            f"environments take {self.environments:.0%} of the time, the policy that acts in them {self.policy:.0%}, "
+            f"updates the rest; {self.steps_per_s:,.0f} steps/s"
+        )
+
+
+def _read_shares(run: History) -> _Shares | None:
+    playing = run.curve("playing")
+    if len(playing) < LEAST_ROWS:
         return None
-    return f"the environments are waited for {share:.0%} of the time; {_median(fps):,.0f} steps/s"
+    waited, acting = _median(playing), _median(run.curve("acting"))
+    return _Shares(waited * (1 - acting), waited * acting, 1 - waited, _median(run.curve("fps")))
 
 
 def _median(curve: Curve) -> float:
