@@ -31,7 +31,6 @@ class Ant(Locomotion):
     rlctl_ignore = {
         **Locomotion.rlctl_ignore,
         "RL804": "the family starts every joint within 0.1 rad of 0, and no ankle can be there",
-        "RL807": "the family drops the ant from half a metre",
     }
 
     def stands(self, height: float, pitch: float) -> bool:
@@ -132,11 +131,6 @@ class Humanoid(Locomotion):
     power_weight, torque_weight = 4.25 * 2.0, 4.25 * 0.1
     action_space = Box(-1.0, 1.0, (17,), np.float32)
     events = pushes(force=40.0)
-    rlctl_ignore = {
-        **Locomotion.rlctl_ignore,
-        "RL807": "the family drops the humanoid from a quarter of a metre",
-        "RL902": "only a world loaded anew repeats its episodes; those of random actions last a third of a second",
-    }
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start as the others do."""

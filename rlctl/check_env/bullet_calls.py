@@ -1,4 +1,4 @@
-"""Records how an environment calls PyBullet: which calls leave physicsClientId out, and which models are loaded."""
+"""Records how an environment calls PyBullet: which calls leave physicsClientId out."""
 
 from __future__ import annotations
 
@@ -50,15 +50,10 @@ class BulletCalls:
 
     def __init__(self) -> None:
         self.without_client: set[BulletCall] = set()
-        self.models: dict[tuple[int, int], tuple[str, int]] = {}
-        """Per client and body that was loaded from a URDF: its file and the flags."""
         self._known: set[tuple[CodeType, int]] = set()
 
     def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
         """Note a call that a frame is about to make, if it leaves the client out."""
-        if name == "resetSimulation":
-            client = keywords.get("physicsClientId", 0)
-            self.models = {key: model for key, model in self.models.items() if key[0] != client}
         where = frame.f_code, frame.f_lasti
         if "physicsClientId" not in keywords and where not in self._known:
             self._known.add(where)
@@ -66,11 +61,6 @@ class BulletCalls:
             has_client = bool(arguments) if name in FIRST_IS_CLIENT else CLIENT_WORDS.search(_read_arguments(frame))
             if not is_library and not has_client:
                 self.without_client.add(BulletCall(frame.f_code.co_filename, frame.f_lineno, name))
-
-    def note_model(self, body: int, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
-        """Note what loadURDF was given, and the body that it returned."""
-        file = str(arguments[0] if arguments else keywords.get("fileName", ""))
-        self.models[keywords.get("physicsClientId", 0), body] = file, int(keywords.get("flags", 0))
 
 
 def _read_arguments(frame: FrameType) -> str:
@@ -101,10 +91,7 @@ class _RecordedFunction(_Replacement):
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         self._calls.note_call(self._name, sys._getframe(1), arguments, keywords)
-        value = self._function(*arguments, **keywords)
-        if self._name == "loadURDF":
-            self._calls.note_model(value, arguments, keywords)
-        return value
+        return self._function(*arguments, **keywords)
 
 
 @contextlib.contextmanager

@@ -34,8 +34,8 @@ MOST_STEPS = 100
 Link = tuple[int, int]
 """Body id and link index; the base is link -1."""
 Pair = tuple[Link, Link]
-HEIGHT, VELOCITY, ANGULAR, JOINTS = 2, slice(3, 6), slice(6, 9), 9
-"""Where in a body's state its base's height [m], velocity [m/s] and angular velocity [rad/s] are, and where its
+VELOCITY, ANGULAR, JOINTS = slice(3, 6), slice(6, 9), 9
+"""Where in a body's state its base's velocity [m/s] and angular velocity [rad/s] are, after its position, and where its
 joints' begin: all positions, then all speeds [rad, rad/s; m, m/s]."""
 
 

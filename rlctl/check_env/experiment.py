@@ -28,13 +28,6 @@ class Experiment:
     """Those it decides: they are judged if it comes to its end. Empty for one that only records."""
     share: float
     """Its part of the time there is, relative to the other experiments of the same process."""
-    provokes: str
-    """What it does that no learner would do, in words for a message. If that ends the process or hangs, it is an error
-    of the first of its rules, and otherwise no failure of the environment."""
-
-
-PROVOKING: set[str] = set()
-"""The names of the experiments that do what no learner would."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,15 +41,13 @@ class Check:
 
 
 def experiment(
-    name: str, *rules: str, share: float = 1.0, provokes: str = ""
+    name: str, *rules: str, share: float = 1.0
 ) -> Callable[[Callable[[Context], Iterator[Message]]], Experiment]:
     """Make an experiment of a function. It decides `rules`; see the package `families` for how."""
 
     def decorate(run: Callable[[Context], Iterator[Message]]) -> Experiment:
         assert all(rule in RULES for rule in rules)
-        if provokes:
-            PROVOKING.add(name)
-        return Experiment(name, run, rules, share, provokes)
+        return Experiment(name, run, rules, share)
 
     return decorate
 

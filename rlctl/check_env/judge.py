@@ -8,9 +8,8 @@ from collections.abc import Collection, Mapping
 
 from rlctl.check_env import families
 from rlctl.check_env.experiment import Experiment
-from rlctl.check_env.finding import RULES, Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.finding import RULES, Finding, NotApplicable, NotJudged
 from rlctl.check_env.leaves import name_leaf
-from rlctl.check_env.messages import Failure
 from rlctl.check_env.records import Records
 from rlctl.errors import UsageError, did_you_mean
 
@@ -72,29 +71,11 @@ def _findings(rule: str, records: Records) -> list[Finding]:
         return found
     if records.built is None and not rule.startswith(LOADING):
         raise NotJudged("no instance could be built")
-    if experiment is not None:
-        found += _ended(records, experiment, rule)
     if check is not None and not found:
         found += check.run(records)
     if experiment is not None and not found:
         _require_complete(records, experiment, rule)
     return found
-
-
-def _ended(records: Records, experiment: Experiment, rule: str) -> list[Finding]:
-    """Return the finding that an experiment that does what no learner would ended the process, or hung."""
-    if not experiment.provokes or rule != experiment.rules[0]:
-        return []
-    return [
-        Finding(rule, f"{experiment.provokes} {describe_end(each)}", each.place, Severity.ERROR)
-        for each in records.failures
-        if each.phase == experiment.name and each.kind in ("died", "hung")
-    ]
-
-
-def describe_end(failure: Failure) -> str:
-    """Return how a call ended the process, or did not come back."""
-    return f"hangs: it {failure.error}" if failure.kind == "hung" else f"ends the process: it {failure.error}"
 
 
 def _require_complete(records: Records, experiment: Experiment, rule: str) -> None:

@@ -41,9 +41,6 @@ LEAST_LIMIT = 0.005
 """The same for the smallest things [m]: collision margins alone are 1 to 4 mm."""
 PART_OF_LINK = 0.25
 """Between those two it is this part of the thinner link."""
-TOUCHING = 0.005
-"""Links that are closer than this touch [m]; Bullet reports contacts a little ahead."""
-
 Place = dict[str, Any]
 """`seed`, `episode`, `actions` and `step` of a look at a world, as a finding's evidence; step 0 is the reset."""
 
@@ -58,8 +55,6 @@ class Log:
     """Per look, per body, as `read_states` returns them."""
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)
     """Depth and limit of what is too far inside each other [m]."""
-    touching: list[set[int]] = dataclasses.field(default_factory=list)
-    """The ids of bodies that touch another one."""
 
     def look(self, place: Place) -> bool:
         """Add what is there now; False where the world has gone, or has other bodies."""
@@ -72,9 +67,6 @@ class Log:
         self.places.append(place)
         self.states.append(states)
         self.deep.append({pair: each for pair, each in deep.items() if each[0] > each[1]})
-        self.touching.append(
-            {body for pair, d in contacts.items() if d < TOUCHING for body, _ in pair if pair[0][0] != pair[1][0]}
-        )
         return True
 
     @property

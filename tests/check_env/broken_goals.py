@@ -1,5 +1,7 @@
 """Environments with goals, whose rewards hindsight computes again."""
 
+import os
+
 import numpy as np
 from broken_envs import Clean
 from gymnasium import spaces
@@ -43,6 +45,16 @@ class OtherReward(Goal):
 
     def info(self):
         return {"is_success": self.reward() > -0.75}
+
+
+class EndsInComputeReward(Goal):
+    """Ends the process where it is asked for rewards."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        os._exit(9)
+
+    def reward(self):
+        return -float(np.linalg.norm(self.position - self.goal))
 
 
 class OneByOne(Goal):

@@ -42,26 +42,3 @@ class NoModelAtReset(Clean):
     def start(self):
         super().start()
         pybullet.loadURDF("robot.urdf", physicsClientId=self.client)
-
-
-class OldKeys(Clean):
-    metadata = {"render.modes": ["human"], "video.frames_per_second": 30}
-
-
-class NoFrameRate(Clean):
-    metadata = {"render_modes": ["rgb_array"]}
-
-    def __init__(self, render_mode=None):
-        super().__init__()
-        self.render_mode = render_mode
-
-    def render(self):
-        import numpy as np
-
-        image = np.zeros((64, 64, 3), np.uint8)
-        image[10:20] = 255
-        return image
-
-
-class FrameRate(NoFrameRate):
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}

@@ -17,7 +17,7 @@ STANDING = 0.051  # [m], height of the base when the cart stands
 class Cart(Clean):
     """A box on the floor is pushed to the middle and raises its arm; nothing is wrong with it."""
 
-    rlctl_ignore = dict.fromkeys(("RL902", "RL904"), "loads anew at every reset, so that each is exactly the same")
+    rlctl_ignore = {"RL904": "loads anew at every reset, so that each is exactly the same"}
     fixed = False
     height = STANDING
     model, flags = CART, 0
@@ -144,10 +144,6 @@ class StartsInTheFloor(Cart):
     height = -0.02
 
 
-class Drops(Cart):
-    height = 0.5
-
-
 class ForgetsClient(Cart):
     def read(self):
         p.getNumBodies()
@@ -186,21 +182,3 @@ class ThroughBulletClient(Clean):
         if self.p is not None:
             self.p.disconnect()
         self.p = None
-
-
-class TipOfAKilogram(Cart):
-    """The tip has no <inertial>."""
-
-    model = CART.replace("cart.urdf", "cart_without_inertial.urdf")
-
-
-class FileInertia(Cart):
-    """The file's inertias are used; they are possible."""
-
-    flags = p.URDF_USE_INERTIA_FROM_FILE
-
-
-class HeavyInertia(FileInertia):
-    """The arm turns like a body of tons."""
-
-    model = CART.replace("cart.urdf", "cart_of_tons.urdf")

@@ -1,9 +1,7 @@
-"""Environments that keep what they take, share spaces, or cannot be built in a worker process."""
+"""Environments that keep what they take or share spaces."""
 
-import multiprocessing
 import os
 import threading
-import time
 
 import numpy as np
 import pybullet
@@ -113,25 +111,3 @@ class SharedGenerator(Clean):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32, seed=self.generator)
-
-
-class StartsProcess(Clean):
-    def __init__(self):
-        super().__init__()
-        helper = multiprocessing.get_context("fork").Process(target=int)
-        helper.start()
-        helper.join()
-
-
-class ExitsInWorker(Clean):
-    def start(self):
-        super().start()
-        if multiprocessing.current_process().daemon:
-            os._exit(3)
-
-
-class SlowInWorker(Clean):
-    def __init__(self):
-        super().__init__()
-        if multiprocessing.current_process().daemon:
-            time.sleep(100)

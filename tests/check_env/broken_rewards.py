@@ -141,19 +141,6 @@ class Terms(Clean):
         return {**super().info(), "reward_terms": self.terms()}
 
 
-class TermLeftOut(Terms):
-    def info(self):
-        left = {name: value for name, value in self.terms().items() if name != "effort"}
-        return {**super().info(), "reward_terms": left}
-
-
-class Float32Terms(Terms):
-    """Rounding is no mistake."""
-
-    def info(self):
-        return {**super().info(), "reward_terms": {name: np.float32(each) for name, each in self.terms().items()}}
-
-
 class SparseTerm(Terms):
     """A term that is 0 in all that is tried may be a bonus for what was not found."""
 

@@ -31,12 +31,6 @@ class SlowStep(Clean):
         super().move(action)
 
 
-class SlowReset(Clean):
-    def start(self):
-        work(0.007)
-        super().start()
-
-
 class Sleeps(Clean):
     """Keeps real time, for nobody."""
 
@@ -46,8 +40,6 @@ class Sleeps(Clean):
 
 
 class SleepsInReset(Clean):
-    """Its reset takes most of the time, but that is said once."""
-
     def start(self):
         time.sleep(0.01)
         super().start()

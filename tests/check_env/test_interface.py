@@ -82,10 +82,17 @@ def test_what_ends_the_process_is_said_once(name, rule, severity, text, monkeypa
 
 
 def test_what_ends_the_process_leaves_nothing_else_unjudged():
-    """Another process does what comes after the rendering, which ends it."""
-    task = str(Path(__file__).parent / FILE) + ":EndsInRender"
-    verdict = check(EnvSpec(task), env_timeout_s=10, rules=["RL208", "RL215", "RL404", "RL406"]).verdict
+    """Another process does what comes after asking for rewards, which ends the first."""
+    task = str(Path(__file__).parent / "broken_goals.py") + ":EndsInComputeReward"
+    verdict = check(EnvSpec(task), env_timeout_s=10, rules=["RL208", "RL405", "RL614"]).verdict
     (finding,) = verdict.findings
+    assert (finding.rule, finding.severity) == ("RL208", "error")
+    assert finding.message == "the process ended with exit code 9 in compute_reward"
+    assert (verdict.judged, verdict.not_judged.keys()) == (["RL208", "RL405"], {"RL614"})
+
+
+def test_what_ends_the_process_while_rendering_is_an_error():
+    task = str(Path(__file__).parent / FILE) + ":EndsInRender"
+    (finding,) = check(EnvSpec(task), env_timeout_s=10, rules=["RL208", "RL215"]).verdict.findings
     assert (finding.rule, finding.severity) == ("RL215", "error")
-    assert finding.message == "rendering without a window ends the process: it ended with exit code 9"
-    assert verdict.not_judged == {}
+    assert finding.message == "rendering without a window: the process ended with exit code 9 in render"

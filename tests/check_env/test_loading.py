@@ -20,8 +20,6 @@ CASES = [
     case("broken_loading.py:NoModel", ("RL007", ERROR)),
     case("broken_loading.py:NoModelAtReset", ("RL007", ERROR)),
     case("broken_old_gym.py:Pushed", ("RL008", ERROR)),
-    case("broken_loading.py:OldKeys", ("RL009", "info")),
-    case("broken_loading.py:NoFrameRate", ("RL009", "info"), twin="broken_loading.py:FrameRate"),
 ]
 
 

@@ -1,14 +1,11 @@
-"""What an instance takes and does not give back, what instances share, and building in a worker process."""
+"""What an instance takes and does not give back, and what instances share."""
 
 import pytest
 
-from rlctl.check_env import supervisor
-from rlctl.check_env.check import check
 from rlctl.check_env.families import isolation
 from rlctl.check_env.finding import NotJudged
 from rlctl.check_env.judge import judge
-from rlctl.env_spec import EnvSpec
-from tests.check_env.judging import FOLDER, case, check_case, findings, records_of
+from tests.check_env.judging import case, check_case, findings, records_of
 
 FILE = "broken_resources.py"
 CASES = [
@@ -19,7 +16,6 @@ CASES = [
     case(f"{FILE}:ClassSpaces", ("RL404", "warning")),
     case(f"{FILE}:ClassObservations", ("RL404", "info")),
     case(f"{FILE}:SharedGenerator", ("RL404", "warning")),
-    case(f"{FILE}:StartsProcess", ("RL406", "error")),
 ]
 
 
@@ -75,24 +71,3 @@ def test_memory_needs_resets_and_a_second_half():
 def test_too_few_resets_are_not_judged():
     with pytest.raises(NotJudged, match="there was time for only 4 resets"):
         found_in(4, [1, 2, 3, 4])
-
-
-def test_a_worker_says_what_it_raised():
-    finding = the_finding("StartsProcess", "RL406")
-    assert finding.message.startswith("in a daemonic worker build raises TaskError: task ")
-    assert "AssertionError: daemonic processes are not allowed to have children" in finding.message
-    assert finding.evidence["call"] == "build"
-
-
-@pytest.mark.parametrize(
-    ("name", "end"),
-    [
-        ("ExitsInWorker", "ends the process: it ended with exit code 3"),
-        ("SlowInWorker", "hangs: it did not come back in 1 s"),
-    ],
-)
-def test_a_worker_that_ends_or_hangs_is_a_finding(name, end, monkeypatch):
-    monkeypatch.setattr(supervisor, "BUILD_TIMEOUT_S", 1.0)
-    (finding,) = check(EnvSpec(str(FOLDER / f"{FILE}:{name}")), rules=["RL406"], env_timeout_s=1.0).verdict.findings
-    assert (finding.rule, finding.severity) == ("RL406", "error")
-    assert finding.message == f"use in a daemonic worker {end}"

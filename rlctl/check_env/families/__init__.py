@@ -12,8 +12,7 @@ It decides the rules that it names: they are judged when it comes to its end. `r
 `NotApplicable(why)` says so of all its rules without a finding, `yield Skipped("RL404", why)` of one of them. It calls
 the environment through `Instance.call`, `Instance.reset` and `Episode` only, so that what the environment raises is an
 `EnvironmentRaised`, which need not be caught, and a hang or a crash can be placed. `context.budget` is the time there
-is. One that does what no learner would (`provokes="rendering without a window"`) may crash the environment; that is
-then an error of its first rule, found by nobody else.
+is.
 
 **A check** judges one rule in the parent process, from recorded episodes, which many rules share:
 
@@ -92,7 +91,6 @@ PROCESSES = {
             attributes.read_attributes,
             variants.play_variants,
             attributes.render,
-            isolation.build_in_worker,
         ),
         hash_seed=1,  # another one, so that hash order shows
     ),

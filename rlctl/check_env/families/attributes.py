@@ -22,6 +22,7 @@ from rlctl.check_env.failures import (
     iterate_causes,
     lacks_display,
 )
+from rlctl.check_env.families.interface import RENDERING
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.instance import Context, RenderMode
 from rlctl.check_env.messages import FIRST_SEED, Fact, Message, Skipped
@@ -115,7 +116,7 @@ def read_truncation(env: Any) -> str:
     return "never" if all(assigned.get(flag, {flag}) == {"False"} for flag in flags) else "computed"
 
 
-@experiment("rendering", "RL215", provokes="rendering without a window")
+@experiment(RENDERING, "RL215")
 def render(context: Context) -> Iterator[Message]:
     """Try each promised render mode that opens no window, on an instance of its own."""
     with context.fresh() as instance:
@@ -174,6 +175,13 @@ def _describe_wrong_picture(mode: RenderMode, picture: Any) -> str:
         return f"a {type(picture).__name__}"
     fine = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
     return "" if fine else f"an array of {picture.dtype} and shape {picture.shape}"
+
+
+@check("RL215", RENDERING)
+def _find_end_in_rendering(records: Records) -> Iterator[Finding]:
+    for failure in records.failures:
+        if failure.phase == RENDERING and failure.kind in ("died", "hung"):
+            yield Finding("RL215", f"rendering without a window: {failure.message}", failure.place, Severity.ERROR)
 
 
 @check("RL216", *RECORDING)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rlctl.check_env.experiment import PROVOKING, RECORDING, check
+from rlctl.check_env.experiment import RECORDING, check
 from rlctl.check_env.failures import lacks_display
 from rlctl.check_env.finding import Finding, Severity
 from rlctl.check_env.messages import Failure, Form, Trajectory
@@ -17,8 +17,10 @@ MANY_LINES = 0.1
 FEWEST_STEPS = 20
 """With fewer, what is printed belongs to the start."""
 MOST_FAILURES = 3
-BESIDE_OTHERS = ("interleaved", "after close")
-"""Where a failure is the matter of RL401 and RL402."""
+RENDERING = "rendering"
+"""The experiment that renders."""
+OF_OTHER_RULES = ("interleaved", "after close", RENDERING)
+"""Where a failure is the matter of RL401, RL402 and RL215."""
 
 
 @check("RL201")
@@ -80,7 +82,7 @@ def select_failures(records: Records, kind: str) -> Iterator[Failure]:
     """Yield the calls that raised, died or hung on an instance that was alone and used properly, each error once."""
     errors: set[tuple[str, str]] = set()
     for failure in records.failures:
-        if failure.kind != kind or failure.call in ("load", "build") or failure.phase in (*BESIDE_OTHERS, *PROVOKING):
+        if failure.kind != kind or failure.call in ("load", "build") or failure.phase in OF_OTHER_RULES:
             continue
         if (failure.call, failure.error) not in errors:
             errors.add((failure.call, failure.error))

@@ -1,11 +1,10 @@
-"""RL4: instances do not touch each other, give back what they take, and can be built where training builds them."""
+"""RL4: instances do not touch each other, and give back what they take."""
 
 from __future__ import annotations
 
 import ctypes
 import dataclasses
 import gc
-import multiprocessing
 import os
 import sys
 from collections.abc import Iterator
@@ -258,24 +257,3 @@ def _report(
 ) -> Finding:
     evidence = {"element": what, "value": value, "expected": first, "resets": resets, "per_reset": per_reset}
     return Finding("RL405", message, evidence, severity)
-
-
-@experiment("worker build", "RL406", provokes="use in a daemonic worker")
-def build_in_worker(context: Context) -> Iterator[Message]:
-    """Build, reset and step in a daemonic process, as the workers of Stable-Baselines3's SubprocVecEnv are."""
-    process = multiprocessing.current_process()
-    process.daemon = True  # nothing else is different there: each process of a check is a fresh interpreter
-    try:
-        _build_and_step(context)
-    except EnvironmentRaised as error:
-        failed, process.daemon = describe_failure(error, context.progress), False
-        _build_and_step(context)  # what raises here, too, is another rule's
-        yield Finding("RL406", f"in a daemonic worker {failed.call} raises {failed.error}", failed.place)
-    finally:
-        process.daemon = False
-
-
-def _build_and_step(context: Context) -> None:
-    with context.fresh() as instance:
-        for _ in Episode(instance, FIRST_SEED, max_steps=1):
-            pass

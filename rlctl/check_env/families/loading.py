@@ -18,16 +18,11 @@ from rlctl.check_env.own_code import find_author, is_task
 from rlctl.check_env.records import Records
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
 
-OLD_KEYS = {
-    "render.modes": "render_modes",
-    "video.frames_per_second": "render_fps",
-    "video.frames_per_sec": "render_fps",
-}
 WAIVERS = "rlctl_ignore"
 """The class attribute that waives rules: rule id -> reason."""
 
 
-@experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL009", share=0.0)
+@experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", share=0.0)
 def build(context: Context) -> Iterator[Message]:
     """Build the first instance, which the process keeps. Raises `UsageError` for a name that does not exist."""
     try:
@@ -41,7 +36,6 @@ def build(context: Context) -> Iterator[Message]:
         return
     yield describe_built(instance)
     yield from _base_class(instance)
-    yield from _judge_metadata(getattr(instance.env, "metadata", None))
 
 
 def _explain(context: Context, error: RlctlError) -> Finding:
@@ -88,17 +82,6 @@ def _base_class(instance: Instance) -> Iterator[Finding]:
     for name, leaves in (("observation", instance.leaves), ("action", instance.action_leaves)):
         if "NoneType" in {leaf.kind for leaf in leaves}:
             yield Finding("RL003", f"there is no {name}_space")
-
-
-def _judge_metadata(metadata: Any) -> Iterator[Finding]:
-    keys = [str(key) for key in metadata] if isinstance(metadata, dict) else []
-    for key in keys:
-        if key in OLD_KEYS:
-            message = f"metadata has {key!r}, which is now {OLD_KEYS[key]!r}"
-            yield Finding("RL009", message, {"value": key, "expected": OLD_KEYS[key]})
-    if keys and metadata.get("render_modes") and not any("fps" in key or "frames_per_sec" in key for key in keys):
-        message = f"metadata has render_modes {metadata['render_modes']} and no render_fps"
-        yield Finding("RL009", message, {"expected": "render_fps"})
 
 
 @check("RL004", "build")

@@ -7,18 +7,19 @@ import itertools
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.bullet_calls import BulletCall, BulletCalls, record_calls
-from rlctl.check_env.bullet_worlds import ANGULAR, HEIGHT, JOINTS, VELOCITY, Body, Joint, Jump, Pair, find_clients
+from rlctl.check_env.bullet_calls import BulletCall, record_calls
+from rlctl.check_env.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Body, Joint, Jump, Pair, find_clients
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, list_names
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
+from rlctl.check_env.own_code import is_task
 from rlctl.check_env.world_logs import Log, LoggedWorld, Place, WorldLogger
 
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))
@@ -37,7 +38,6 @@ FASTEST_MEANT = 100.5
 NONSENSE = 5_000.0
 FASTEST_JUMP = 1.0
 """So much faster than by falling a body may be a tenth of a second after a reset [m/s]: ten times gravity."""
-HIGHEST_DROP = 0.1  # [m]
 MOST_NAMES = 3
 MOST_CALLS, MOST_LINKS = 20, 5
 """Calls and links that a finding's evidence has."""
@@ -55,7 +55,7 @@ def watch_worlds(context: Context) -> Iterator[Message]:
     with record_calls() as calls, context.fresh() as instance:
         with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
             instance.reset(FIRST_SEED)
-        yield from _models(calls)
+        yield from _model_faults(instance.env)
         logger = WorldLogger(instance, older)
         for number, (kind, steps) in enumerate(EPISODES):
             if number and (context.budget.seconds_left < 0 or not logger.worlds):
@@ -84,31 +84,16 @@ def _left_out_clients(calls: Sequence[BulletCall]) -> Iterator[Finding]:
         yield Finding("RL808", f"{count} of PyBullet without physicsClientId: {shown}", evidence)
 
 
-def _models(calls: BulletCalls) -> Iterator[Message]:
-    if not calls.models:
-        yield Skipped("RL809", "no URDF is loaded", applies=False)
-    faults = [fault for key, model in calls.models.items() for fault in _model_faults(*key, *model)]
-    faults = list(dict.fromkeys(faults))
+def _model_faults(env: Any) -> Iterator[Message]:
+    if not is_task(env):
+        yield Skipped("RL809", "only of a task of rlctl are the model files known", applies=False)
+        return
+    from rlctl.task.inertia import find_inertia_faults
+
+    faults = [fault for body in env.unwrapped.sim.bodies.values() for fault in find_inertia_faults(body)]
     if faults:
         more = f"; {len(faults) - 1} more links" if len(faults) > 1 else ""
         yield Finding("RL809", f"{faults[0].rstrip('.')}{more}", {"value": len(faults), "links": faults[:MOST_LINKS]})
-
-
-def _model_faults(client: int, number: int, file: str, flags: int) -> list[str]:
-    from rlctl.task.body import Body
-    from rlctl.task.bullet import pybullet, pybullet_data
-    from rlctl.task.inertia import find_inertia_faults
-
-    path = next((each for each in (Path(file), Path(pybullet_data.getDataPath()) / file) if each.is_file()), None)
-    if path is None:
-        return []
-    try:
-        held = pybullet.getDynamicsInfo(number, -1, physicsClientId=client)[0] == 0
-        body = Body(client, 1, path.stem, number, path, fixed=held)
-    except pybullet.error:  # it was removed since
-        return []
-    body.inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
-    return find_inertia_faults(body)
 
 
 def _judge(world: LoggedWorld) -> Iterator[Message]:
@@ -244,20 +229,10 @@ def _thrown(world: LoggedWorld) -> dict[str, Jump]:
 
 
 def _unrest(world: LoggedWorld) -> Iterator[Finding]:
-    thrown = _thrown(world)
-    for jump in thrown.values():
+    for jump in _thrown(world).values():
         yield Finding(
             "RL807",
             f"{jump.body} moves at {jump.speed:.2f} m/s {jump.after_s:.2g} s after reset, with nothing done to it; "
             f"falling explains {jump.explained:.2f} m/s",
             {"seed": jump.seed, "body": jump.body, "value": jump.speed, "expected": jump.explained},
         )
-    for log in world.logs:
-        for body, states in log.bodies if log.actions == "zero" else ():
-            first = next((row for row, touching in enumerate(log.touching) if body.id in touching), 0)
-            heights = np.nan_to_num(states[:, HEIGHT])
-            height = float(heights[0] - heights[first])
-            if body.is_free and height > HIGHEST_DROP and body.name not in thrown:
-                message = f"{body.name} drops {100 * height:.0f} cm after reset before it touches anything"
-                evidence = {**log.places[0], "value": height, "expected": HIGHEST_DROP}
-                yield Finding("RL807", message, evidence, Severity.INFO)

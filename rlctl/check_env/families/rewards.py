@@ -1,4 +1,4 @@
-"""RL6: the reward as a number, its terms in `info["reward_terms"]`, and for other goals (RL601-603, 607, 612, 614)."""
+"""RL6: the reward as a number, its terms in `info["reward_terms"]`, and for other goals (RL601-603, 612, 614)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.instance import Context
-from rlctl.check_env.messages import FIRST_SEED, MOST_INFOS, Message, Trajectory
+from rlctl.check_env.messages import FIRST_SEED, Message
 from rlctl.check_env.records import Records
 from rlctl.check_env.rewarded import (
     WITH_SEARCH,
     find_constant_terms,
-    find_terms,
     has_succeeded,
     require_rewarded,
     require_terms,
@@ -31,8 +30,6 @@ LARGE = 10.0
 as much, and value networks begin near 0. Pendulum's rewards, down to -16, are below it."""
 HUGE = 1_000.0
 """A single reward beyond this, ten times the usual bonus for finishing, spoils the value estimate of all before it."""
-ROUNDING = 1e-5
-"""How far a sum of terms may be off, relative to the sum of all sizes: terms are often float32."""
 MEANT_CONSTANT = re.compile(
     r"(^|_)(alive|aliveness|surviv\w*|time|steps?|living|life|exist\w*|constant|bias)(_|$)", re.I
 )
@@ -90,36 +87,6 @@ def _find_badly_scaled(records: Records) -> Iterator[Finding]:
         return
     evidence = largest.at(step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
     yield Finding("RL603", message, evidence, Severity.INFO if records.normalizes() else Severity.WARNING)
-
-
-@check("RL607", *WITH_SEARCH)
-def _find_wrong_sum(records: Records) -> Iterator[Finding]:
-    episodes = require_terms(records)
-    if any(len(each.infos) >= MOST_INFOS for each in episodes):
-        raise NotJudged(f"info has more than {MOST_INFOS} numbers, not all were recorded")
-    worst: tuple[float, Trajectory, int, float] | None = None
-    wrong = steps = 0
-    for each in episodes:
-        values = np.stack(list(find_terms(each).values()))
-        is_known = ~np.isnan(values).all(axis=0)
-        sums, sizes = np.nansum(values, axis=0), np.nansum(np.abs(values), axis=0)
-        off = np.where(is_known, np.abs(sums - each.rewards), 0.0)
-        off[off <= ROUNDING * np.maximum(sizes, np.abs(each.rewards))] = 0.0
-        wrong, steps, step = wrong + int((off > 0).sum()), steps + int(is_known.sum()), int(off.argmax())
-        if off[step] > (worst[0] if worst else 0.0):
-            worst = float(off[step]), each, step, float(sums[step])
-    if worst is not None:
-        _, episode, step, total = worst
-        reward = float(episode.rewards[step])
-        terms = {
-            name: None if np.isnan(each[step]) else float(each[step]) for name, each in find_terms(episode).items()
-        }
-        yield Finding(
-            "RL607",
-            f"the terms add up to {total:.6g} at step {step + 1}, the reward is {reward:.6g}; they differ at {wrong:,} "
-            f"of {steps:,} steps",
-            episode.at(step + 1, value=total, expected=reward, terms=terms),
-        )
 
 
 @check("RL612", *WITH_SEARCH)

@@ -35,13 +35,11 @@ MOST_CALLS = 5
 MILLION = 1_000_000
 SLOW_STEPS_PER_S = 100.0
 """Below it a million steps, a small training, take about three hours on one core [steps/s]."""
-SLOW_RESET_S = 0.005
-"""A reset, or loading in it, below this is not reported, whatever its share of short episodes: PyBullet's
-resetSimulation of an empty world alone takes half a millisecond [s]."""
-MOST_RESET = 0.5
-"""Share of an episode that reset takes from which most of training is spent in reset."""
+SLOW_LOADING_S = 0.005
+"""Loading in a reset that takes less is not reported, whatever its share of short episodes: PyBullet's resetSimulation
+of an empty world alone takes half a millisecond [s]."""
 LITTLE_LOADING = 0.05
-"""Share of an episode below which loading in reset for more than `SLOW_RESET_S` is an info: environments
+"""Share of an episode below which loading in reset for more than `SLOW_LOADING_S` is an info: environments
 that are stepped together wait for the one that resets, but rarely."""
 MOST_LOADING = 0.2
 """Share of a step that loading or reading files takes from which that is a finding."""
@@ -67,7 +65,6 @@ class Speed:
     resets: int
     slowest_in_step: list[TimedCall]
     """By their own time, what they call left out; the slowest first."""
-    slowest_in_reset: list[TimedCall]
     suspicious_in_step: list[TimedCall]
     """Calls that step should not make, with what they call; none is inside another."""
     suspicious_in_reset: list[TimedCall]
@@ -98,7 +95,6 @@ def measure_speed(context: Context) -> Iterator[Message]:
             steps=len(steps.seconds),
             resets=len(resets.seconds),
             slowest_in_step=in_step.slowest()[:MOST_CALLS],
-            slowest_in_reset=in_reset.slowest()[:MOST_CALLS],
             suspicious_in_step=in_step.suspicious(),
             suspicious_in_reset=in_reset.suspicious(),
             rebuilds=rebuilds_world(instance.env),
@@ -139,7 +135,8 @@ def _find_slow_step(records: Records) -> Iterator[Finding]:
     speed = _require_speed(records)
     if speed.step_s is None:
         raise NotJudged("no step could be timed")
-    left = speed.step_s * (1 - _share(_explained(records, speed, "step")))
+    named_elsewhere = _idle(records, speed, "step") + _loading(speed, "step")
+    left = speed.step_s * (1 - _share(named_elsewhere))
     if left * SLOW_STEPS_PER_S <= 1:
         return
     per_s, hours = 1 / speed.step_s, MILLION * speed.step_s / 3600
@@ -148,23 +145,6 @@ def _find_slow_step(records: Records) -> Iterator[Finding]:
         "RL901",
         f"{per_s:,.3g} steps/s: a million steps take {hours:,.3g} hours per process on this machine; slowest: {calls}",
         {"value": per_s, "expected": SLOW_STEPS_PER_S, "step_ms": 1e3 * speed.step_s, "steps": speed.steps},
-    )
-
-
-@check("RL902", "speed", "episodes")
-def _find_slow_reset(records: Records) -> Iterator[Finding]:
-    speed, step_s, reset_s, steps = _require_times(records)
-    left = reset_s * (1 - _share(_explained(records, speed, "reset")))
-    if left <= SLOW_RESET_S or left / (left + steps * step_s) <= MOST_RESET:
-        return
-    share = reset_s / (reset_s + steps * step_s)
-    yield Finding(
-        "RL902",
-        f"reset takes {_time(reset_s)}, {share:.0%} of an episode of {steps:.0f} steps of {_time(step_s)} each; "
-        f"slowest: {_list(speed.slowest_in_reset)}",
-        {"value": share, "expected": MOST_RESET, "reset_ms": 1e3 * reset_s, "steps": steps},
-        Severity.INFO if speed.rebuilds else Severity.WARNING,
-        "If every episode repeats exactly without it (RL303), set fast_reset = True." if speed.rebuilds else "",
     )
 
 
@@ -261,13 +241,8 @@ def _loading(speed: Speed, call: str) -> list[TimedCall]:
     calls = _suspicious(speed, call, ("loading", "connecting"))
     share = _share(calls)
     seconds = share * ((speed.step_s if call == "step" else speed.reset_s) or 0.0)
-    is_much = seconds > SLOW_RESET_S or (call == "step" and share > MOST_LOADING)
+    is_much = seconds > SLOW_LOADING_S or (call == "step" and share > MOST_LOADING)
     return calls if is_much or any(each.kind == "connecting" for each in calls) else []
-
-
-def _explained(records: Records, speed: Speed, call: str) -> list[TimedCall]:
-    """Return the calls whose time RL903 or RL904 names."""
-    return _idle(records, speed, call) + _loading(speed, call)
 
 
 def _share(calls: Sequence[TimedCall]) -> float:
