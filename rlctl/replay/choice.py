@@ -37,6 +37,8 @@ def choose_episodes(
     chosen = select(results, choice)
     known = [result.success for result in results if result.success is not None]
     successes = f", {sum(known)} of which succeeded" if known else ""
+    if not chosen:
+        return chosen, f"no failure among {episodes} episodes (seed {seed}): nothing to replay"
     return chosen, f"the {len(chosen)} {choice.kind} of {episodes} episodes (seed {seed}){successes}"
 
 

@@ -43,7 +43,7 @@ def test_they_are_episodes_of_the_evaluation_bit_for_bit(run, tmp_path, capsys):
 def test_no_failures_is_an_answer(replay, run, tmp_path):
     done = replay(run.run.path, "--failures", 2, "--episodes", 2, "--set", "task.tolerance=9", "-o", "out")
     assert done.returncode == 0, done.stderr
-    assert "the 0 failures of 2 episodes (seed 0), 2 of which succeeded" in done.stdout
+    assert "no failure among 2 episodes (seed 0): nothing to replay" in done.stdout
     assert not (tmp_path / "out").exists()
 
 
