@@ -103,12 +103,14 @@ def print_table(
         return
     lines = Text()  # rich's own table takes half a second for a thousand rows
     for row in table:
+        line = Text()
         for name, width, cell in zip(columns, widths, row, strict=False):
             space = " " * (width - cell.cell_len)
-            parts = (cell, space) if name in left else (space, cell)
-            lines.append_text(Text.assemble(*parts, gap))
-        lines.rstrip()
-        lines.append("\n")
+            for part in (cell, space) if name in left else (space, cell):
+                line.append(part)
+            line.append(gap)
+        line.rstrip()
+        lines.append_text(line.append("\n"))
     out().print(lines, end="", soft_wrap=True)
 
 
