@@ -37,7 +37,7 @@ FOR_WORKERS = (
 )
 FOR_COMMANDS = (
     *("torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
-    *("rlctl.eval.evaluate", "rlctl.run.torch_policy", "typer.rich_utils", "yaml", "scipy.stats", "onnx"),
+    *("rlctl.eval.evaluate", "rlctl.run.torch_policy", "typer.rich_utils", "yaml", "onnx"),
 )
 """What is imported when it is needed; one that is missing here costs time only."""
 HASH_SEED = "0"

@@ -10,7 +10,6 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.rollout.baselines import BASELINES, SERVER, load_function
 from rlctl.rollout.workers import Workers
-from rlctl.run.recipe_sources import resolve_packaged
 
 if TYPE_CHECKING:
     from rlctl.eval.evaluate import EvalRequest
@@ -61,5 +60,7 @@ def choose_task(request: EvalRequest) -> EnvSpec:
         return dataclasses.replace(request.spec, frame_stack=1, time_feature=False)
     if request.run is None:
         raise UsageError(f"--policy {request.baseline}: give the task to play: rlctl eval reach --policy zero")
+    from rlctl.run.recipe_sources import resolve_packaged
+
     spec = resolve_packaged(request.run).env_specs(request.run)[-1]
     return request.changes.apply(dataclasses.replace(spec, frame_stack=1, time_feature=False, stage=0))

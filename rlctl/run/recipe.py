@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -239,10 +240,15 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
 
 
 def build_schema(algo: Any = None) -> schema_text.Schema:
-    """Return the JSON schema of a recipe, with the parameters of an algorithm and its networks."""
+    """Return the JSON schema of a recipe, with the parameters of an algorithm and its networks; do not change it."""
+    return _build_schema(algo if isinstance(algo, str) and algo in ALGORITHMS else None)
+
+
+@functools.cache
+def _build_schema(algo: str | None) -> schema_text.Schema:
     schema = Recipe.model_json_schema()
     for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
-        if isinstance(algo, str) and algo in models:
+        if algo in models:
             own = models[algo].model_json_schema()
             schema["$defs"] |= own.pop("$defs", {})
             schema["properties"][key] |= own

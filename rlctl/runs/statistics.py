@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
+import statistics
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,5 @@ def _episodes_for_success(gained: int, lost: int, episodes: int) -> int | None:
 
 
 def _quantiles() -> tuple[float, float]:
-    from scipy.stats import norm
-
-    return float(norm.ppf(1 - ALPHA / 2)), float(norm.ppf(POWER))
+    normal = statistics.NormalDist()
+    return normal.inv_cdf(1 - ALPHA / 2), normal.inv_cdf(POWER)

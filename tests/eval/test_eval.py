@@ -39,6 +39,9 @@ def test_wilson_interval_by_hand():
     # p = 0.8, n = 10, z = 1.959964: centre (p + z^2 / 2n) / (1 + z^2 / n) = (0.8 + 0.192073) / 1.384146 = 0.716741
     # half width z / (1 + z^2 / n) * sqrt(p q / n + z^2 / 4 n^2) = 1.416010 * sqrt(0.016 + 0.00960365) = 0.226577
     assert success_interval(results) == pytest.approx((0.490162, 0.943318), abs=1e-5)
+    # At the ends: [0, z^2 / (n + z^2)] and [n / (n + z^2), 1], z^2 = 3.841459.
+    assert success_interval(results[8:]) == (0.0, pytest.approx(3.841459 / 5.841459, abs=1e-6))
+    assert success_interval(results[:8]) == (pytest.approx(8 / 11.841459, abs=1e-6), 1.0)
 
 
 def test_no_success_is_not_zero_success():
