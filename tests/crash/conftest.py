@@ -11,7 +11,7 @@ from tests.crash.trials import ARGUMENTS, Trials
 pytest.register_assert_rewrite("tests.crash.contract", "tests.train.comparing")
 
 PARTS = 101
-"""A test that repeats itself is in so many parts, of which the first runs with all other tests."""
+"""A test that repeats itself is in so many parts; of some the first runs with all other tests."""
 
 ALGORITHMS = ["ppo", pytest.param("sac", marks=pytest.mark.crash)]
 

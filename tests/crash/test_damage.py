@@ -35,7 +35,8 @@ def killed(trials, whole, tmp_path_factory):
 
 
 @parts
-@pytest.mark.parametrize("name", ["ppo, kept", pytest.param("sac, kept", marks=pytest.mark.crash)])
+@pytest.mark.crash
+@pytest.mark.parametrize("name", ["ppo, kept", "sac, kept"])
 def test_damage_is_noticed_or_harmless(trials, whole, killed, folders, name, part):
     before, undamaged = only_run(whole(name).folder), killed(name)
     for damage in all_damage(undamaged.path, COUNT)[part::PARTS]:

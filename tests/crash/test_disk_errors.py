@@ -32,6 +32,7 @@ def test_an_error_once_costs_nothing(trials, whole, folders, name, part):
         assert_same_end(run, only_run(before.folder))
 
 
+@pytest.mark.crash
 @parts
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_short_writes_cost_nothing(trials, whole, folders, name, part):
@@ -44,6 +45,7 @@ def test_short_writes_cost_nothing(trials, whole, folders, name, part):
         assert_same_end(only_run(ended.folder), only_run(before.folder))
 
 
+@pytest.mark.crash
 @parts
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_disk_that_has_failed_for_good(trials, whole, folders, name, part):

@@ -8,6 +8,8 @@ from rlctl.rollout.seeds import EpisodeAddress, Stream
 from tests.crash.contract import assert_quiet, assert_same_end
 from tests.crash.trials import ARGUMENTS, only_run, resume
 
+pytestmark = pytest.mark.crash
+
 SEED = EpisodeAddress(0, Stream.TRAIN, 1, 3).seed
 """Of the fourth episode of the second environment: its seventh step is the 37th, in the fifth rollout of eight."""
 
@@ -20,9 +22,7 @@ LONGER = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", ["ppo", *(pytest.param(name, marks=pytest.mark.crash) for name in ("sac", "ppo with gSDE"))]
-)
+@pytest.mark.parametrize("name", LONGER)
 def test_a_finished_run_made_longer_is_a_longer_run(trials, folders, name):
     arguments, short, long = LONGER[name]
     whole = trials.run([*arguments, "-n", str(long)], next(folders))

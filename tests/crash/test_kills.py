@@ -18,9 +18,9 @@ def every(part, operations):
 @pytest.mark.parametrize(
     ("name", "fault"),
     [
-        *(("ppo", "power"), ("sac", "kill")),
+        ("ppo", "power"),
         *(pytest.param("ppo", fault, marks=pytest.mark.crash) for fault in ("kill", "half")),
-        *(pytest.param("sac", fault, marks=pytest.mark.crash) for fault in ("half", "power")),
+        *(pytest.param("sac", fault, marks=pytest.mark.crash) for fault in ("kill", "half", "power")),
     ],
 )
 def test_killed_at_an_operation(trials, whole, folders, name, fault, part):
@@ -50,10 +50,8 @@ def half_done(trials, whole, tmp_path_factory):
 
 
 @parts
-@pytest.mark.parametrize(
-    ("name", "saved"),
-    [("ppo", 16), *(pytest.param(name, saved, marks=pytest.mark.crash) for name, saved in (("ppo", 0), ("sac", 16)))],
-)
+@pytest.mark.crash
+@pytest.mark.parametrize(("name", "saved"), [("ppo", 16), ("ppo", 0), ("sac", 16)])
 def test_killed_again_while_resuming(trials, whole, half_done, folders, name, saved, part):
     before = half_done(name, saved)
     first = next(folders)

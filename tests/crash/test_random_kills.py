@@ -15,6 +15,7 @@ STUCK = [f"{FILE}:Stuck" if each.endswith(":Line") else each for each in ARGUMEN
 
 
 @parts
+@pytest.mark.crash
 def test_killed_at_any_moment(trials, whole, folders, part):
     for number in range(part, KILLS, PARTS):
         name = ("ppo", "sac")[number % 2]

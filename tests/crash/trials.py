@@ -136,7 +136,7 @@ def members(session: int) -> list[psutil.Process]:
     return found
 
 
-def end_orphans(session: int, patience_s: float = 10.0) -> list[str]:
+def end_orphans(session: int, patience_s: float = 60.0) -> list[str]:
     """Wait for the end of a session's processes; kill those that do not end, and return their commands."""
     deadline = time.monotonic() + patience_s
     while (left := members(session)) and time.monotonic() < deadline:
