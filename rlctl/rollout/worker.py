@@ -67,9 +67,10 @@ class Worker:
         return Answer()
 
     def _build(self, spec: EnvSpec) -> None:
-        self.close()
-        gc.unfreeze()
-        gc.collect()  # environments may hold themselves in cycles
+        if self._episodes:
+            self.close()
+            gc.unfreeze()
+            gc.collect()  # environments may hold themselves in cycles
         envs = make_several(spec, self._job.count)
         self._info = describe(envs[0])
         self._episodes = [RunningEpisode(env, self._job.first + index) for index, env in enumerate(envs)]

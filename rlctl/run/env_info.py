@@ -127,8 +127,9 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
 
 def _encode_bounds(values: Any) -> Any:
     # One number where all are equal: images have many thousand bounds. Text, because JSON has no infinity.
-    flat = [repr(float(v)) for v in np.unique(values)]
-    return flat[0] if len(flat) == 1 else [repr(float(v)) for v in values.ravel()]
+    flat = values.ravel()
+    same = flat.size > 0 and bool((flat == flat[0]).all())  # np.unique would import numpy.ma, in every worker
+    return repr(float(flat[0])) if same else [repr(float(v)) for v in flat]
 
 
 def _decode_bounds(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
