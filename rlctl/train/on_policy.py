@@ -15,8 +15,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from rlctl.dict_spaces import join, split, split_space
 from rlctl.run.acting import Exploration
+from rlctl.run.recipe import Recipe
+from rlctl.train.ppo_update import PpoUpdate
+from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, Statistics, to_network_layout
-from rlctl.train.vec_env import PlayedSegment
+from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -28,6 +31,10 @@ class OnPolicyRollouts(Rollouts):
     """Plays `n_steps` steps of each environment into the rollout buffer."""
 
     _statistics: Statistics
+
+    def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
+        super().__init__(model, env, recipe, progress)
+        self._update: PpoUpdate | Any = PpoUpdate(model) if PpoUpdate.supports(model) else model
 
     def start(self) -> None:
         model = self.model
@@ -43,7 +50,7 @@ class OnPolicyRollouts(Rollouts):
         self.finish_segment(segment)
 
     def learn(self) -> None:
-        self.model.train()
+        self._update.train()
 
     def _fill_buffer(self, segment: PlayedSegment, rewards: NDArray[np.float32]) -> None:
         """Write a segment into SB3's buffer, whose arrays have the shape (steps, environments, ...)."""

@@ -1,0 +1,96 @@
+"""Updates whose gradients are computed without autograd: Stable-Baselines3's own, but for rounding."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from rlctl.dict_spaces import split
+from rlctl.train.ppo_update import PpoUpdate
+
+VECTOR = spaces.Box(-np.inf, np.inf, (5,), np.float32)
+ACTIONS = spaces.Box(-1, 1, (3,), np.float32)
+
+
+class Still(gym.Env):
+    """Spaces; it is never stepped."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+
+def make_ppo(observations=VECTOR, actions=ACTIONS, policy="MlpPolicy", network=None, **settings):
+    """A model with a rollout of made-up numbers that is no multiple of the minibatches."""
+    network = {"net_arch": [16, 16], **(network or {})}
+    settings = {"n_steps": 25, "batch_size": 16, "n_epochs": 3, "learning_rate": 1e-2, "seed": 0, **settings}
+    model = PPO(
+        policy, DummyVecEnv([lambda: Still(observations, actions)] * 2), policy_kwargs=network, device="cpu", **settings
+    )
+    model.set_logger(Logger(None, []))
+    rng, buffer = np.random.default_rng(0), model.rollout_buffer
+    for rows in (
+        *split(buffer.observations).values(),
+        buffer.actions,
+        buffer.advantages,
+        buffer.returns,
+        buffer.values,
+    ):
+        rows[...] = rng.standard_normal(rows.shape)
+    buffer.log_probs[...] = rng.normal(-4, 1, buffer.log_probs.shape)
+    buffer.full = True
+    return model
+
+
+def weights(model):
+    return {name: value.clone() for name, value in model.policy.state_dict().items()}
+
+
+def assert_same_weights(one, other, before):
+    assert any((one[name] - before[name]).abs().max() > 1e-3 for name in before)
+    for name in one:
+        torch.testing.assert_close(one[name], other[name], rtol=1e-4, atol=1e-5, msg=name)
+
+
+PPO_CASES = {
+    "tanh": {},
+    "relu": {"network": {"activation_fn": torch.nn.ReLU}},
+    "gSDE": {"use_sde": True},
+    "gSDE, relu, no hidden layer of the critic": {
+        "use_sde": True,
+        "network": {"activation_fn": torch.nn.ReLU, "net_arch": {"pi": [8], "vf": []}},
+    },
+    "clipped values and gradients, entropy": {"clip_range_vf": 0.2, "ent_coef": 0.1, "max_grad_norm": 0.1},
+    "advantages as they are": {"normalize_advantage": False},
+    "stopped by target_kl": {"target_kl": 8.0},
+    "dict": {"observations": spaces.Dict({"a": VECTOR, "b": VECTOR}), "policy": "MultiInputPolicy"},
+}
+
+
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+@pytest.mark.parametrize("name", PPO_CASES)
+def test_ppo_updates_as_sb3(name):
+    one, other = make_ppo(**PPO_CASES[name]), make_ppo(**PPO_CASES[name])
+    before = weights(one)
+    assert PpoUpdate.supports(other)
+    set_random_seed(1)
+    one.train()
+    set_random_seed(1)
+    PpoUpdate(other).train()
+    assert_same_weights(weights(one), weights(other), before)
+    expected, logged = one.logger.name_to_value, other.logger.name_to_value
+    assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
+
+
+def test_what_sb3_updates_itself():
+    discrete = make_ppo(actions=spaces.Discrete(3))
+    image = make_ppo(spaces.Box(0, 255, (3, 36, 36), np.uint8), policy="CnnPolicy")
+    elu = make_ppo(network={"activation_fn": torch.nn.ELU})
+    assert [PpoUpdate.supports(model) for model in (discrete, image, elu)] == [False] * 3
