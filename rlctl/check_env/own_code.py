@@ -62,6 +62,13 @@ def is_task(env: Any) -> bool:
     return task_env is not None and isinstance(getattr(env, "unwrapped", env), task_env.TaskEnv)
 
 
+def find_time_limit(env: Any) -> int | None:
+    """Return after how many steps an environment says that its episodes end; None where it does not."""
+    if is_task(env):
+        return int(env.unwrapped.max_steps)
+    return getattr(getattr(env, "spec", None), "max_episode_steps", None)
+
+
 def rebuilds_world(env: Any) -> bool:
     """Say whether it is a task that declares that every reset loads the world anew."""
     return is_task(env) and not find_author(env).fast_reset

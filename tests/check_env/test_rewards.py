@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.check_env.actions import action_at
-from rlctl.check_env.families.incentives import pair_up
+from rlctl.check_env.families.search import compare_returns
 from rlctl.check_env.rewarded import discounted_steps, discounted_sum
 from tests.check_env.judging import case, check_case, findings, found, rules_of, shared_records_of
 
@@ -82,21 +82,16 @@ def test_falling_is_compared_with_going_on():
     assert 0 < evidence["gain"] <= saved
 
 
-def test_hovering_is_compared_from_where_two_lives_part():
-    life = shared_records_of("broken_envs.py:Clean", "search").role("search")[0]
-    actions = np.zeros((4, 2))
-    actions[2:] = 1.0
-    finished = dataclasses.replace(life, rewards=np.array([0.0, 0.0, 9.0]), action_values=np.zeros((3, 2)))
-    hovered = dataclasses.replace(life, rewards=np.array([0.0, 0.0, 5.0, 5.0]), action_values=actions, ended="steps")
-    pair = pair_up(finished, hovered, longest=6)
-    # From the third step on: 9, against 5 for each of the steps 3 to 6, the last two of them not lived.
-    assert pair.step == 2
-    assert pair.per_step == 5.0
-    assert (pair.finishing, pair.hovering) == pytest.approx((9.0, 5 * (1 + 0.99 + 0.9801 + 0.970299)))
-    ended = dataclasses.replace(hovered, ended="truncated")
-    assert pair_up(finished, ended, longest=6).hovering == pytest.approx(5 * 1.99)
-    elsewhere = dataclasses.replace(hovered, seed=life.seed + 1)
-    assert pair_up(finished, elsewhere, longest=6) is None
+def test_stopping_is_compared_from_where_it_begins():
+    episode = shared_records_of("broken_envs.py:Clean", "search").role("search")[0]
+    finished = dataclasses.replace(episode, rewards=np.array([0.0, 0.0, 9.0]))
+    stopped = dataclasses.replace(episode, rewards=np.array([0.0, 0.0, 5.0, 5.0]), ended="steps")
+    stop = compare_returns(finished, stopped, at=2, longest=6)
+    # From the third step on: 9, against 5 for each of the steps 3 to 6, the last two of them not played.
+    assert (stop.step, stop.per_step) == (3, 5.0)
+    assert (stop.finishing, stop.stopping) == pytest.approx((9.0, 5 * (1 + 0.99 + 0.9801 + 0.970299)))
+    ended = dataclasses.replace(stopped, ended="truncated")
+    assert compare_returns(finished, ended, at=2, longest=6).stopping == pytest.approx(5 * 1.99)
 
 
 def test_hovering_is_found_and_placed():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,7 +12,6 @@ from numpy.typing import NDArray
 from rlctl.check_env.experiment import check
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
 from rlctl.check_env.leaves import Leaf
-from rlctl.check_env.messages import Trajectory
 from rlctl.check_env.records import Records
 from rlctl.check_env.rewarded import WITH_SEARCH, require_rewarded
 
@@ -27,15 +28,9 @@ APART = 1_000.0
 """Ratio of scales from which the smaller elements are invisible to a network of usual initial weights."""
 STILL = 1e-6
 """Relative to its size: an element that varies less is noise of the simulation."""
-_Steps = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
-"""Of n steps: the seed and the number in its episode of each, its features (observation before, observation after,
-action; shape (n, elements)), and its reward."""
-NEAR, NEAR_ACTION = 0.05, 0.25
-"""Two steps are alike where each number of both observations is as near as this, and each of the actions (much of which
-the observations show already), in units of its standard deviation over everything that was recorded."""
-MOST_STEPS = 2_000
-"""Steps that are compared, each with each."""
-MOST_PAIRS = 20_000
+NEAR = 0.05
+"""Two steps are alike where each number of both observations is as near as this, in units of its standard deviation over
+everything that was recorded."""
 FEWEST_PAIRS = 30
 FEWEST_ALIKE_SEEDS = 4
 """Seeds among which alike steps are found: with fewer it may be something special of one episode."""
@@ -127,84 +122,76 @@ def _find_unequal_scales(records: Records) -> Iterator[Finding]:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class _Step:
+    """One of the first steps of an episode."""
+
+    seed: int
+    number: int
+    """1 is the first."""
+    observations: Numbers
+    """The ones before and after it, in units of what is near. Shape (2, elements)."""
+    reward: float
+
+    def is_alike(self, other: _Step) -> bool:
+        """Say whether the observations of both are the same, nearly."""
+        return bool((np.abs(self.observations - other.observations) <= 1.0).all())
+
+
 @check("RL114", *WITH_SEARCH)
 def find_hidden_goal(records: Records) -> Iterator[Finding]:
-    """Compare the rewards of steps that look alike, of different episodes and of one."""
-    seeds, numbers, features, rewards = _steps(records, require_rewarded(records))
-    one, two = _alike(features)
-    differences = np.abs(rewards[one] - rewards[two])
-    across = seeds[one] != seeds[two]
-    # Of one episode, recorded twice perhaps, but at different times: chance in the reward would show.
-    within = ~across & (numbers[one] != numbers[two])
-    different_seeds = len(np.unique(seeds[np.concatenate([one[across], two[across]])]))
-    if across.sum() < FEWEST_PAIRS or within.sum() < FEWEST_PAIRS or different_seeds < FEWEST_ALIKE_SEEDS:
+    """Compare the rewards of steps with the zero action that look alike, of different episodes and of one."""
+    rewards = np.concatenate([each.rewards for each in require_rewarded(records)])
+    pairs = [(one, two) for one, two in itertools.combinations(_first_steps(records), 2) if one.is_alike(two)]
+    across = [pair for pair in pairs if pair[0].seed != pair[1].seed]
+    within = [pair for pair in pairs if pair[0].seed == pair[1].seed]  # where chance in the reward would show
+    seeds = {step.seed for pair in across for step in pair}
+    if len(across) < FEWEST_PAIRS or len(within) < FEWEST_PAIRS or len(seeds) < FEWEST_ALIKE_SEEDS:
         return  # no two episodes came to the same state
-    different, same = float(np.median(differences[across])), float(np.median(differences[within]))
+    different, same = (float(np.median([_apart(pair) for pair in each])) for each in (across, within))
     if different > LARGE_PART * float(rewards.std()) and different > TIMES * same:
-        pair = np.flatnonzero(across)[int(differences[across].argmax())]
-        first, second = int(one[pair]), int(two[pair])
+        one, two = max(across, key=_apart)
         yield Finding(
             "RL114",
-            f"with {different_seeds} seeds, steps that look alike have rewards {different:.3g} apart (median of "
-            f"{across.sum():,} pairs), within one episode {same:.2g}: {rewards[first]:.4g} and "
-            f"{rewards[second]:.4g}, say",
+            f"with {len(seeds)} seeds, steps that look alike have rewards {different:.3g} apart (median of "
+            f"{len(across):,} pairs), within one episode {same:.2g}: {one.reward:.4g} and {two.reward:.4g}, say",
             {
-                "seed": int(seeds[second]),
-                "step": int(numbers[second]),
-                "value": float(rewards[second]),
-                "expected": float(rewards[first]),
-                "other_seed": int(seeds[first]),
-                "other_step": int(numbers[first]),
+                "seed": two.seed,
+                "step": two.number,
+                "value": two.reward,
+                "expected": one.reward,
+                "other_seed": one.seed,
+                "other_step": one.number,
             },
         )
 
 
-def _steps(records: Records, episodes: list[Trajectory]) -> _Steps:
-    """Return some steps of all kinds of episodes; their features are in units of what is near."""
+def _apart(pair: tuple[_Step, _Step]) -> float:
+    return abs(pair[0].reward - pair[1].reward)
+
+
+def _first_steps(records: Records) -> list[_Step]:
+    """Return the steps of all starts, but those that end an episode."""
     leaves = records.require_built().leaves
-    if not leaves or any(not leaf.supported for leaf in leaves):
-        raise NotApplicable("a part of the observation cannot be compared")
-    if any(len(leaf.shape) == 3 for leaf in leaves):
-        raise NotApplicable("images are not compared")
-    parts = [part for each in episodes for part in _steps_of(each, len(leaves))]
-    if not parts:
-        raise NotApplicable("no whole observation was recorded")
-    seeds, numbers, features, rewards = (np.concatenate(each) for each in zip(*parts, strict=True))
-    # Some, evenly, of the beginnings of episodes, where they are most alike, and as many of all others.
-    halves = [np.flatnonzero(numbers <= 3), np.flatnonzero(numbers > 3)]
-    chosen = np.concatenate([each[:: max(1, -(-len(each) * 2 // MOST_STEPS))] for each in halves])
-    near = NEAR * features.std(axis=0)
-    near[features.shape[1] - episodes[0].action_values.shape[1] :] *= NEAR_ACTION / NEAR
-    # Whole numbers, of places and kinds, are alike only if they are equal.
-    whole = (features == np.round(features)).all(axis=0)
-    near[whole] = np.minimum(near[whole], 0.5)
-    scaled = features[chosen] / np.where(near > 0, near, 1.0)
-    return seeds[chosen], numbers[chosen], scaled, rewards[chosen]
+    if not leaves or any(not leaf.supported or len(leaf.shape) == 3 for leaf in leaves):
+        raise NotApplicable("a part of the observation is an image or cannot be compared")
+    near = np.concatenate([_near(_rows(records, index)) for index in range(len(leaves))])
+    steps = []
+    for each in records.role("starts"):
+        series = [each.observations.get(index) for index in range(len(leaves))]
+        flat = [one.values.reshape(len(one.values), -1) for one in series if one is not None]
+        if [len(one) for one in flat] == [each.steps + 1] * len(leaves):
+            scaled = np.concatenate(flat, axis=1) / near
+            steps += [
+                _Step(each.seed, number, scaled[number - 1 : number + 1], float(each.rewards[number - 1]))
+                for number in range(1, each.steps + 1 - (each.ended in ("terminated", "both")))
+            ]
+    return steps
 
 
-def _steps_of(episode: Trajectory, leaves: int) -> Iterator[_Steps]:
-    """Yield the steps of an episode whose observations are all known and finite; a last one that ends is left out."""
-    steps = episode.steps - (episode.ended in ("terminated", "both", "raised"))
-    series = [episode.observations.get(index) for index in range(leaves)]
-    flat = [each.values.reshape(len(each.values), -1).astype(np.float64) for each in series if each is not None]
-    if steps < 1 or [len(each) for each in flat] != [episode.steps + 1] * leaves:
-        return
-    observations = np.concatenate(flat, axis=1)
-    if np.isfinite(observations).all():
-        parts = [observations[:steps], observations[1 : steps + 1], episode.action_values[:steps]]
-        features = np.concatenate(parts, axis=1)
-        yield np.full(steps, episode.seed), np.arange(1, steps + 1), features, episode.rewards[:steps]
-
-
-def _alike(features: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the pairs of steps that are alike, in no number farther apart than 1: first of each, second of each."""
-    features = features - features.mean(axis=0)
-    squares = (features**2).sum(axis=1)
-    distances = squares[:, None] + squares[None, :] - 2 * features @ features.T
-    # Rounding aside, no pair that is alike is farther apart than this.
-    most = features.shape[1] + 1e-9 * squares.max(initial=0.0)
-    one, two = np.nonzero(np.triu(distances <= most, 1))
-    step = max(1, -(-len(one) // MOST_PAIRS))
-    one, two = one[::step], two[::step]
-    alike = (np.abs(features[one] - features[two]) <= 1.0).all(axis=1)
-    return one[alike], two[alike]
+def _near(rows: Numbers) -> Numbers:
+    """Return how near two values of each element are that count as alike."""
+    near = NEAR * rows.std(axis=0)
+    if np.issubdtype(rows.dtype, np.integer):  # places and kinds are alike only if they are equal
+        near = np.minimum(near, 0.5)
+    return np.where(near > 0, near, 1.0)

@@ -1,8 +1,7 @@
-"""RL604 to RL606 and RL609 to RL611: what the reward pays for, and success, as `info["is_success"]` reports it."""
+"""RL604, RL606 and RL609 to RL611: what the reward pays for, and success, as `info["is_success"]` reports it."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
-from rlctl.check_env.families.determinism import compare
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
@@ -37,13 +35,6 @@ from rlctl.check_env.rewarded import (
 LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5
 """Part of all rewards that the last one of an episode is as good as, from which its end looks like a goal, or like
 nothing in particular. Below, it looks like a failure."""
-LATE = 10
-"""Up to how many steps before its end another episode may part from one that finished, to be compared with it."""
-FAR_ABOVE = 5.0
-"""The last reward of an episode is that of a goal, where success is not reported, if it stands out by so many times the
-spread of the rewards in its first half: a robot that falls while it walks fast ends with a good reward too."""
-CLEARLY = 0.1
-"""How much more hovering has to earn than finishing."""
 NEARLY = 0.05
 """How much better than doing nothing something has to be, to be better."""
 FEWEST_COMPARED = 10
@@ -106,77 +97,6 @@ def _severity_of_end(
     if as_good_as >= LIKE_A_GOAL:
         return None
     return Severity.INFO if as_good_as >= LIKE_ANY else Severity.WARNING
-
-
-@dataclasses.dataclass(frozen=True)
-class Pair:
-    """Two episodes that are the same up to a step, from where one finishes and the other hovers."""
-
-    finished: Trajectory
-    step: int
-    finishing: float
-    """The discounted rewards from that step on."""
-    hovering: float
-    per_step: float
-    """The mean reward of hovering."""
-
-
-@check("RL605", *WITH_SEARCH)
-def _find_paid_hovering(records: Records) -> Iterator[Finding]:
-    episodes = require_rewarded(records)
-    is_reported = reports_success(episodes)
-    finished = [each for each in episodes if _finishes(each, is_reported)]
-    if not finished:
-        raise NotApplicable("nothing ended an episode at a goal")
-    if max(float(each.rewards[:-1].max(initial=0.0)) for each in episodes) <= 0:
-        return  # there is nothing to be earned by staying
-    if compare(records, "alone", "reused")[1] is not None:
-        raise NotJudged("equal seeds and actions give unequal episodes (RL301, RL302)")
-    others = [each for each in records.role("search") if each.steps and not _finishes(each, is_reported)]
-    longest = longest_episode(records, episodes)
-    pairs = [pair for one in finished for two in others if (pair := pair_up(one, two, longest)) is not None]
-    if not is_reported:
-        pairs = [pair for pair in pairs if pair.finishing > 0]  # an end that costs more than it pays is no goal
-    if not pairs:
-        raise NotJudged("no episode that stops just before the goal could be played")
-    best = max(pairs, key=lambda pair: pair.hovering - pair.finishing)
-    if best.per_step > 0 and best.hovering > best.finishing + CLEARLY * abs(best.finishing):
-        step, expected = best.step + 1, f"below {best.finishing:.6g}"
-        yield Finding(
-            "RL605",
-            f"finishing at step {best.finished.steps} earns {best.finishing:.4g} from step {step} on; stopping "
-            f"there instead earns {best.per_step:.3g} per step, {best.hovering:.4g} in all (discounted by {DISCOUNT} "
-            f"up to step {longest})",
-            best.finished.at(step, value=best.hovering, expected=expected, per_step=best.per_step),
-        )
-
-
-def _finishes(episode: Trajectory, success_is_reported: bool) -> bool:
-    """Whether an episode ended at the goal: as it reports, or else with a reward far above what it began with."""
-    if episode.ended not in ("terminated", "both"):
-        return False
-    if success_is_reported:
-        return ends_in_success(episode)
-    begin = episode.rewards[: episode.steps // 2]
-    last = episode.rewards[-1]
-    return len(begin) > 1 and bool(last > begin.max() + FAR_ABOVE * np.ptp(begin) and last >= episode.rewards.max())
-
-
-def pair_up(one: Trajectory, two: Trajectory, longest: int) -> Pair | None:
-    """Compare an episode that finished with another of the same seed that parts from it shortly before that.
-
-    `longest`: how long an episode may last [steps]. None if they are not such a pair.
-    """
-    if one.role != two.role or one.seed != two.seed or two.steps <= one.steps or two.ended == "raised":
-        return None
-    differ = (one.action_values != two.action_values[: one.steps]).any(axis=1)
-    step = int(differ.argmax())
-    if not differ.any() or step < one.steps - LATE:
-        return None
-    rest = two.rewards[step:]
-    to_come = 0 if two.has_ended else longest - two.steps
-    hovering = discounted_sum(rest) + DISCOUNT ** len(rest) * discounted_steps(float(rest[-LATE:].mean()), to_come)
-    return Pair(one, step, discounted_sum(one.rewards[step:]), hovering, float(rest.mean()))
 
 
 @check("RL606", *WITH_SEARCH)

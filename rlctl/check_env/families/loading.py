@@ -14,7 +14,7 @@ from rlctl.check_env.failures import EnvironmentRaised, find_missing_file, itera
 from rlctl.check_env.finding import Finding
 from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.messages import Built, Message
-from rlctl.check_env.own_code import find_author, is_task
+from rlctl.check_env.own_code import find_author, find_time_limit, is_task
 from rlctl.check_env.records import Records
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
 
@@ -123,7 +123,7 @@ def describe_built(instance: Instance) -> Built:
         action_space=_short(env.action_space),
         names=dict(inner.observation_sizes) if is_task(env) else {},
         events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
-        max_steps=inner.max_steps if is_task(env) else getattr(spec, "max_episode_steps", None),
+        max_steps=find_time_limit(env),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         accepts_seed=instance.accepts_seed,
         accepts_options=instance.accepts_options,

@@ -1,16 +1,16 @@
-"""Records a small search for good actions, so that rules see more of an environment than chance finds.
+"""Records a small search for good actions, so that rules see more of an environment than chance finds; and RL605.
 
-All its episodes begin with the same seed, unless doing nothing succeeds with it. The cross-entropy method comes first:
+All its episodes begin with the same seed, unless doing nothing succeeds with it. The cross-entropy method plays
 generations of sequences of a few held actions, each drawn around the best of those before. Then the best sequence is
-followed with another action from some step on; at last it stops shortly before its best moment, to see what standing
-still beside a goal earns.
+followed with another action from some step on; at last one that finished stops shortly before its end, to see what
+standing still beside a goal earns.
 """
 
 from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,10 +19,19 @@ from numpy.typing import NDArray
 from rlctl.check_env.actions import action_at, zero_action
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
+from rlctl.check_env.own_code import find_time_limit
 from rlctl.check_env.recording import Recording
-from rlctl.check_env.rewarded import has_succeeded
+from rlctl.check_env.rewarded import (
+    DISCOUNT,
+    discounted_steps,
+    discounted_sum,
+    ends_in_success,
+    has_succeeded,
+    reports_success,
+)
 
 MOST_STEPS = 6_000
 """Steps in all. With them the goal of the bundled `reach`, a ball of 5 cm within reach of an arm, is found from most
@@ -45,7 +54,14 @@ CEM_FRACTION = 0.7
 CONTINUED = 12
 """Episodes that follow the best and then go on otherwise."""
 STOPS = (1, 2, 4, 8)
-"""How many steps before its best moment, or its end, an episode is played again with nothing done from there on."""
+"""How many steps before its end an episode that finished is played again with nothing done from there on."""
+FAR_ABOVE = 5.0
+"""The last reward of an episode is that of a goal, where success is not reported, if it stands out by so many times the
+spread of the rewards in its first half: a robot that falls while it walks fast ends with a good reward too."""
+CLEARLY = 0.1
+"""How much more stopping has to earn than finishing."""
+LATE = 10
+"""The mean of so many rewards is what each later step is taken to earn [steps]."""
 
 
 @dataclasses.dataclass
@@ -62,14 +78,13 @@ class _Attempt:
         return float(rewards.sum() / LONGEST + rewards.max()) if rewards.size else -np.inf
 
 
-@experiment("search", share=3.0)
+@experiment("search", "RL605", share=3.0)
 def search(context: Context) -> Iterator[Message]:
-    """Look for action sequences with a high return, and stand still near the best moments of them."""
+    """Look for action sequences with a high return, and stop one that finished shortly before its end."""
     leaves = context.instance.action_leaves
     unknown = [leaf.kind for leaf in leaves if not leaf.supported]
     if unknown or not leaves:
-        yield Skipped("search", f"no search among actions of a {', '.join(unknown) or 'space without numbers'}")
-        return
+        raise NotJudged(f"no search among actions of a {', '.join(unknown) or 'space without numbers'}")
     searcher = _Search(context)
     yield from searcher.do_nothing()
     yield from searcher.cross_entropy_search()
@@ -129,21 +144,26 @@ class _Search:
             yield from self.play([*best.sequence[:at], *[action] * (self._length - at)])
 
     def stop_early(self) -> Iterator[Message]:
-        """Follow the sequences that finished, or else the best, and do nothing from shortly before on."""
-        followed = [each for each in self._of_seed if each.played.steps]
-        if not followed:
-            return
-        ended = [each for each in followed if each.played.ended == "terminated"]
-        finished = [each for each in ended if has_succeeded(each.played)] or ended
-        chosen = [max(finished, key=lambda each: each.played.rewards[-1])] if finished else []
-        chosen.append(max(followed, key=lambda each: each.score))
-        nothing = zero_action(self._space)
-        for each in chosen:
-            is_over, rewards = each.played.ended == "terminated", np.nan_to_num(each.played.rewards)
-            for before in STOPS:
-                at = max(0, (len(rewards) if is_over else int(rewards.argmax()) + 1) - before)
-                if self._goes_on():
-                    yield from self.play([*each.sequence[:at], *[nothing] * (self._length - at)])
+        """Follow a sequence that finished, do nothing from shortly before its end on, and compare what both earn."""
+        is_reported = reports_success([each.played for each in self.attempts])
+        finished = [each for each in self._of_seed if _finishes(each.played, is_reported)]
+        if not finished:
+            raise NotApplicable("nothing ended an episode at a goal")
+        best = max(finished, key=lambda each: each.played.rewards[-1])
+        one, nothing = best.played, zero_action(self._space)
+        stops: list[Stop] = []
+        for before in STOPS:
+            at = max(0, one.steps - before)
+            if self._goes_on():
+                yield from self.play([*best.sequence[:at], *[nothing] * (self._length - at)])
+                two = self.attempts[-1].played
+                is_same = np.array_equal(one.rewards[:at], two.rewards[:at]) and two.ended != "raised"
+                if is_same and two.steps > one.steps and not _finishes(two, is_reported):
+                    longest = find_time_limit(self.instance.env) or max(each.played.steps for each in self.attempts)
+                    stops.append(compare_returns(one, two, at, longest))
+        if not is_reported:
+            stops = [each for each in stops if each.finishing > 0]  # an end that costs more than it pays is no goal
+        yield from _judge_stops(one, stops)
 
     def play(self, sequence: list[Any], kind: str = "searched") -> Iterator[Message]:
         """Play one sequence of actions."""
@@ -176,3 +196,49 @@ class _Search:
         steps = sum(each.played.steps for each in self.attempts)
         is_left = steps < part * MOST_STEPS and len(self.attempts) < part * MOST_EPISODES
         return is_left and not self.budget.why_spent
+
+
+def _finishes(episode: Trajectory, success_is_reported: bool) -> bool:
+    """Whether an episode ended at the goal: as it reports, or else with a reward far above what it began with."""
+    if episode.ended not in ("terminated", "both"):
+        return False
+    if success_is_reported:
+        return ends_in_success(episode)
+    begin = episode.rewards[: episode.steps // 2]
+    last = episode.rewards[-1]
+    return len(begin) > 1 and bool(last > begin.max() + FAR_ABOVE * np.ptp(begin) and last >= episode.rewards.max())
+
+
+@dataclasses.dataclass(frozen=True)
+class Stop:
+    """What an episode earns that stops shortly before another one finishes."""
+
+    step: int
+    """The first step that is different."""
+    finishing: float
+    """The discounted rewards of the other one from that step on."""
+    stopping: float
+    """Its own, up to the time limit."""
+    per_step: float
+    """Its mean reward from that step on."""
+
+
+def compare_returns(one: Trajectory, two: Trajectory, at: int, longest: int) -> Stop:
+    """Compare an episode that finished with one that is the same for `at` steps. `longest`: the time limit [steps]."""
+    rest = two.rewards[at:]
+    to_come = 0 if two.has_ended else longest - two.steps
+    stopping = discounted_sum(rest) + DISCOUNT ** len(rest) * discounted_steps(float(rest[-LATE:].mean()), to_come)
+    return Stop(at + 1, discounted_sum(one.rewards[at:]), stopping, float(rest.mean()))
+
+
+def _judge_stops(finished: Trajectory, stops: Sequence[Stop]) -> Iterator[Message]:
+    if not stops:
+        raise NotJudged("no episode that stops just before the goal could be played")
+    best = max(stops, key=lambda each: each.stopping - each.finishing)
+    if best.per_step > 0 and best.stopping > best.finishing + CLEARLY * abs(best.finishing):
+        yield Finding(
+            "RL605",
+            f"finishing at step {finished.steps} earns {best.finishing:.4g} from step {best.step} on; stopping there "
+            f"instead earns {best.per_step:.3g} per step, {best.stopping:.4g} in all (discounted by {DISCOUNT})",
+            finished.at(best.step, value=best.stopping, expected=f"below {best.finishing:.6g}", per_step=best.per_step),
+        )
