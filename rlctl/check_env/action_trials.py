@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -115,19 +116,17 @@ class Trials:
     ) -> list[Frame]:
         """Play an episode with one number of the action set to a value, in one step or in all."""
 
-        def change(part: Any, leaf: Leaf) -> Any:
+        def change(action: Any, leaf: Leaf) -> Any:
+            part = pick(action, leaf.path)
             if leaf.path == dimension.leaf.path:
                 part = np.array(part)
                 part.flat[dimension.index] = value
             return part
 
-        chosen = self.actions(seed, steps)
-        changed = [self.change(each, change) if at in (None, step) else each for step, each in enumerate(chosen)]
-        return self.play(seed, changed)
-
-    def change(self, action: Any, change: Callable[[Any, Leaf], Any]) -> Any:
-        """Return an action whose leaves went through a function of the part and the leaf."""
-        return build_action(self.instance.env.action_space, lambda leaf: change(pick(action, leaf.path), leaf))
+        space, chosen = self.instance.env.action_space, self.actions(seed, steps)
+        for step in range(len(chosen)) if at is None else [at]:
+            chosen[step] = build_action(space, functools.partial(change, chosen[step]))
+        return self.play(seed, chosen)
 
     def play(self, seed: int, chosen: Sequence[Any]) -> list[Frame]:
         """Play an episode with given actions, to its end at most; the first frame is that of reset."""

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
-import itertools
 import linecache
-import os
 import re
 import sys
 import traceback
@@ -28,8 +25,6 @@ NO_DISPLAY = re.compile(
 )
 """What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
-_MOST_FOLDERS = 2_000
-"""Folders that are looked through for a similar name."""
 
 
 class EnvironmentRaised(Exception):
@@ -93,7 +88,7 @@ def iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
 
 def _describe(name: str, more: list[Path]) -> dict[str, Any]:
     searched = [] if Path(name).is_absolute() else [Path.cwd(), *more]
-    return {"file": name, "searched": [str(folder) for folder in searched], "similar": _similar(Path(name), searched)}
+    return {"file": name, "searched": [str(folder) for folder in searched]}
 
 
 def _find_model(trace: TracebackType | None) -> str | None:
@@ -113,16 +108,3 @@ def _find_model(trace: TracebackType | None) -> str | None:
             value = inspect.getattr_static(value, attribute, None)  # runs no code of the environment
         texts += [str(value)] if isinstance(value, (str, Path)) else []
     return next((text for text in texts if _MODEL.fullmatch(text) and not Path(text).is_file()), None)
-
-
-def _similar(wanted: Path, searched: list[Path]) -> str | None:
-    """Return a file of nearly the same name in the folders that were searched, or in the one that was named."""
-    folders = searched or [next((parent for parent in wanted.parents if parent.is_dir()), Path("/nowhere"))]
-    for folder in folders:
-        paths = {}
-        for parent, inner, files in itertools.islice(os.walk(folder), _MOST_FOLDERS):
-            inner[:] = [each for each in inner if not each.startswith(".") and each != "site-packages"]
-            paths.update({name: Path(parent, name) for name in files if name.endswith(wanted.suffix)})
-        if close := difflib.get_close_matches(wanted.name, paths, n=1, cutoff=0.8):
-            return str(paths[close[0]])
-    return None

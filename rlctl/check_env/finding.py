@@ -53,7 +53,7 @@ FAMILIES, RULES = _load()
 """The families' titles by the beginning of their ids, and the rules by id."""
 
 
-@dataclasses.dataclass(frozen=True, init=False)
+@dataclasses.dataclass(init=False)
 class Finding:
     """Something that is wrong, or may be, with one environment."""
 
@@ -73,11 +73,8 @@ class Finding:
         fix: str = "",
     ) -> None:
         """Severity and fix are the rule's where left out."""
-        text = RULES[rule]
-        severity = Severity(severity or text.severity)
-        values = {"rule": rule, "message": message, "evidence": evidence or {}, "severity": severity}
-        for name, value in {**values, "fix": fix or text.fix}.items():
-            object.__setattr__(self, name, value)
+        self.rule, self.message, self.evidence = rule, message, evidence or {}
+        self.severity, self.fix = Severity(severity or RULES[rule].severity), fix or RULES[rule].fix
 
     @property
     def name(self) -> str:

@@ -18,7 +18,6 @@ from rlctl.errors import TaskError
 
 MOST_FAILURES = 3
 """After so many episodes that raise no other is played for the same purpose."""
-RenderMode = Literal["rgb_array", "ansi"]
 
 
 @dataclasses.dataclass
@@ -106,7 +105,7 @@ class Context:
         """What the experiment that is running may use."""
         self._instance: Instance | None = None
 
-    def build(self, render_mode: RenderMode | None = None) -> Instance:
+    def build(self, render_mode: Literal["rgb_array"] | None = None) -> Instance:
         """Return a new instance; what its import or constructor raises is an `EnvironmentRaised`."""
         try:
             # Loaded before it is built, to distinguish an import error from a constructor's.
@@ -132,7 +131,7 @@ class Context:
         return self._instance is not None
 
     @contextlib.contextmanager
-    def fresh(self, render_mode: RenderMode | None = None) -> Iterator[Instance]:
+    def fresh(self, render_mode: Literal["rgb_array"] | None = None) -> Iterator[Instance]:
         """A new instance for one experiment, closed after it; what its close raises is not this experiment's matter."""
         instance = self.build(render_mode)
         try:

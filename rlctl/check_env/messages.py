@@ -137,7 +137,7 @@ class Failure:
     details: str | None = None
     """A traceback, or the last lines that a dying process printed."""
     file: Mapping[str, Any] | None = None
-    """A file that was not found: its name, the folders that were searched, and a similar file."""
+    """A file that was not found: its name, and the folders that were searched."""
     process: str = ""
     """Which child process: `probe` or `instances`."""
 

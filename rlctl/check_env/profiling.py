@@ -8,7 +8,7 @@ import re
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import CodeType
 from typing import Any
@@ -82,14 +82,13 @@ class _Function:
 
 
 class Profile:
-    """The functions that were called, as a graph of who calls whom."""
+    """The functions that were called, and by whom."""
 
     def __init__(self, stats: list[Any], is_own: Callable[[str], bool], kind_of: Callable[[str, bool], str]) -> None:
         modules = {getattr(each, "__dict__", {}).get("__file__"): name for name, each in list(sys.modules.items())}
         self._functions: dict[Any, _Function] = {}
-        self._called: dict[Any, Counter[Any]] = defaultdict(Counter)
-        """What a function calls, with the time of that and of all below [s]."""
         self._callers: dict[Any, Counter[Any]] = defaultdict(Counter)
+        """What calls a function, with the time of that and of all it calls [s]."""
         for entry in stats:
             own = isinstance(entry.code, CodeType) and is_own(entry.code.co_filename)
             name = _name_of(entry.code, own, modules)
@@ -97,7 +96,6 @@ class Profile:
             function = self._functions.setdefault(entry.code, _Function(name, place, kind_of(name, own)))
             function.own_s += entry.inlinetime
             for each in entry.calls or ():
-                self._called[entry.code][each.code] += each.totaltime
                 self._callers[each.code][entry.code] += each.totaltime
         self._seconds = sum(each.own_s for each in self._functions.values()) or 1.0
 
@@ -107,30 +105,21 @@ class Profile:
 
     def suspicious(self) -> list[TimedCall]:
         """Return the functions of a suspicious kind that no other such calls, with the time in all they call."""
-        found = []
-        for caller in self._walk():
-            for code, seconds in self._called[caller].items():
-                if self._functions[code].kind:
-                    found.append((code, self._functions[code].place or self._place(caller), seconds))
-        return self._sum_up(found)
-
-    def _walk(self) -> Iterator[Any]:
-        """Yield the functions that no suspicious one calls, from those on that nobody calls."""
-        waiting = [code for code in self._functions if not self._callers[code].keys() - {code}]
-        seen = set(waiting)
-        while waiting:
-            caller = waiting.pop()
-            yield caller
-            new = {code for code in self._called[caller] if not self._functions[code].kind} - seen
-            seen |= new
-            waiting += new
+        return self._sum_up(
+            [
+                (code, self._functions[code].place or self._place(caller), seconds)
+                for code, callers in self._callers.items()
+                for caller, seconds in callers.items()
+                if self._functions[code].kind and not self._functions[caller].kind
+            ]
+        )
 
     def _place(self, code: Any) -> str:
         """Return the place of a function, or of the own function that most of its time is spent for."""
         seen = set()
         while code is not None and not self._functions[code].place:
             seen.add(code)
-            callers = [each for each, _ in self._callers[code].most_common() if each not in seen]
+            callers = [each for each, _ in self._callers.get(code, Counter()).most_common() if each not in seen]
             code = callers[0] if callers else None
         return "" if code is None else self._functions[code].place
 

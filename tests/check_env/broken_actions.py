@@ -123,7 +123,7 @@ class Saturated(Clean):
 
 
 class Switch(Clean):
-    """The second number opens or closes."""
+    """The second number opens or closes: nothing is wrong with it."""
 
     def move(self, action):
         super().move(np.array([action[0], np.sign(action[1])], np.float32))

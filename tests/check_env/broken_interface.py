@@ -21,7 +21,7 @@ class NewSpaces(Clean):
 class Renders(Clean):
     """Draws the point: nothing is wrong with it."""
 
-    metadata = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 20}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 20}
 
     def __init__(self, render_mode=None):
         super().__init__()
@@ -58,11 +58,6 @@ class RenderFloats(Renders):
 class RenderNothing(Renders):
     def render(self):
         return None
-
-
-class RenderBlack(Renders):
-    def draw(self):
-        return np.zeros((20, 30, 3), np.uint8)
 
 
 class EndsInRender(Renders):

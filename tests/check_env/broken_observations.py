@@ -57,15 +57,6 @@ class SomeFlags(Clean):
         return {"position": self.position.copy(), "flags": np.array([self.position[0] > 0, 0], np.int8)}
 
 
-class Millimetres(Wide):
-    def __init__(self):
-        super().__init__()
-        self.observation_space = spaces.Box(-1e6, 1e6, (4,), np.float32)
-
-    def third(self, x, y):
-        return 1e4 * (x + y * y)
-
-
 class HiddenGoal(FixedStart):
     """The goal is drawn at reset, and not observed."""
 

@@ -51,7 +51,7 @@ class FloatTable(TwoAxes):
 
 
 class Tiles(Seen):
-    """A board of 9 x 9 tiles: too small for a picture."""
+    """A board of 9 x 9 tiles: nothing is wrong with it."""
 
     shape = (9, 9)
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.check_env.judging import case, check_case, findings, verdict_of
+from tests.check_env.judging import case, check_case, findings, found, rules_of, verdict_of
 
 FILE = "broken_actions.py"
 CASES = [
@@ -12,8 +12,8 @@ CASES = [
     case(f"{FILE}:CostlyAction", ("RL701", "warning"), twin=f"{FILE}:HiddenAction"),
     case(f"{FILE}:CopiedAction", ("RL701", "info")),
     case(f"{FILE}:Saturated", ("RL702", "warning"), twin=f"{FILE}:OneWay"),
-    case(f"{FILE}:Switch", ("RL702", "info")),
 ]
+CLEAN = [f"{FILE}:Switch"]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
@@ -21,7 +21,12 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-def the_finding(name, rule, study="action effects"):
+@pytest.mark.parametrize("task", CLEAN)
+def test_clean_is_clean(task):
+    assert found(task, *rules_of("RL7")) == set()
+
+
+def the_finding(name, rule):
     (finding,) = findings(f"{FILE}:{name}", rule)
     return finding
 

@@ -27,7 +27,7 @@ LONGEST_DELAY = 4
 SATURATED = 0.2
 """The part of the range from which on nothing may change for it to be called saturated: four fifths are then lost."""
 SWITCH = 0.01
-"""If even from here on nothing changes, only the sign counts: a gripper's switch, say, which may be meant."""
+"""If even from here on nothing changes, only the sign counts: a gripper's switch, say, which is meant."""
 MOST_NAMES = 8
 """So many dimensions are named in a message."""
 
@@ -40,8 +40,8 @@ class _Effect:
     kind: str
     """`lasting`; `cost`: in the reward of its own step only; `copy`: beside that, only as a copy of itself in the
     observation; `none`."""
-    saturates: str = ""
-    """`switch`: only its sign counts; `range`: from a fifth of its range on nothing changes; empty otherwise."""
+    saturates: bool = False
+    """Whether nothing changes from a fifth of its range on."""
 
 
 @experiment("action effects", "RL701", "RL702", share=4.0)
@@ -75,7 +75,7 @@ def _effect(trials: Trials, dimension: Dimension) -> _Effect:
         for end in dimension.ends:
             played = trials.with_value(seed, steps, dimension, end)
             if observations_differ(plain, played, copies):
-                saturates = _saturates(trials, dimension, copies) if dimension.is_continuous else ""
+                saturates = dimension.is_continuous and _saturates(trials, dimension, copies)
                 return _Effect(dimension.name, "lasting", saturates)
             if find_other_rewards(plain, played):
                 kind = "cost"
@@ -97,8 +97,8 @@ def _lasts(trials: Trials, dimension: Dimension) -> bool:
     return False
 
 
-def _saturates(trials: Trials, dimension: Dimension, copies: Sequence[int]) -> str:
-    """Say whether small and large values do the same, in both directions."""
+def _saturates(trials: Trials, dimension: Dimension, copies: Sequence[int]) -> bool:
+    """Say whether small and large values do the same, in both directions, and not only by their sign, as a switch."""
     low, high = dimension.bounds
     middle, half = (low + high) / 2, (high - low) / 2
 
@@ -109,9 +109,7 @@ def _saturates(trials: Trials, dimension: Dimension, copies: Sequence[int]) -> s
                 return False
         return True
 
-    if not (same(SATURATED, 1.0) and same(-SATURATED, -1.0)) or (same(0.0, 1.0) and same(0.0, -1.0)):
-        return ""
-    return "switch" if same(SWITCH, 1.0) and same(-SWITCH, -1.0) else "range"
+    return same(SATURATED, 1.0) and same(-SATURATED, -1.0) and not (same(SWITCH, 1.0) and same(-SWITCH, -1.0))
 
 
 def _without_effect(effects: Sequence[_Effect], total: int, left_out: str) -> Iterator[Finding]:
@@ -135,13 +133,9 @@ def _without_effect(effects: Sequence[_Effect], total: int, left_out: str) -> It
 
 
 def _saturated(effects: Sequence[_Effect], left_out: str) -> Iterator[Finding]:
-    for kind, part, what, severity in (
-        ("range", SATURATED, "", Severity.WARNING),
-        ("switch", SWITCH, ": a switch", Severity.INFO),
-    ):
-        if names := [each.name for each in effects if each.saturates == kind]:
-            message = f"{list_names(names, MOST_NAMES)}: from {part} of its range on, nothing changes{what}{left_out}"
-            yield _finding("RL702", names, message, severity)
+    if names := [each.name for each in effects if each.saturates]:
+        message = f"{list_names(names, MOST_NAMES)}: from {SATURATED} of its range on, nothing changes{left_out}"
+        yield _finding("RL702", names, message, Severity.WARNING)
 
 
 def _finding(rule: str, names: list[str], message: str, severity: Severity) -> Finding:

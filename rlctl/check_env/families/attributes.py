@@ -24,12 +24,12 @@ from rlctl.check_env.failures import (
 )
 from rlctl.check_env.families.interface import RENDERING
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
-from rlctl.check_env.instance import Context, RenderMode
+from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, Fact, Message, Skipped
 from rlctl.check_env.records import Records
 
-PICTURES: dict[RenderMode, str] = {"rgb_array": "a uint8 array of shape (height, width, 3)", "ansi": "a str"}
-"""The render modes that open no window, and what `render` returns in them."""
+PICTURE = "a uint8 array of shape (height, width, 3)"
+"""What `render` returns in the mode rgb_array."""
 NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)
 """What is raised where this machine has no graphics: whether it works elsewhere is not known."""
 NO_GRAPHICS_FIX = (
@@ -118,21 +118,14 @@ def read_truncation(env: Any) -> str:
 
 @experiment(RENDERING, "RL215")
 def render(context: Context) -> Iterator[Message]:
-    """Try each promised render mode that opens no window, on an instance of its own."""
+    """Try the mode rgb_array, which opens no window, on an instance of its own, where it is promised."""
     with context.fresh() as instance:
         metadata = getattr(instance.env, "metadata", None)
-        modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
-    promised = [str(mode) for mode in modes] if isinstance(modes, (list, tuple, set)) else []
-    if not set(promised) & set(PICTURES):
-        raise NotApplicable(f"promises no render mode that needs no window ({promised or 'none'})")
-    for mode in PICTURES:
-        if mode in promised:
-            yield from _render_in(context, mode)
-
-
-def _render_in(context: Context, mode: RenderMode) -> Iterator[Finding]:
+    modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
+    if not isinstance(modes, (list, tuple, set)) or "rgb_array" not in modes:
+        raise NotApplicable(f"metadata does not promise the render mode rgb_array (render_modes: {modes})")
     try:
-        with context.fresh(mode) as instance:
+        with context.fresh("rgb_array") as instance:
             instance.reset(FIRST_SEED)
             picture = instance.call("render", instance.env.render)
     except EnvironmentRaised as error:
@@ -142,21 +135,14 @@ def _render_in(context: Context, mode: RenderMode) -> Iterator[Finding]:
         if _lacks_library(cause):
             raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
         call = "the constructor" if error.call == "build" else error.call
-        yield _of_mode(mode, f"{call} raises {describe(cause)}", describe(cause))
+        message = f"with render_mode='rgb_array' {call} raises {describe(cause)}"
+        is_here = NO_GRAPHICS.search(describe(cause)) is not None
+        severity, fix = (Severity.INFO, NO_GRAPHICS_FIX) if is_here else (None, "")
+        yield Finding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity, fix)
         return
-    if wrong := _describe_wrong_picture(mode, picture):
-        yield _of_mode(mode, f"render returns {wrong}, not {PICTURES[mode]}", wrong)
-    elif mode == "rgb_array" and picture.size and (picture == picture[0, 0]).all():
-        colour = f"({', '.join(str(int(part)) for part in picture[0, 0])})"
-        yield _of_mode(mode, f"the picture after reset is all of one colour, {colour}", colour, Severity.INFO)
-
-
-def _of_mode(mode: RenderMode, what: str, value: str, severity: Severity | None = None) -> Finding:
-    evidence = {"mode": mode, "value": value, "expected": PICTURES[mode]}
-    message = f"with render_mode={mode!r} {what}"
-    if " raises " in what and NO_GRAPHICS.search(value):
-        return Finding("RL215", message, evidence, Severity.INFO, NO_GRAPHICS_FIX)
-    return Finding("RL215", message, evidence, severity)
+    if wrong := _describe_wrong_picture(picture):
+        message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"
+        yield Finding("RL215", message, {"value": wrong, "expected": PICTURE})
 
 
 def _lacks_library(error: BaseException) -> bool:
@@ -166,11 +152,7 @@ def _lacks_library(error: BaseException) -> bool:
     )
 
 
-def _describe_wrong_picture(mode: RenderMode, picture: Any) -> str:
-    if mode == "ansi":
-        # Gymnasium's API allows a string or a StringIO.
-        fine = isinstance(picture, str) or hasattr(picture, "getvalue")
-        return "" if fine else f"a {type(picture).__name__}"
+def _describe_wrong_picture(picture: Any) -> str:
     if not isinstance(picture, np.ndarray):
         return f"a {type(picture).__name__}"
     fine = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3

@@ -1,4 +1,4 @@
-"""RL110, RL112 and RL114: numbers in an observation that say nothing, are of quite different size, or are left out."""
+"""RL110 and RL114: numbers in an observation that say nothing, or are left out."""
 
 from __future__ import annotations
 
@@ -19,18 +19,10 @@ Numbers = NDArray[np.float64]
 
 FEWEST_ROWS = 50
 FEWEST_SEEDS = 3
-MOST_ROWS = 1_000
-"""Observations that are compared element by element: more would only cost time."""
-MOST_ELEMENTS = 1_500
-"""A larger array is not a list of measurements."""
 MOST_NAMED = 8
-APART = 1_000.0
-"""Ratio of scales from which the smaller elements are invisible to a network of usual initial weights."""
-STILL = 1e-6
-"""Relative to its size: an element that varies less is noise of the simulation."""
 NEAR = 0.05
-"""Two steps are alike where each number of both observations is as near as this, in units of its standard deviation over
-everything that was recorded."""
+"""Two steps are alike where each number of both observations is as near as this, in units of its standard deviation
+over everything that was recorded."""
 FEWEST_PAIRS = 30
 FEWEST_ALIKE_SEEDS = 4
 """Seeds among which alike steps are found: with fewer it may be something special of one episode."""
@@ -51,15 +43,6 @@ def _rows(records: Records, index: int) -> Numbers:
     if len(rows) < FEWEST_ROWS or seeds < FEWEST_SEEDS:
         raise NotJudged(f"only {len(rows)} observations with {seeds} seeds were recorded")
     return rows.reshape(len(rows), -1)
-
-
-def _vectors(records: Records) -> Iterator[tuple[int, Leaf, Numbers]]:
-    """Yield the leaves that are lists of measurements (floats, no image, not too large), with some of their rows."""
-    for index, leaf in enumerate(records.require_built().leaves):
-        is_float = leaf.supported and leaf.kind == "Box" and np.dtype(leaf.dtype).kind == "f"
-        if is_float and not _is_image(leaf) and 0 < np.prod(leaf.shape) <= MOST_ELEMENTS:
-            rows = _rows(records, index)
-            yield index, leaf, rows[:: max(1, -(-len(rows) // MOST_ROWS))].astype(np.float64)
 
 
 def _is_image(leaf: Leaf) -> bool:
@@ -96,30 +79,6 @@ def _constant(rows: Numbers, leaf: Leaf) -> NDArray[np.intp]:
     if np.dtype(leaf.dtype).kind != "f" and not still.all():
         return np.zeros(0, np.intp)
     return np.flatnonzero(still & (low < high))
-
-
-@check("RL112", *WITH_SEARCH)
-def _find_unequal_scales(records: Records) -> Iterator[Finding]:
-    built = records.require_built()
-    for index, _, rows in _vectors(records):
-        rows = rows[np.isfinite(rows).all(axis=1)]
-        deviations = rows.std(axis=0)
-        moving = np.flatnonzero(deviations > STILL * np.maximum(1.0, np.abs(rows).max(axis=0, initial=0.0)))
-        ordered = moving[np.argsort(deviations[moving])]
-        if len(ordered) < 2 or deviations[ordered[-1]] <= APART * deviations[ordered[0]]:
-            continue
-        if normalizes := records.normalizes():
-            return
-        large, small = int(ordered[-1]), int(ordered[0])
-        ratio, names = float(deviations[large] / deviations[small]), [built.element(index, i) for i in (large, small)]
-        recipe = "no recipe says to normalise" if normalizes is None else "the recipe does not normalise"
-        yield Finding(
-            "RL112",
-            f"{names[0]} varies by {deviations[large]:.3g}, {names[1]} by {deviations[small]:.3g}: {ratio:.2g} times "
-            f"less, and {recipe}",
-            {"value": ratio, "expected": f"up to {APART:g}", "elements": names},
-            Severity.INFO if normalizes is None else Severity.WARNING,
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,7 +140,7 @@ def _first_steps(records: Records) -> list[_Step]:
         series = [each.observations.get(index) for index in range(len(leaves))]
         flat = [one.values.reshape(len(one.values), -1) for one in series if one is not None]
         if [len(one) for one in flat] == [each.steps + 1] * len(leaves):
-            scaled = np.concatenate(flat, axis=1) / near
+            scaled = np.nan_to_num(np.concatenate(flat, axis=1) / near)
             steps += [
                 _Step(each.seed, number, scaled[number - 1 : number + 1], float(each.rewards[number - 1]))
                 for number in range(1, each.steps + 1 - (each.ended in ("terminated", "both")))
@@ -191,7 +150,7 @@ def _first_steps(records: Records) -> list[_Step]:
 
 def _near(rows: Numbers) -> Numbers:
     """Return how near two values of each element are that count as alike."""
-    near = NEAR * rows.std(axis=0)
+    near = NEAR * np.where(np.isfinite(rows), rows, 0.0).std(axis=0)
     if np.issubdtype(rows.dtype, np.integer):  # places and kinds are alike only if they are equal
         near = np.minimum(near, 0.5)
     return np.where(near > 0, near, 1.0)

@@ -24,19 +24,15 @@ from rlctl.check_env.records import Records
 
 IN_TURNS, AFTER_CLOSE = "two instances stepped in turns", "after another instance was closed"
 MOST_RESETS = 100
-WARM_UP = 10
-"""Resets after which caches and allocators are filled; memory is measured from there on."""
-TRIAL_RESETS = 3
-"""So many are timed to see how many there is time for."""
-MARGIN = 0.7
-"""The part of the time that is planned with, since a leak makes resets slower."""
+MEASURED_RESETS = 10
+"""Memory is measured after every so many resets; after the first of them caches and allocators are filled."""
 FEWEST_RESETS = 8
 """With fewer, growth cannot be distinguished from a slow start."""
 SETTLING_RESETS = 2
 """The first resets load what later ones keep."""
 LEAST_GROWTH = 3
 """In each half of the resets, so that one late object is not a leak."""
-FEWEST_RESETS_FOR_MEMORY = 30
+FEWEST_MEASUREMENTS = 3
 MEMORY_GROWTH = 8 * 2**20
 """Over the resets after the warm-up [bytes]. Allocators of clean environments move by 1 to 2 MiB; 0.1 MB per reset
 fills the memory of 16 workers in a day."""
@@ -169,9 +165,7 @@ class Counts:
     series: dict[str, list[int]] = dataclasses.field(default_factory=dict)
     """Per key of `LEAKS` that can be counted here, how many there are after each reset."""
     memory: list[int] = dataclasses.field(default_factory=list)
-    """Resident memory [bytes] once the warm-up is over, half way, and at the end; empty where it is not known."""
-    measured: list[int] = dataclasses.field(default_factory=list)
-    """After how many resets each of these was measured."""
+    """Resident memory [bytes] after each `MEASURED_RESETS` resets; empty where it is not known."""
 
     def count(self) -> None:
         """Count what is there now."""
@@ -194,7 +188,6 @@ class Counts:
             trim(0)
         pages = int((_PROCESS / "statm").read_text().split()[1])
         self.memory.append(pages * os.sysconf("SC_PAGE_SIZE"))
-        self.measured.append(self.resets)
 
 
 @experiment("leaks", "RL405", share=3.0)
@@ -204,16 +197,11 @@ def count_after_resets(context: Context) -> Iterator[Message]:
     instance, budget = context.instance, context.budget
     gc.freeze()  # what there is already need not be looked through again and again
     try:
-        begun, planned = budget.seconds_left, MOST_RESETS
-        while (done := counts.resets) < planned and budget.seconds_left > 0:
-            for _ in Episode(instance, FIRST_SEED + done, number=done, max_steps=1):
+        while counts.resets < MOST_RESETS and budget.seconds_left > 0:
+            for _ in Episode(instance, FIRST_SEED + counts.resets, number=counts.resets, max_steps=1):
                 pass
             counts.count()
-            done += 1
-            if done == TRIAL_RESETS:
-                affordable = done * MARGIN * begun / max(1e-9, begun - budget.seconds_left)
-                planned = max(done, min(MOST_RESETS, int(affordable)))
-            if done in (WARM_UP, (WARM_UP + planned) // 2, planned):
+            if counts.resets % MEASURED_RESETS == 0:
                 counts.measure_memory()
     except EnvironmentRaised as error:
         yield describe_failure(error, context.progress)
@@ -233,9 +221,9 @@ def find_growth(counts: Counts) -> Iterator[Finding]:
             message = f"{what} grow with every reset: from {first} to {series[-1]} in {after} resets"
             yield _report(message, what, series[-1], first, after, growth / after, LEAKS[what])
             return  # a client brings its own bodies, files, threads and memory
-    if len(counts.memory) == 3 and counts.measured[-1] >= FEWEST_RESETS_FOR_MEMORY:
-        start, middle, end = counts.memory
-        resets = counts.measured[-1] - counts.measured[0]
+    if len(counts.memory) >= FEWEST_MEASUREMENTS:
+        start, middle, end = (counts.memory[i] for i in (0, (len(counts.memory) - 1) // 2, -1))
+        resets = MEASURED_RESETS * (len(counts.memory) - 1)
         if end - start > MEMORY_GROWTH and end - middle > LATER_SHARE * (end - start):
             message = (
                 f"memory grows with every reset: by {(end - start) / 2**20:.1f} MiB in {resets} resets, of which "

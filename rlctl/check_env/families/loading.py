@@ -104,9 +104,8 @@ def _find_missing_files(records: Records) -> Iterator[Finding]:
 
 def _not_found(call: str, file: Mapping[str, Any], details: str | None) -> Finding:
     where = f", looked for in {' and '.join(file['searched'])}" if file["searched"] else ""
-    similar = f"; there is {file['similar']}" if file["similar"] else ""
     evidence = {**file, "traceback": details} if details else dict(file)
-    return Finding("RL007", f"{call} does not find {file['file']!r}{where}{similar}", evidence)
+    return Finding("RL007", f"{call} does not find {file['file']!r}{where}", evidence)
 
 
 def describe_built(instance: Instance) -> Built:

@@ -19,7 +19,6 @@ ROUNDING = 1e-6
 LARGE_SHARE, SMALL_SHARE = 0.1, 0.005
 """Part of all observations from which values outside the bounds are no rare extreme, or below which they hardly matter.
 The last one of an episode does not count: a limit that ends it has just been passed."""
-COLOURS = (3, 4)
 SMALLEST_SIDE = 36
 """An image with a shorter side does not fit through the default network's filters [pixels]."""
 
@@ -196,44 +195,31 @@ def _unusual_actions(leaf: Leaf) -> Iterator[Finding]:
 @check("RL108", "build", *RECORDING)
 def _find_unusual_images(records: Records) -> Iterator[Finding]:
     for index, leaf in enumerate(records.require_built().leaves):
-        if leaf.kind != "Box":
-            continue
         name, shape = name_leaf(leaf), list(leaf.shape)
-        if problem := _image_problem(leaf):
-            evidence = {"element": name, "value": shape, "dtype": leaf.dtype}
-            severity = Severity.WARNING if _looks_like_image(leaf) else Severity.INFO
-            yield Finding("RL108", f"{name} has {problem}", evidence, severity)
-        elif len(shape) == 3 and leaf.dtype == "uint8" and (brightest := _brightest(records, index)) in (0, 1):
+        if leaf.kind == "Box" and (problem := _image_problem(leaf)):
+            yield Finding("RL108", f"{name} {problem}", {"element": name, "value": shape, "dtype": leaf.dtype})
+        elif leaf.kind == "Box" and _is_in_image_format(leaf) and (brightest := _brightest(records, index)) in (0, 1):
             message = (
                 f"{name} is uint8 up to 255, and no pixel of any episode is brighter than {brightest}: scaled twice?"
             )
             yield Finding("RL108", message, {"element": name, "value": brightest, "expected": 255})
 
 
+def _is_in_image_format(leaf: Leaf) -> bool:
+    """Say whether it is what the default networks take for an image."""
+    in_range = np.all(leaf.low == 0) and np.all(leaf.high == 255)
+    return len(leaf.shape) == 3 and leaf.dtype == "uint8" and bool(in_range)
+
+
 def _image_problem(leaf: Leaf) -> str:
-    """Say what is unusual about a space of more than one axis; nothing for an image, and for numbers of other kinds."""
-    shape = tuple(leaf.shape)
-    if len(shape) < 2 or (len(shape) == 2 and leaf.dtype != "uint8"):
-        return ""
-    if len(shape) != 3:
-        return f"shape {shape}: {len(shape)} axes are neither a vector nor an image"
-    if 1 not in (shape[0], shape[-1]) and not {shape[0], shape[-1]} & set(COLOURS) and leaf.dtype != "uint8":
-        return f"shape {shape}: three axes, and neither the first nor the last of them counts colours"
-    if leaf.dtype != "uint8":
-        return f"the shape of an image, {shape}, and is {leaf.dtype}, not uint8"
-    if np.any(leaf.low != 0) or np.any(leaf.high != 255):
-        return f"the shape of an image, {shape}, and bounds other than 0 and 255"
-    if sorted(shape)[1] < SMALLEST_SIDE:
-        return f"the shape of an image, {shape}, smaller than {SMALLEST_SIDE} x {SMALLEST_SIDE}"
+    """Say what is wrong with what is as large as a picture, or has the format of one; nothing for anything else."""
+    is_large = sum(size >= SMALLEST_SIDE for size in leaf.shape) >= 2
+    is_table = len(leaf.shape) == 2 and leaf.dtype != "uint8"
+    if is_large and not is_table and not _is_in_image_format(leaf):
+        return f"is as large as an image, {leaf.shape}, and not (height, width, channels) of uint8 in [0, 255]"
+    if _is_in_image_format(leaf) and not is_large:
+        return f"has the shape of an image, {leaf.shape}, smaller than {SMALLEST_SIDE} x {SMALLEST_SIDE}"
     return ""
-
-
-def _looks_like_image(leaf: Leaf) -> bool:
-    """Say whether a space is as large as a picture, or has the format that the default networks take for one."""
-    is_format = (
-        len(leaf.shape) == 3 and leaf.dtype == "uint8" and bool(np.all(leaf.low == 0) and np.all(leaf.high == 255))
-    )
-    return is_format or sum(size >= SMALLEST_SIDE for size in leaf.shape) >= 2
 
 
 def _brightest(records: Records, index: int) -> int | None:
