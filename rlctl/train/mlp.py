@@ -6,12 +6,15 @@ computes gradients that nobody needs, as those of a critic's weights where it on
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+LOG_SQRT_TAU = 0.5 * math.log(2 * math.pi)
+"""Minus the logarithm of the standard normal density at 0."""
 _ACTIVATIONS = (nn.Tanh, nn.ReLU)
 
 

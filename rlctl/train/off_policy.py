@@ -13,6 +13,7 @@ from rlctl.run.network import DETERMINISTIC
 from rlctl.run.recipe import Recipe
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, to_network_layout
+from rlctl.train.sac_update import SacUpdate
 from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
 
 _LONGEST = 1000
@@ -33,6 +34,7 @@ class OffPolicyRollouts(Rollouts):
         # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
         self.overlap = recipe.overlap and recipe.her is None
         default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # else they would not explore at all
+        self._update: SacUpdate | Any = SacUpdate(model) if SacUpdate.supports(model) else model
         self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
 
     def start(self) -> None:
@@ -99,4 +101,4 @@ class OffPolicyRollouts(Rollouts):
         if steps and model.num_timesteps > model.learning_starts:
             updates = model.gradient_steps if model.gradient_steps >= 0 else steps
             if updates > 0:
-                model.train(batch_size=model.batch_size, gradient_steps=updates)
+                self._update.train(batch_size=model.batch_size, gradient_steps=updates)

@@ -7,7 +7,6 @@ gradient is of stands in its name: `to_mean` is the gradient of the loss with re
 from __future__ import annotations
 
 import collections
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,9 +19,8 @@ from stable_baselines3.common.utils import explained_variance
 from torch import Tensor
 
 from rlctl.dict_spaces import join, split
-from rlctl.train.mlp import Mlp, is_mlp, share_gradients
+from rlctl.train.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
 
-_LOG_SQRT_TAU = 0.5 * math.log(2 * math.pi)
 _FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
 
 
@@ -95,8 +93,8 @@ class PpoUpdate:
         std = self._compute_std(actor)
         z = (batch["actions"] - actor[-1]) / std
         log_std = std.log()
-        log_prob = (z.square() * -0.5 - log_std - _LOG_SQRT_TAU).sum(1)
-        entropy = (log_std.expand_as(z) + (0.5 + _LOG_SQRT_TAU)).sum(1)
+        log_prob = (z.square() * -0.5 - log_std - LOG_SQRT_TAU).sum(1)
+        entropy = (log_std.expand_as(z) + (0.5 + LOG_SQRT_TAU)).sum(1)
 
         advantages = batch["advantages"]
         if model.normalize_advantage and size > 1:

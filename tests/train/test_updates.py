@@ -5,13 +5,16 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rlctl.dict_spaces import split
 from rlctl.train.ppo_update import PpoUpdate
+from rlctl.train.sac_update import SacUpdate
+
+pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 
 VECTOR = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 ACTIONS = spaces.Box(-1, 1, (3,), np.float32)
@@ -74,7 +77,6 @@ PPO_CASES = {
 }
 
 
-@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 @pytest.mark.parametrize("name", PPO_CASES)
 def test_ppo_updates_as_sb3(name):
     one, other = make_ppo(**PPO_CASES[name]), make_ppo(**PPO_CASES[name])
@@ -89,8 +91,55 @@ def test_ppo_updates_as_sb3(name):
     assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
 
 
+def make_sac(observations=VECTOR, actions=ACTIONS, policy="MlpPolicy", network=None, **settings):
+    """A model with a replay buffer of made-up numbers."""
+    settings = {"batch_size": 16, "learning_rate": 1e-2, "buffer_size": 200, "seed": 0, **settings}
+    network = {"net_arch": [16, 16], **(network or {})}
+    envs = DummyVecEnv([lambda: Still(observations, actions)])
+    model = SAC(policy, envs, policy_kwargs=network, device="cpu", **settings)
+    model.set_logger(Logger(None, []))
+    rng, buffer = np.random.default_rng(0), model.replay_buffer
+    both = (buffer.observations, buffer.next_observations)
+    for rows in (*(part for each in both for part in split(each).values()), buffer.actions, buffer.rewards):
+        rows[...] = rng.uniform(-1, 1, rows.shape)
+    buffer.dones[...] = rng.random(buffer.dones.shape) < 0.1
+    buffer.full = True
+    return model
+
+
+SAC_CASES = {
+    "relu": {},
+    "tanh, another entropy, seldom followed": {
+        "network": {"activation_fn": torch.nn.Tanh},
+        "target_entropy": -1.0,
+        "target_update_interval": 3,
+    },
+    "gSDE": {"use_sde": True},
+    "gSDE, clipped mean": {"use_sde": True, "network": {"clip_mean": 0.02}},
+    "fixed entropy coefficient, three critics": {"ent_coef": 0.2, "network": {"n_critics": 3}},
+    "several steps": {"n_steps": 3},
+    "dict": {"observations": spaces.Dict({"a": VECTOR, "b": VECTOR}), "policy": "MultiInputPolicy"},
+}
+
+
+@pytest.mark.parametrize("name", SAC_CASES)
+def test_sac_updates_as_sb3(name):
+    one, other = make_sac(**SAC_CASES[name]), make_sac(**SAC_CASES[name])
+    before = weights(one)
+    assert SacUpdate.supports(other)
+    set_random_seed(1)
+    one.train(gradient_steps=7, batch_size=16)
+    set_random_seed(1)
+    SacUpdate(other).train(gradient_steps=7, batch_size=16)
+    assert_same_weights(weights(one), weights(other), before)
+    expected, logged = one.logger.name_to_value, other.logger.name_to_value
+    assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
+
+
 def test_what_sb3_updates_itself():
-    discrete = make_ppo(actions=spaces.Discrete(3))
-    image = make_ppo(spaces.Box(0, 255, (3, 36, 36), np.uint8), policy="CnnPolicy")
-    elu = make_ppo(network={"activation_fn": torch.nn.ELU})
-    assert [PpoUpdate.supports(model) for model in (discrete, image, elu)] == [False] * 3
+    image = spaces.Box(0, 255, (3, 36, 36), np.uint8)
+    elu = {"activation_fn": torch.nn.ELU}
+    ppo = [make_ppo(actions=spaces.Discrete(3)), make_ppo(image, policy="CnnPolicy"), make_ppo(network=elu)]
+    sac = [make_sac(image, policy="CnnPolicy"), make_sac(network=elu), make_sac(network={"net_arch": []})]
+    assert [PpoUpdate.supports(model) for model in ppo] == [False] * 3
+    assert [SacUpdate.supports(model) for model in sac] == [False] * 3
