@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import importlib.metadata
 import inspect
 import os
@@ -59,7 +60,24 @@ class TaskEntry:
 
 
 def list_installed() -> list[TaskEntry]:
-    """Return every installed task, by name; of two with one name the bundled one, or the first, can be used."""
+    """Return every installed task, by name; of two with one name the bundled one, or the first, can be used.
+
+    They are looked for anew where `sys.path`, or a folder on it, has changed.
+    """
+    return list(_list_installed(tuple((folder, _find_state(folder or os.curdir)) for folder in sys.path)))
+
+
+def _find_state(folder: str) -> tuple[int, ...]:
+    """Return which folder it is, and when something was added or removed; empty if it is none."""
+    try:
+        state = os.stat(folder)
+    except OSError:
+        return ()
+    return state.st_dev, state.st_ino, state.st_mtime_ns
+
+
+@functools.lru_cache(maxsize=4)
+def _list_installed(path: tuple[tuple[str, tuple[int, ...]], ...]) -> list[TaskEntry]:
     found: list[TaskEntry] = []
     seen: set[tuple[str, str]] = set()
     named: dict[Any, tuple[str, str]] = {}  # each look at a distribution's name or version reads its metadata anew
