@@ -37,7 +37,8 @@ FOR_WORKERS = (
 )
 FOR_COMMANDS = (
     *("torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
-    *("rlctl.eval.evaluate", "rlctl.run.torch_policy", "typer.rich_utils", "yaml", "onnx"),
+    *("rlctl.eval.evaluate", "rlctl.eval.report", "rlctl.run.torch_policy", "rlctl.tasks.listing"),
+    *("typer.rich_utils", "typer._adapters", "rich._emoji_codes", "yaml", "onnx"),
 )
 """What is imported when it is needed; one that is missing here costs time only."""
 HASH_SEED = "0"

@@ -80,9 +80,9 @@ def commands(page: Path) -> list[str]:
 @functools.cache
 def rlctl_command() -> Any:
     """Return the command that is made of all of them: it takes half a second."""
-    from rlctl.cli import app
+    from rlctl.cli import build_app
 
-    return typer.main.get_command(app)
+    return typer.main.get_command(build_app())
 
 
 def parse(words: list[str], command: Any = None) -> None:

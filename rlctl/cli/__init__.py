@@ -6,6 +6,7 @@ What a verb needs is imported inside its command, so that help, lists and comple
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterable
 from typing import Annotated
 
 import typer
@@ -14,18 +15,6 @@ from rlctl import __version__, error_boundary
 from rlctl.cli import check_env, eval, export, identify, replay, runs, serve, tasks, train
 from rlctl.errors import RlctlError
 
-app = typer.Typer(
-    name="rlctl",
-    help="Robot learning in simulation, end to end: check an environment, train, evaluate, export, replay.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={
-        "help_option_names": ["-h", "--help"],
-        # Typer hands over names without their dashes in front.
-        "token_normalize_func": lambda name: {"num-envs": "n-envs"}.get(name.replace("_", "-"), name.replace("_", "-")),
-    },
-)
-
 
 def _print_version(wanted: bool) -> None:
     if wanted:
@@ -33,7 +22,6 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _root(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
@@ -42,15 +30,42 @@ def _root(
     pass
 
 
-app.command("check-env")(check_env.check_env)
-app.command()(train.train)
-app.command("eval")(eval.evaluate)
-app.command()(export.export)
-app.command()(replay.replay)
-app.command()(serve.serve)
-app.command()(identify.identify)
-app.add_typer(tasks.app, name="tasks")
-app.add_typer(runs.app, name="runs")
+COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
+    "check-env": check_env.check_env,
+    "train": train.train,
+    "eval": eval.evaluate,
+    "export": export.export,
+    "replay": replay.replay,
+    "serve": serve.serve,
+    "identify": identify.identify,
+    "tasks": tasks.app,
+    "runs": runs.app,
+}
+
+
+def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
+    """Return the command line with some of the commands."""
+    app = typer.Typer(
+        name="rlctl",
+        help="Robot learning in simulation, end to end: check an environment, train, evaluate, export, replay.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings={
+            "help_option_names": ["-h", "--help"],
+            # Typer hands over names without their dashes in front.
+            "token_normalize_func": lambda name: {"num-envs": "n-envs"}.get(
+                name.replace("_", "-"), name.replace("_", "-")
+            ),
+        },
+    )
+    app.callback()(_root)
+    for name in names:
+        command = COMMANDS[name]
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name)
+        else:
+            app.command(name)(command)
+    return app
 
 
 def main() -> None:
@@ -64,6 +79,8 @@ def main() -> None:
 def run(arguments: list[str]) -> int:
     """Run a command line; return the exit code: the one error boundary."""
     try:
+        # Typer reads the options of every command it is given, which takes longer than most commands need to begin.
+        app = build_app(arguments[:1] if arguments and arguments[0] in COMMANDS else COMMANDS)
         code = app(arguments, standalone_mode=False)
         error_boundary.flush()
         return code if isinstance(code, int) else 0

@@ -282,9 +282,9 @@ def test_torch_compiler_is_not_imported(algo, tmp_path):
     # It takes longer than the rest of the start.
     code = """
 import sys
-from rlctl.cli import app
+from rlctl.cli import build_app
 try:
-    app()
+    build_app()()
 finally:
     assert "torch._dynamo" not in sys.modules
 """
