@@ -2,14 +2,13 @@ import json
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 
 from rlctl.errors import ArtifactError
 from rlctl.replay.curves import named_observations
 from rlctl.replay.rrd import write_rrd
 from rlctl.task import rough_heights
 from tests.replay.conftest import play, reach
-from tests.replay.reading import column, entities, properties, static
+from tests.replay.reading import column, entities, properties, reader, static
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +89,7 @@ def test_two_timelines_of_equal_length(recording):
 
 
 def test_no_wall_clock(recording):
-    timelines = {name for chunk in RrdReader(recording).stream() for name in chunk.timeline_names}
+    timelines = {name for chunk in reader(recording).stream() for name in chunk.timeline_names}
     assert timelines <= {"step", "sim_time"}
     assert "/__properties" not in entities(recording)
 
@@ -115,14 +114,14 @@ def test_properties_say_what_it_is(recording):
 
 
 def test_layout_is_in_the_file(recording):
-    assert len(RrdReader(recording).blueprints()) == 1
+    assert len(reader(recording).blueprints()) == 1
 
 
 def test_same_episode_same_recording_id(recording, tmp_path):
     write_rrd(tmp_path / "again.rrd", reach(5), title="again", warn=print)
     write_rrd(tmp_path / "other.rrd", reach(6), title="other", warn=print)
     ids = [
-        RrdReader(path).recordings()[0].recording_id
+        reader(path).recordings()[0].recording_id
         for path in (recording, tmp_path / "again.rrd", tmp_path / "other.rrd")
     ]
     assert ids[0] == ids[1] != ids[2]

@@ -1,8 +1,9 @@
 """The figures of a comparison, each with numbers from a formula or a published table."""
 
+import statistics
+
 import numpy as np
 import pytest
-from scipy.stats import mannwhitneyu, norm, trim_mean
 
 from rlctl.runs.statistics import (
     Verdict,
@@ -78,6 +79,8 @@ def test_probability_of_improvement_counts_ties_half():
 
 
 def test_figures_over_seeds_are_those_of_rliable():
+    from scipy.stats import mannwhitneyu, trim_mean
+
     # Its formulas: probability of improvement is Mann and Whitney's U over the number of pairs; the interval of the
     # interquartile mean is the percentile bootstrap over seeds of scipy's trim_mean(scores, 0.25).
     rng = np.random.default_rng(1)
@@ -91,7 +94,8 @@ def test_figures_over_seeds_are_those_of_rliable():
 
 def test_probability_of_improvement_of_normal_scores():
     # Of N(0, 1) and N(1, 1): P(Y > X) = Phi(1 / sqrt(2)) = 0.760250
-    scores = norm.ppf((np.arange(200) + 0.5) / 200)
+    normal = statistics.NormalDist()
+    scores = np.array([normal.inv_cdf((index + 0.5) / 200) for index in range(200)])
     assert seed_difference(scores, scores + 1.0).probability_of_improvement == pytest.approx(0.760250, abs=0.002)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from rlctl.deploy.identify.log import Array, Expected, Log
 from rlctl.deploy.identify.parameters import Unknowns
@@ -61,6 +60,8 @@ class Follower:
     """A world and a log; `compare` says how far apart they are for some values."""
 
     def __init__(self, env: TaskEnv, log: Log, unknowns: Unknowns) -> None:
+        from scipy.signal import savgol_filter
+
         self.unknowns = unknowns
         self._env = env
         self._log = log

@@ -10,7 +10,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from rlctl import errors
 from rlctl.deploy.identify.log import Array, Log
@@ -171,6 +170,8 @@ def _ask_fit(at: list[float], delay: int, weights: Array, evaluations: int) -> d
 
 def _make_trials(unknowns: Unknowns, seed: int) -> list[dict[str, Any]]:
     """Return points all over the ranges, with every delay in turn."""
+    from scipy.stats import qmc
+
     size = len(unknowns.parameters)
     delays = range(unknowns.longest_delay + 1)
     if size == 0:

@@ -7,7 +7,6 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from rlctl.deploy.identify.follow import Follower, open_world
 from rlctl.deploy.identify.log import Array, Log
@@ -67,6 +66,8 @@ def _fit(follower: Follower, at: Array, delay: int, weights: Array, evaluations:
     errors: Array
     derivatives: Array
     if len(at):
+        from scipy.optimize import least_squares
+
         found = least_squares(
             residuals,
             np.clip(at, 1e-6, 1 - 1e-6),
