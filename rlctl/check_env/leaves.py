@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from gymnasium import spaces
 
 Path = tuple[str | int, ...]
 NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)

@@ -17,8 +17,7 @@ from rlctl.check_env.messages import Built, End, Failure, Finished, Message, Mis
 from rlctl.check_env.progress import Position, Progress
 from rlctl.check_env.wire import decode
 from rlctl.env_spec import EnvSpec
-from rlctl.rollout.child_process import ChildProcess, LineReader
-from rlctl.rollout.shared_arrays import anonymous_file
+from rlctl.rollout.child_process import ChildProcess, LineReader, anonymous_file
 
 AT_ONCE = 2
 LEAST_REST_S = 4.0

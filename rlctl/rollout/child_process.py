@@ -110,6 +110,16 @@ def run_main(job: dict[str, Any]) -> None:
     getattr(importlib.import_module(module), name)(Connection(job["connection"]), **job["arguments"])
 
 
+def anonymous_file() -> int:
+    """Return the descriptor of a new file without a name."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("rlctl-workers")
+    import tempfile  # only where there is no memory for it
+
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
 class LineReader:
     """Hands each line that is written to `descriptor` to a function, in a thread of its own.
 

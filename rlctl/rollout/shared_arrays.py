@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import mmap
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -104,11 +103,3 @@ class SegmentArrays:
         self.truncated = arrays["segment/truncated"]
         self.terms = arrays["segment/terms"]
         """Raw reward terms, shape (n_envs, steps, terms), where they were to be recorded."""
-
-
-def anonymous_file() -> int:
-    """Return the descriptor of a new file without a name."""
-    if hasattr(os, "memfd_create"):
-        return os.memfd_create("rlctl-workers")
-    with tempfile.TemporaryFile() as file:
-        return os.dup(file.fileno())

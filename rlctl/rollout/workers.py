@@ -19,12 +19,13 @@ from rlctl.dict_spaces import Observations, join
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.rollout import goal_rewards, messages
+from rlctl.rollout.child_process import anonymous_file
 from rlctl.rollout.failures import format_hint, make_error
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
 from rlctl.rollout.policy_numbers import PolicyNumbers
 from rlctl.rollout.process_pool import ProcessPool, WorkerFault
 from rlctl.rollout.process_start import StartProcess
-from rlctl.rollout.shared_arrays import SharedArrays, anonymous_file
+from rlctl.rollout.shared_arrays import SharedArrays
 from rlctl.rollout.worker_output import write_stderr
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo

@@ -15,9 +15,9 @@ import numpy as np
 from gymnasium import spaces
 
 import rlctl
-from rlctl.rollout.child_process import ChildProcess
+from rlctl.rollout.child_process import ChildProcess, anonymous_file
 from rlctl.rollout.running_episode import RunningEpisode
-from rlctl.rollout.shared_arrays import Layout, anonymous_file, map_arrays
+from rlctl.rollout.shared_arrays import Layout, map_arrays
 
 
 class SteppingWorkers:

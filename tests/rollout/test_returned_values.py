@@ -6,9 +6,9 @@ import threading
 import pytest
 
 from rlctl.env_spec import EnvSpec
+from rlctl.rollout.child_process import anonymous_file
 from rlctl.rollout.failures import FailedInEpisode, describe_failure
 from rlctl.rollout.messages import Attach, Build, Failure, Job, LoadPolicy, Play, Segment
-from rlctl.rollout.shared_arrays import anonymous_file
 from rlctl.rollout.worker import Worker
 from rlctl.rollout.worker_output import MAX_LINE_BYTES, MAX_LINES_PER_S, forward, replace_control_characters
 from tests.train import faulty_envs
