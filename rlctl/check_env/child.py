@@ -16,9 +16,8 @@ from rlctl.check_env.experiment import Experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
 from rlctl.check_env.instance import Budget, Context
-from rlctl.check_env.messages import End, Failure, Finished, Message, Mistake, Skipped
+from rlctl.check_env.messages import End, Failure, Finished, Message, Mistake, Skipped, encode
 from rlctl.check_env.progress import Progress
-from rlctl.check_env.wire import encode
 from rlctl.errors import RecipeError, UsageError
 
 

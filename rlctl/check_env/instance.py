@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import inspect
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
@@ -159,3 +160,27 @@ def _accepts(env: Any, name: str) -> bool:
     except ValueError:  # not written in Python
         return True
     return any(each.name == name or each.kind is each.VAR_KEYWORD for each in parameters)
+
+
+def find_author(env: Any) -> Any:
+    """Return the object whose class the environment's author wrote: not rlctl's environment of a task, but the task."""
+    inner = getattr(env, "unwrapped", env)
+    return inner.task if is_task(env) else inner
+
+
+def is_task(env: Any) -> bool:
+    """Say whether it is an environment of a task of rlctl."""
+    task_env = sys.modules.get("rlctl.task.env")
+    return task_env is not None and isinstance(getattr(env, "unwrapped", env), task_env.TaskEnv)
+
+
+def find_time_limit(env: Any) -> int | None:
+    """Return after how many steps an environment says that its episodes end; None where it does not."""
+    if is_task(env):
+        return int(env.unwrapped.max_steps)
+    return getattr(getattr(env, "spec", None), "max_episode_steps", None)
+
+
+def rebuilds_world(env: Any) -> bool:
+    """Say whether it is a task that declares that every reset loads the world anew."""
+    return is_task(env) and not find_author(env).fast_reset

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import cProfile
 import dataclasses
+import functools
 import re
 import sys
+import sysconfig
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
@@ -15,11 +17,25 @@ from typing import Any
 
 from rlctl.check_env import bullet_calls
 from rlctl.check_env.clock import read_waited_s
+from rlctl.check_env.instance import find_author
 
 _BUILTIN = re.compile(
     r"<built-in method (?P<function>.+)>|<method '(?P<method>.+)' of '(?P<of>.+)' objects>|<(?P<bare>.+)>"
 )
 """How the profiler names functions that are not written in Python."""
+
+KINDS = {
+    "rendering": r"pybullet\.(getCameraImage|addUserDebug\w+)$|(matplotlib|pyglet|OpenGL|PIL\.ImageDraw)\.|"
+    r"pygame\.(draw|gfxdraw|display|font|transform|surface|Surface)\b|"
+    r"cv2\.(imshow|imwrite|line|circle|rectangle|polylines|fillPoly|putText|arrowedLine)$|"
+    r"mujoco\.(mjr_render|renderer\.)|gymnasium\.envs\.mujoco\.mujoco_rendering\.",
+    "sleeping": r"time\.sleep$|pygame\.time\.(wait|delay|Clock\.tick\w*)$|cv2\.waitKey\w*$",
+    "connecting": r"pybullet\.connect$",
+    "loading": r"pybullet\.(load(URDF|MJCF|SDF|SoftBody|Bullet|Texture|Plugin)|create(Collision|Visual)Shape\w*|"
+    r"createMultiBody|createSoftBody\w*|resetSimulation)$|mujoco\..*from_(xml|binary)\w*$|"
+    r"open$|(TextIOWrapper|Buffered\w+|FileIO)\.read\w*$",
+}
+"""What step and reset should not do, by patterns of the names of functions."""
 
 
 class Stopwatch:
@@ -65,10 +81,9 @@ class Profiler:
         finally:
             self._profile.disable()
 
-    def profile(self, is_own: Callable[[str], bool], kind_of: Callable[[str, bool], str]) -> Profile:
-        """Return where the time went. `is_own` says of a file whether it is the environment's own code; `kind_of` what
-        is suspicious about a function, given by its name and whether it is own code."""
-        return Profile(self._profile.getstats(), is_own, kind_of)
+    def profile(self, is_own: Callable[[str], bool]) -> Profile:
+        """Return where the time went; `is_own` says of a file whether it is the environment's own code."""
+        return Profile(self._profile.getstats(), is_own)
 
 
 @dataclasses.dataclass
@@ -84,7 +99,7 @@ class _Function:
 class Profile:
     """The functions that were called, and by whom."""
 
-    def __init__(self, stats: list[Any], is_own: Callable[[str], bool], kind_of: Callable[[str, bool], str]) -> None:
+    def __init__(self, stats: list[Any], is_own: Callable[[str], bool]) -> None:
         modules = {getattr(each, "__dict__", {}).get("__file__"): name for name, each in list(sys.modules.items())}
         self._functions: dict[Any, _Function] = {}
         self._callers: dict[Any, Counter[Any]] = defaultdict(Counter)
@@ -93,7 +108,7 @@ class Profile:
             own = isinstance(entry.code, CodeType) and is_own(entry.code.co_filename)
             name = _name_of(entry.code, own, modules)
             place = f"{Path(entry.code.co_filename).name}:{entry.code.co_firstlineno}" if own else ""
-            function = self._functions.setdefault(entry.code, _Function(name, place, kind_of(name, own)))
+            function = self._functions.setdefault(entry.code, _Function(name, place, _kind_of(name, own)))
             function.own_s += entry.inlinetime
             for each in entry.calls or ():
                 self._callers[each.code][entry.code] += each.totaltime
@@ -153,3 +168,28 @@ def _name_of(code: CodeType | str, own: bool, modules: dict[Any, str]) -> str:
         name = match["function"] or f"{match['of']}.{match['method']}"
     *parts, function = name.replace("<locals>.", "").removeprefix("builtins.").removeprefix("io.").split(".")
     return ".".join([*(each for each in parts if each and not each.startswith("_")), function])
+
+
+def find_own_code(env: Any) -> Callable[[str], bool]:
+    """Return what decides of a file whether it is the environment's own code, and no library's."""
+    import rlctl
+
+    paths = sysconfig.get_paths()
+    libraries = [str(Path(rlctl.__file__).parent), *(paths[name] for name in ("stdlib", "purelib", "platlib"))]
+    author = sys.modules.get(type(find_author(env)).__module__)
+    folder = str(Path(getattr(author, "__file__", None) or "/nowhere/at.all").parent)
+
+    @functools.cache
+    def is_own(file: str) -> bool:
+        if file.startswith(f"{folder}/"):
+            return True
+        return not file.startswith(("<", *(f"{each}/" for each in libraries))) and "site-packages" not in file
+
+    return is_own
+
+
+def _kind_of(name: str, own: bool) -> str:
+    """Return what is suspicious about a function: a key of `KINDS`, or nothing."""
+    if own:
+        return "rendering" if name.rpartition(".")[2] in ("render", "_render") else ""
+    return next((kind for kind, pattern in KINDS.items() if re.match(pattern, name)), "")

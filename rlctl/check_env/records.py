@@ -44,8 +44,8 @@ class Records:
     """Experiments that came to their end."""
     crashes: dict[str, str] = dataclasses.field(default_factory=dict)
     """Per experiment that crashed by itself, its traceback."""
-    normalizes: Callable[[], bool | None] = lambda: None
-    """Says whether the packaged recipe normalises observations; None without a recipe."""
+    normalizes_rewards: Callable[[], bool] = lambda: False
+    """Says whether there is a packaged recipe, and it normalises rewards."""
     printed_lines: int = 0
     """Lines that the environment of the first process wrote to stdout."""
     printed_first: str = ""

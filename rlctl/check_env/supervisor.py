@@ -13,9 +13,8 @@ from multiprocessing.connection import Connection, wait
 
 from rlctl.check_env import families
 from rlctl.check_env.clock import read_clock_of
-from rlctl.check_env.messages import Built, End, Failure, Finished, Message, Mistake
+from rlctl.check_env.messages import Built, End, Failure, Finished, Message, Mistake, decode
 from rlctl.check_env.progress import Position, Progress
-from rlctl.check_env.wire import decode
 from rlctl.env_spec import EnvSpec
 from rlctl.rollout.child_process import ChildProcess, LineReader, anonymous_file
 

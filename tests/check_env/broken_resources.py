@@ -103,11 +103,3 @@ class ClassObservations(Clean):
     def __init__(self):
         super().__init__()
         del self.observation_space
-
-
-class SharedGenerator(Clean):
-    generator = np.random.default_rng(0)
-
-    def __init__(self):
-        super().__init__()
-        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32, seed=self.generator)

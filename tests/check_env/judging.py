@@ -10,8 +10,8 @@ import pybullet
 
 from rlctl.check_env import child, families
 from rlctl.check_env.bullet_worlds import find_clients
+from rlctl.check_env.check import judge
 from rlctl.check_env.finding import RULES
-from rlctl.check_env.judge import judge
 from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
 

@@ -13,10 +13,9 @@ import pytest
 import sarif_pydantic
 
 from rlctl.check_env import families
-from rlctl.check_env.check import Report
+from rlctl.check_env.check import Report, Verdict, judge
 from rlctl.check_env.finding import FAMILIES, RULES, choose_rules, find_rule
 from rlctl.check_env.formats import FORMATS, choose, github, plain, rules, sarif, structured
-from rlctl.check_env.judge import Verdict, judge
 from rlctl.check_env.records import Records
 from rlctl.errors import UsageError
 from tests import fork_server

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rlctl.check_env import families, judge, wire
-from rlctl.check_env.check import check
+from rlctl.check_env import families
+from rlctl.check_env.check import check, judge
 from rlctl.check_env.experiment import Check
 from rlctl.check_env.finding import choose_rules
-from rlctl.check_env.messages import Fact, Series
+from rlctl.check_env.messages import Fact, Series, decode, encode
 from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, UsageError
@@ -116,7 +116,7 @@ def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
 def test_messages_arrive_as_they_were_sent():
     values = {0: Series(np.arange(3), np.zeros((3, 2), np.float32)), 1: Series(np.zeros(0, np.int64), np.array(True))}
     sent = Fact("numbers", {"tuple": (1, "two"), "series": values, "numpy": np.float64(0.5)})
-    received = wire.decode(wire.encode(sent))
+    received = decode(encode(sent))
     assert received.value["tuple"] == (1, "two")
     assert received.value["numpy"] == 0.5
     for key, series in values.items():
@@ -125,13 +125,13 @@ def test_messages_arrive_as_they_were_sent():
             assert (one.dtype, one.shape) == (other.dtype, other.shape)
             np.testing.assert_array_equal(one, other)
     with pytest.raises(TypeError, match="object cannot be sent"):
-        wire.encode(Fact("objects", np.array([None])))
+        encode(Fact("objects", np.array([None])))
 
 
 def test_a_rule_that_crashes_is_no_pass(monkeypatch):
     for rule in ("RL004", "RL306"):
         monkeypatch.setitem(families.CHECKS, rule, Check(rule, lambda records: [1 / 0], ()))
-    verdict = judge.judge(Records("any"), ["RL004", "RL306"])
+    verdict = judge(Records("any"), ["RL004", "RL306"])
     assert verdict.not_judged["RL306"] == "no instance could be built"
     assert "ZeroDivisionError" in verdict.crashed["RL004"]
     assert verdict.judged == []

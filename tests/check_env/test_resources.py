@@ -2,9 +2,9 @@
 
 import pytest
 
+from rlctl.check_env.check import judge
 from rlctl.check_env.families import isolation
 from rlctl.check_env.finding import NotJudged
-from rlctl.check_env.judge import judge
 from tests.check_env.judging import case, check_case, findings, records_of
 
 FILE = "broken_resources.py"
@@ -15,7 +15,6 @@ CASES = [
     case(f"{FILE}:KeepsMemory", ("RL405", "warning"), twin=f"{FILE}:Caches"),
     case(f"{FILE}:ClassSpaces", ("RL404", "warning")),
     case(f"{FILE}:ClassObservations", ("RL404", "info")),
-    case(f"{FILE}:SharedGenerator", ("RL404", "warning")),
 ]
 
 

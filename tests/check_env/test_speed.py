@@ -9,10 +9,9 @@ import time
 import numpy as np
 import pytest
 
+from rlctl.check_env.check import judge
 from rlctl.check_env.families.speed import Speed, format_speed, typical
 from rlctl.check_env.finding import choose_rules
-from rlctl.check_env.judge import judge
-from rlctl.check_env.own_code import kind_of
 from rlctl.check_env.profiling import Profiler, Stopwatch, TimedCall
 from rlctl.check_env.records import Records
 from tests.check_env.judging import case, check_case, shared_records_of
@@ -159,7 +158,7 @@ def profiled(function, repetitions=20):
     profiler = Profiler()
     for _ in range(repetitions):
         profiler(function)
-    return profiler.profile(lambda file: file == __file__, kind_of)
+    return profiler.profile(lambda file: file == __file__)
 
 
 def test_time_is_booked_on_who_takes_it():

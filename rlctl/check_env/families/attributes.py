@@ -63,36 +63,18 @@ def _count_windows() -> int:
 
 
 def _shared_spaces(one: Any, other: Any) -> Iterator[Finding]:
-    objects, generators = [], []
+    shared = []
     for name in ("action_space", "observation_space"):
-        a, b = getattr(one, name, None), getattr(other, name, None)
-        if a is not getattr(one, name, None):
-            yield _shared([name], f"{name} is a new object each time it is read, so that seeding it has no effect")
-        pairs = zip(_parts(a), _parts(b), strict=False)
-        if a is not None and a is b:
-            objects.append(name)
-        elif any(_generator(x) is _generator(y) is not None for x, y in pairs):
-            generators.append(name)
-    if objects:
-        yield _shared(objects, f"two instances have one object as {' and '.join(objects)}")
-    if generators:
-        named = " and ".join(f"the {name}'s random generator" for name in generators)
-        yield _shared(generators, f"two instances share {named}")
+        first, again, others = (getattr(each, name, None) for each in (one, one, other))
+        if first is not again:
+            yield _of_spaces([name], f"{name} is a new object each time it is read, so that seeding it has no effect")
+        elif first is others is not None:
+            shared.append(name)
+    if shared:
+        yield _of_spaces(shared, f"two instances have one object as {' and '.join(shared)}")
 
 
-def _generator(space: Any) -> Any:
-    return getattr(space, "np_random", None)
-
-
-def _parts(space: Any) -> Iterator[Any]:
-    """Yield a space and the spaces inside it."""
-    yield space
-    inner = getattr(space, "spaces", ())
-    for each in inner.values() if isinstance(inner, dict) else inner:
-        yield from _parts(each)
-
-
-def _shared(names: list[str], message: str) -> Finding:
+def _of_spaces(names: list[str], message: str) -> Finding:
     # Nobody samples observations.
     severity = Severity.WARNING if "action_space" in names else Severity.INFO
     return Finding("RL404", message, {"value": names, "expected": []}, severity)

@@ -12,9 +12,8 @@ from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.experiment import RECORDING, check, experiment
 from rlctl.check_env.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
 from rlctl.check_env.finding import Finding
-from rlctl.check_env.instance import Context, Instance
+from rlctl.check_env.instance import Context, Instance, find_author, find_time_limit, is_task
 from rlctl.check_env.messages import Built, Message
-from rlctl.check_env.own_code import find_author, find_time_limit, is_task
 from rlctl.check_env.records import Records
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
 

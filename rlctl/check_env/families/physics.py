@@ -17,9 +17,8 @@ from rlctl.check_env.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Body, Joint
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, list_names
-from rlctl.check_env.instance import Context
+from rlctl.check_env.instance import Context, is_task
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
-from rlctl.check_env.own_code import is_task
 from rlctl.check_env.world_logs import Log, LoggedWorld, Place, WorldLogger
 
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))

@@ -86,7 +86,7 @@ def _find_badly_scaled(records: Records) -> Iterator[Finding]:
     else:
         return
     evidence = largest.at(step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
-    yield Finding("RL603", message, evidence, Severity.INFO if records.normalizes() else Severity.WARNING)
+    yield Finding("RL603", message, evidence, Severity.INFO if records.normalizes_rewards() else Severity.WARNING)
 
 
 @check("RL612", *WITH_SEARCH)

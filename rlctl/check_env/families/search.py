@@ -20,9 +20,8 @@ from rlctl.check_env.actions import action_at, zero_action
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import experiment
 from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
-from rlctl.check_env.instance import Context
+from rlctl.check_env.instance import Context, find_time_limit
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
-from rlctl.check_env.own_code import find_time_limit
 from rlctl.check_env.recording import Recording
 from rlctl.check_env.rewarded import (
     DISCOUNT,

@@ -12,10 +12,9 @@ from rlctl.check_env.clock import read_clock
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.finding import Finding, NotJudged, Severity
-from rlctl.check_env.instance import Context, Instance
+from rlctl.check_env.instance import Context, Instance, rebuilds_world
 from rlctl.check_env.messages import Fact, Message
-from rlctl.check_env.own_code import find_own_code, kind_of, rebuilds_world
-from rlctl.check_env.profiling import Profiler, Stopwatch, TimedCall
+from rlctl.check_env.profiling import Profiler, Stopwatch, TimedCall, find_own_code
 from rlctl.check_env.records import Records
 
 FIRST_SPEED_SEED = 5000
@@ -86,7 +85,7 @@ def measure_speed(context: Context) -> Iterator[Message]:
             deadline = read_clock() + min(seconds / 4, PROFILED_S)
             _play(instance, *profilers, MOST_STEPS, deadline, only_reset=only_reset)
     is_own = find_own_code(instance.env)
-    in_step, in_reset = (each.profile(is_own, kind_of) for each in profilers)
+    in_step, in_reset = (each.profile(is_own) for each in profilers)
     yield Fact(
         "speed",
         Speed(
