@@ -8,14 +8,12 @@ interpreter in that everything is imported already, and in that no `atexit` func
 
 import contextlib
 import ctypes
-import fcntl
 import functools
 import gc
 import importlib
 import json
 import os
 import pkgutil
-import runpy
 import select
 import signal
 import socket
@@ -24,11 +22,11 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
-import traceback
 from pathlib import Path
 
+from rlctl.env_spec import EnvSpec
 from rlctl.rollout.process_start import set_default_start
+from tests.forked_process import SIGNALS, become
 
 ROOT = Path(__file__).parents[1]
 FOR_WORKERS = (
@@ -43,7 +41,6 @@ FOR_COMMANDS = (
 """What is imported when it is needed; one that is missing here costs time only."""
 HASH_SEED = "0"
 """Of all forks: that of check-env's processes but one."""
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PR_SET_CHILD_SUBREAPER = 36
 _MADV_COLLAPSE = 25
 _HUGE = 2**21  # bytes
@@ -250,7 +247,7 @@ def serve(connection, commands=False):
             # It ends at once, so that the new process gets the caller as its parent.
             received[0]["between"] = os.getpid()
             if os.fork() == 0:
-                _become(*received, write_end, commands)
+                become(*received, write_end, _start_own_server if commands else lambda: None)
             os._exit(0)
         os.close(write_end)
         for descriptor in received[1]:
@@ -262,79 +259,8 @@ def serve(connection, commands=False):
     os._exit(0)
 
 
-def _become(request, received, ready, commands):
-    """Be the new process; does not return."""
-    code = 70
-    try:
-        if request["session"]:
-            os.setsid()
-        elif request["process_group"] is not None:
-            os.setpgid(0, request["process_group"])
-        while os.getppid() == request["between"]:  # until it has ended
-            time.sleep(0.0001)
-        os.write(ready, struct.pack("i", os.getpid()))
-        _take_descriptors(request["descriptors"], received)
-        _take_surroundings(request)
-        if commands:
-            set_default_start(ForkServer.fork().start)
-        code = _run(request["command"][1:])
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(Exception):
-                stream.flush()
-        os._exit(code)
-
-
-def _take_descriptors(numbers, received):
-    lowest = max(*numbers, *received) + 1
-    moved = [fcntl.fcntl(each, fcntl.F_DUPFD, lowest) for each in received]
-    os.closerange(3, lowest)
-    for number, descriptor in zip(numbers, moved, strict=True):
-        os.dup2(descriptor, number)
-        os.close(descriptor)
-    sys.stdin = os.fdopen(0, closefd=False)
-    sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
-    sys.stderr = os.fdopen(2, "w", encoding="utf-8", errors="backslashreplace", buffering=1, closefd=False)
-
-
-def _take_surroundings(request):
-    os.chdir(request["cwd"])
-    os.environ.clear()
-    os.environ.update(request["env"])
-    os.sched_setaffinity(0, request["cores"])
-    signal.pthread_sigmask(signal.SIG_SETMASK, request["blocked"])  # first: what is held back must not end it
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    for number in SIGNALS[1:]:
-        signal.signal(number, signal.SIG_DFL)
-    first = os.getcwd() if request["command"][1] == "-m" else ""
-    given = [each for each in request["env"].get("PYTHONPATH", "").split(os.pathsep) if each]
-    sys.path[:] = [first, *given, *sys.path[1:]]
-    importlib.invalidate_caches()
-    import numpy as np
-
-    np.random.seed()  # noqa: NPY002 (every fork would draw the same)
-
-
-def _run(arguments):
-    """Run `-c code ...` or `-m module ...`; return the exit code."""
-    kind, what, *rest = arguments
-    sys.argv = [kind, *rest]
-    try:
-        if kind == "-m":
-            runpy.run_module(what, run_name="__main__", alter_sys=True)
-        else:
-            exec(compile(what, "<string>", "exec"), {"__name__": "__main__"})
-    except SystemExit as end:
-        if end.code is None or isinstance(end.code, int):
-            return end.code or 0
-        print(end.code, file=sys.stderr)
-        return 1
-    except BaseException:
-        traceback.print_exc()
-        return 1
-    return 0
+def _start_own_server():
+    set_default_start(ForkServer.fork().start)
 
 
 def _use_huge_pages():
@@ -349,6 +275,16 @@ def _use_huge_pages():
             madvise(first, max(0, last // _HUGE * _HUGE - first), _MADV_COLLAPSE)  # without effect before Linux 6.1
 
 
+def _read_messages():
+    """Read a message of each kind: the first one takes as long as a worker's start otherwise."""
+    from rlctl.rollout import messages
+
+    asked = messages.Build(EnvSpec("reach")), messages.Attach(1), messages.LoadPolicy(), messages.BeginEpisodes([])
+    for each in (*asked, messages.Play(messages.Segment(1), {}), messages.ComputeRewards()):
+        messages.decode(messages.encode(each))
+    messages.decode_answer(messages.encode(messages.Answer()))
+
+
 def main(descriptor, commands):
     """Import what the processes need, and serve."""
     for name in FOR_WORKERS + (FOR_COMMANDS if commands else ()):
@@ -358,6 +294,7 @@ def main(descriptor, commands):
 
         for module in pkgutil.iter_modules(rlctl.train.__path__, "rlctl.train."):
             importlib.import_module(module.name)
+    _read_messages()
     gc.collect()
     gc.freeze()
     _use_huge_pages()
