@@ -136,12 +136,7 @@ def _status(task: str, wanted: bool) -> Iterator[Callable[[Position], None]]:
         yield lambda position: None
         return
     with console.status(f"checking {task}") as status:
-
-        def say(position: Position) -> None:
-            number = f" {position.episode + 1}" if position.phase == "episodes" else ""
-            status.update(f"checking {task}: {position.phase}{number}")
-
-        yield say
+        yield lambda position: status.update(f"checking {task}: {position.phase}")
 
 
 def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> Verdict:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import itertools
 import json
 import math
 import struct
@@ -45,6 +46,8 @@ class Built:
     """The time limit it declares [steps]."""
     nondeterministic: bool = False
     """Whether its Gymnasium registration says that equal seeds may give unequal episodes."""
+    truncation: str = "unknown"
+    """What the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
     accepts_seed: bool = True
     accepts_options: bool = True
     uses_pybullet: bool = False
@@ -55,14 +58,19 @@ class Built:
     """Where its class is written."""
     line: int | None = None
 
+    @property
+    def parts(self) -> dict[str, slice]:
+        """The parts of a flat observation by name; empty where names are not known."""
+        ends = list(itertools.accumulate(self.names.values()))
+        if len(self.leaves) != 1 or not ends or ends[-1] != int(np.prod(self.leaves[0].shape)):
+            return {}
+        return {name: slice(end - size, end) for (name, size), end in zip(self.names.items(), ends, strict=True)}
+
     def element(self, leaf: int, index: int) -> str:
         """Name one number of an observation by the place of its array and its flat index."""
-        if len(self.leaves) == 1 and sum(self.names.values()) == int(np.prod(self.leaves[0].shape)):
-            offset = index
-            for name, size in self.names.items():
-                if offset < size:
-                    return f"{name}[{offset}]" if size > 1 else name
-                offset -= size
+        for name, part in self.parts.items():
+            if index < part.stop:
+                return name if part.stop - part.start == 1 else f"{name}[{index - part.start}]"
         return name_element(self.leaves[leaf], index)
 
 

@@ -19,8 +19,6 @@ from rlctl.env_spec import EnvSpec
 from rlctl.rollout.child_process import ChildProcess, LineReader, anonymous_file
 
 AT_ONCE = 2
-LEAST_REST_S = 4.0
-"""A process that goes on for another one gets this much in any case [s]."""
 BUILD_TIMEOUT_S = 60.0
 """How long importing and building may take, unless a step may take longer."""
 FIRST_CALL_TIMEOUT_S = 30.0
@@ -66,14 +64,12 @@ class Child:
         for reader in self._readers:
             reader.close_descriptor()
         self._changed = (-1, self._clock)
-        self.ends_at = self._clock + seconds
-        """On the process's own clock [s]."""
 
     def _count(self, line: str) -> None:
         if line and not line.startswith(_PYBULLETS):
             self.printed += 1
             self.first_line = self.first_line or line
-            self.last_lines.append(line)
+        self._keep(line)
 
     def _keep(self, line: str) -> None:
         if line and not line.startswith(_PYBULLETS):
@@ -91,11 +87,6 @@ class Child:
             self._changed = (position.counter, self._clock)
         limit_s = _limit_s(position, env_timeout_s)
         return f"did not come back in {limit_s:g} s" if self._clock - self._changed[1] > limit_s else None
-
-    @property
-    def seconds_left(self) -> float:
-        """What is left of its budget [s]."""
-        return self.ends_at - self._clock
 
     @property
     def _clock(self) -> float:
@@ -149,8 +140,7 @@ class Supervisor:
         self._waiting: dict[str, list[str]] = {}
         self._active: dict[Connection, Child] = {}
         self._has_built = False
-        self._seconds_left: dict[str, float] = {}
-        """Of the processes that were started again."""
+        self._started_again: set[str] = set()
         self.children: list[Child] = []
         """Those that were started, the first process first."""
 
@@ -176,8 +166,7 @@ class Supervisor:
     def _start(self) -> None:
         while self._waiting and len(self._active) < (AT_ONCE if self._has_built else 1):
             name = next(iter(self._waiting))
-            seconds = self._seconds_left.get(name, self._budget_s)
-            child = Child(name, self._spec, self._waiting.pop(name), seconds)
+            child = Child(name, self._spec, self._waiting.pop(name), self._budget_s)
             self.children.append(child)
             self._active[child.process.connection] = child
 
@@ -215,6 +204,6 @@ class Supervisor:
     def _start_again(self, child: Child) -> None:
         """Have a new process do what is left of one that died or hung, once, if the environment worked before."""
         rest = child.experiments[1:]
-        if rest and child.has_finished_one and child.name not in self._seconds_left:
-            self._seconds_left[child.name] = max(LEAST_REST_S, child.seconds_left)
+        if rest and child.has_finished_one and child.name not in self._started_again:
+            self._started_again.add(child.name)
             self._waiting = {child.name: rest, **self._waiting}

@@ -2,17 +2,18 @@
 
 **An experiment** does something with an environment in a child process and yields what it finds:
 
-    @experiment("attributes", "RL404", "RL216", share=0.5)
-    def look_at_attributes(context: Context) -> Iterator[Message]:
-        with context.fresh() as instance:
+    @experiment("rendering", "RL215", share=0.5)
+    def render(context: Context) -> Iterator[Message]:
+        with context.fresh("rgb_array") as instance:
             instance.reset(FIRST_SEED)
-            yield Finding("RL216", "PyBullet was connected with a window", {"value": "GUI"})
+            if not isinstance(picture := instance.call("render", instance.env.render), np.ndarray):
+                yield Finding("RL215", "render returns no array", {"value": str(picture)})
 
 It decides the rules that it names: they are judged when it comes to its end. `raise NotJudged(why)` or
 `NotApplicable(why)` says so of all its rules without a finding, `yield Skipped("RL404", why)` of one of them. It calls
 the environment through `Instance.call`, `Instance.reset` and `Episode` only, so that what the environment raises is an
-`EnvironmentRaised`, which need not be caught, and a hang or a crash can be placed. `context.budget` is the time there
-is.
+`EnvironmentRaised`, which need not be caught, and a hang or a crash can be placed. `context.budget` is what there is of
+time and memory.
 
 **A check** judges one rule in the parent process, from recorded episodes, which many rules share:
 
@@ -21,9 +22,8 @@ is.
         for each in records.episodes: ...
 
 It names the experiments that it needs (by default those that record the common episodes, `RECORDING`) and raises
-`NotJudged` or `NotApplicable`. A rule may have both, and then has the findings of both. What a check needs of an
-experiment besides episodes is a `Fact`: `yield Fact("truncation", "never")`, then `records.require_fact("truncation",
-"attributes")`. A recording experiment yields what `Recording.run()` returns.
+`NotJudged` or `NotApplicable`. A rule may have both, and then has the findings of both. A recording experiment yields
+what `Recording.run()` returns.
 
 **Texts** (name, severity, meaning, fix) are in `rules.yaml`, not here. A finding gives its own severity or fix only
 where they differ from the rule's. Every check and experiment of a module in `MODULES` counts; the order of experiments
@@ -38,7 +38,6 @@ from collections.abc import Collection, Iterable
 from rlctl.check_env.experiment import Check, Experiment
 from rlctl.check_env.families import (
     actions,
-    attributes,
     determinism,
     episodes,
     features,
@@ -88,9 +87,8 @@ PROCESSES = {
             seeding.compare_unseeded,
             physics.watch_worlds,
             actions.compare_actions,
-            attributes.read_attributes,
             variants.play_variants,
-            attributes.render,
+            interface.render,
         ),
         hash_seed=1,  # another one, so that hash order shows
     ),
@@ -98,7 +96,7 @@ PROCESSES = {
 """The child processes."""
 
 MODULES = (
-    *(loading, observations, features, interface, attributes, determinism, seeding, isolation, episodes),
+    *(loading, observations, features, interface, determinism, seeding, isolation, episodes),
     *(rewards, incentives, actions, physics, speed, variants),
 )
 

@@ -129,7 +129,7 @@ def _find_end_at_once(records: Records) -> Iterator[Finding]:
         yield Finding("RL504", message, {"step": 1, "episodes": len(episodes)})
 
 
-@check("RL506", "episodes", "search", "attributes")
+@check("RL506", "episodes", "search")
 def _find_no_time_limit(records: Records) -> Iterator[Finding]:
     built, episodes = records.require_built(), _require_episodes(records)
     if built.max_steps is not None or any(each.ended != "terminated" for each in episodes):
@@ -141,11 +141,10 @@ def _find_no_time_limit(records: Records) -> Iterator[Finding]:
     _require_two_flags(records)
     if list(_find_time_limit_as_terminated.run(records)):
         raise NotJudged("a time limit seems to be flagged as terminated (RL501)")
-    truncation = records.require_fact("truncation", "attributes")
-    if truncation == "computed":
+    if built.truncation == "computed":
         return  # its limit was not reached
-    why = "step always returns truncated=False" if truncation == "never" else "none is declared or was reached"
+    why = "step always returns truncated=False" if built.truncation == "never" else "none is declared or was reached"
     message = f"no time limit: {why}; all {len(episodes)} episodes ended with terminated=True, the longest after "
     evidence = {"episodes": len(episodes), "value": None, "expected": "max_episode_steps", "step": max(lengths)}
-    severity = Severity.WARNING if is_continuous and truncation == "never" else Severity.INFO
+    severity = Severity.WARNING if is_continuous and built.truncation == "never" else Severity.INFO
     yield Finding("RL506", f"{message}{max(lengths)} steps", evidence, severity)

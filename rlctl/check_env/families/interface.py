@@ -1,13 +1,25 @@
-"""RL2: the interface: what reset and step take and return, and that they come back."""
+"""RL2, the interface: what reset, step and render take and return, that they come back, and unasked windows."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from typing import Any
 
-from rlctl.check_env.experiment import RECORDING, check
-from rlctl.check_env.failures import lacks_display
-from rlctl.check_env.finding import Finding, Severity
-from rlctl.check_env.messages import Failure, Form, Trajectory
+import numpy as np
+
+from rlctl.check_env.experiment import RECORDING, check, experiment
+from rlctl.check_env.failures import (
+    NO_DISPLAY,
+    EnvironmentRaised,
+    describe,
+    find_missing_file,
+    iterate_causes,
+    lacks_display,
+)
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.instance import Context
+from rlctl.check_env.messages import FIRST_SEED, Failure, Form, Message, Trajectory
 from rlctl.check_env.records import Records
 
 NUMBERS = ("float", "int", "numpy.float64")
@@ -21,6 +33,14 @@ RENDERING = "rendering"
 """The experiment that renders."""
 OF_OTHER_RULES = ("interleaved", "after close", RENDERING)
 """Where a failure is the matter of RL401, RL402 and RL215."""
+PICTURE = "a uint8 array of shape (height, width, 3)"
+"""What `render` returns in the mode rgb_array."""
+NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)
+"""What is raised where this machine has no graphics: whether it works elsewhere is not known."""
+NO_GRAPHICS_FIX = (
+    "Render without a display: with MuJoCo set MUJOCO_GL=egl (or osmesa), with pygame SDL_VIDEODRIVER=dummy; with "
+    "PyBullet use getCameraImage(renderer=p.ER_TINY_RENDERER)."
+)
 
 
 @check("RL201")
@@ -117,3 +137,63 @@ def _find_prints(records: Records) -> Iterator[Finding]:
         message = f"{lines} lines on stdout in {steps} steps, the first: {records.printed_first[:80]!r}"
         severity = Severity.WARNING if steps >= FEWEST_STEPS and lines > max(20, MANY_LINES * steps) else None
         yield Finding("RL211", message, {"value": lines, "expected": 0}, severity)
+
+
+@experiment(RENDERING, "RL215")
+def render(context: Context) -> Iterator[Message]:
+    """Try the mode rgb_array, which opens no window, on an instance of its own, where it is promised."""
+    with context.fresh() as instance:
+        metadata = getattr(instance.env, "metadata", None)
+    modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
+    if not isinstance(modes, (list, tuple, set)) or "rgb_array" not in modes:
+        raise NotApplicable(f"metadata does not promise the render mode rgb_array (render_modes: {modes})")
+    try:
+        with context.fresh("rgb_array") as instance:
+            instance.reset(FIRST_SEED)
+            picture = instance.call("render", instance.env.render)
+    except EnvironmentRaised as error:
+        cause = error.__cause__ or error
+        if find_missing_file(cause) is not None:
+            raise NotJudged("a file that the environment loads is missing (RL007)") from None
+        if _lacks_library(cause):
+            raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
+        call = "the constructor" if error.call == "build" else error.call
+        message = f"with render_mode='rgb_array' {call} raises {describe(cause)}"
+        is_here = NO_GRAPHICS.search(describe(cause)) is not None
+        severity, fix = (Severity.INFO, NO_GRAPHICS_FIX) if is_here else (None, "")
+        yield Finding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity, fix)
+        return
+    if wrong := _describe_wrong_picture(picture):
+        message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"
+        yield Finding("RL215", message, {"value": wrong, "expected": PICTURE})
+
+
+def _lacks_library(error: BaseException) -> bool:
+    """Say whether a library is missing: that is this machine's fault, not the environment's."""
+    return any(
+        isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in iterate_causes(error)
+    )
+
+
+def _describe_wrong_picture(picture: Any) -> str:
+    if not isinstance(picture, np.ndarray):
+        return f"a {type(picture).__name__}"
+    fine = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
+    return "" if fine else f"an array of {picture.dtype} and shape {picture.shape}"
+
+
+@check("RL215", RENDERING)
+def _find_end_in_rendering(records: Records) -> Iterator[Finding]:
+    for failure in records.failures:
+        if failure.phase == RENDERING and failure.kind in ("died", "hung"):
+            yield Finding("RL215", f"rendering without a window: {failure.message}", failure.place, Severity.ERROR)
+
+
+@check("RL216", *RECORDING)
+def _find_lost_display(records: Records) -> Iterator[Finding]:
+    for failure in records.failures:
+        if lacks_display(failure):
+            line = next(line for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)).strip()
+            yield Finding("RL216", f"{failure.message}, for want of a display: {line!r}", failure.place)
+            return
+    records.require_built()

@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.episode import Episode
@@ -48,7 +49,7 @@ LEAKS = {
 _PROCESS = Path("/proc/self")
 
 
-@experiment("instances", share=10.0)
+@experiment("instances", "RL404", share=10.0)
 def compare_instances(context: Context) -> Iterator[Message]:
     """Play on three instances: one alone, one after it, and two side by side of which one is closed."""
     progress, budget = context.progress, context.budget
@@ -70,14 +71,18 @@ def compare_instances(context: Context) -> Iterator[Message]:
     neighbour = context.build()
     yield from begin(neighbour, "fresh instance", FIRST_SEED).run()
     if budget.seconds_left < 0:
-        for role in ("interleaved", "interleaved second", "after close"):
-            yield Skipped(role, "building and stepping the first two instances took all the time there is for them")
+        for left_out in ("interleaved", "interleaved second", "after close", "RL404"):
+            yield Skipped(left_out, "building and stepping the first two instances took all the time there is for them")
         yield from context.close(neighbour)
         return
 
     # From here on each instance has played the same episodes, in the same order, as `first` had.
     progress.phase("interleaved")
     survivor = context.build()
+    if survivor.is_env:
+        yield from _shared_spaces(survivor.env, neighbour.env)
+    else:
+        yield Skipped("RL404", "it is not a gymnasium.Env (RL003)")
     pair = begin(survivor, "interleaved", FIRST_SEED), begin(neighbour, "interleaved second", SECOND_SEED)
     progress.phase("interleaved")
     while any(recording.running for recording in pair):
@@ -155,6 +160,24 @@ def _find_single_instance(records: Records) -> Iterator[Finding]:
             where = "in one process" if failure.phase in ("fresh instance", "interleaved") else "in a second process"
             yield Finding("RL403", f"a second instance {where} cannot be built: {failure.error}", failure.place)
             return
+
+
+def _shared_spaces(one: Any, other: Any) -> Iterator[Finding]:
+    shared = []
+    for name in ("action_space", "observation_space"):
+        first, again, others = (getattr(each, name, None) for each in (one, one, other))
+        if first is not again:
+            yield _of_spaces([name], f"{name} is a new object each time it is read, so that seeding it has no effect")
+        elif first is others is not None:
+            shared.append(name)
+    if shared:
+        yield _of_spaces(shared, f"two instances have one object as {' and '.join(shared)}")
+
+
+def _of_spaces(names: list[str], message: str) -> Finding:
+    # Nobody samples observations.
+    severity = Severity.WARNING if "action_space" in names else Severity.INFO
+    return Finding("RL404", message, {"value": names, "expected": []}, severity)
 
 
 @dataclasses.dataclass

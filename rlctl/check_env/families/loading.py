@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import re
+import sys
+import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -21,7 +24,7 @@ WAIVERS = "rlctl_ignore"
 """The class attribute that waives rules: rule id -> reason."""
 
 
-@experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", share=0.0)
+@experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL216", share=0.0)
 def build(context: Context) -> Iterator[Message]:
     """Build the first instance, which the process keeps. Raises `UsageError` for a name that does not exist."""
     try:
@@ -35,6 +38,8 @@ def build(context: Context) -> Iterator[Message]:
         return
     yield describe_built(instance)
     yield from _base_class(instance)
+    if _count_windows():
+        yield Finding("RL216", "PyBullet was connected with a window (p.GUI)", {"value": "GUI", "expected": "DIRECT"})
 
 
 def _explain(context: Context, error: RlctlError) -> Finding:
@@ -83,6 +88,14 @@ def _base_class(instance: Instance) -> Iterator[Finding]:
             yield Finding("RL003", f"there is no {name}_space")
 
 
+def _count_windows() -> int:
+    pybullet = sys.modules.get("pybullet")
+    if pybullet is None:
+        return 0
+    methods = [pybullet.getConnectionInfo(physicsClientId=each)["connectionMethod"] for each in find_clients()]
+    return methods.count(pybullet.GUI)
+
+
 @check("RL004", "build")
 def _find_end_while_loading(records: Records) -> Iterator[Finding]:
     if records.built is None:
@@ -123,6 +136,7 @@ def describe_built(instance: Instance) -> Built:
         events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
         max_steps=find_time_limit(env),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
+        truncation=_read_truncation(inner),
         accepts_seed=instance.accepts_seed,
         accepts_options=instance.accepts_options,
         uses_pybullet=bool(find_clients()),
@@ -154,3 +168,21 @@ def _short(space: Any) -> str:
         return text
     shape = getattr(space, "shape", None)
     return f"{type(space).__name__}{shape or ''}"
+
+
+def _read_truncation(env: Any) -> str:
+    """Return what the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
+    try:
+        nodes = list(ast.walk(ast.parse(textwrap.dedent(inspect.getsource(type(env).step)))))
+    except (AttributeError, OSError, TypeError, SyntaxError):
+        return "unknown"
+    returned = [node.value for node in nodes if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple)]
+    flags = [ast.unparse(each.elts[3]) for each in returned if len(each.elts) == 5]
+    assigned: dict[str, set[str]] = {}
+    for node in nodes:
+        if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign) and node.value is not None:
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                assigned.setdefault(ast.unparse(target), set()).add(ast.unparse(node.value))
+    if not flags:
+        return "unknown"
+    return "never" if all(assigned.get(flag, {flag}) == {"False"} for flag in flags) else "computed"

@@ -11,7 +11,7 @@ from rlctl.check_env.bullet_calls import visible_to_profilers
 from rlctl.check_env.clock import read_clock
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
-from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.finding import Finding, NotJudged, list_names
 from rlctl.check_env.instance import Context, Instance, rebuilds_world
 from rlctl.check_env.messages import Fact, Message
 from rlctl.check_env.profiling import Profiler, Stopwatch, TimedCall, find_own_code
@@ -38,8 +38,7 @@ SLOW_LOADING_S = 0.005
 """Loading in a reset that takes less is not reported, whatever its share of short episodes: PyBullet's resetSimulation
 of an empty world alone takes half a millisecond [s]."""
 LITTLE_LOADING = 0.05
-"""Share of an episode below which loading in reset for more than `SLOW_LOADING_S` is an info: environments
-that are stepped together wait for the one that resets, but rarely."""
+"""Share of an episode below which loading in reset is not reported."""
 MOST_LOADING = 0.2
 """Share of a step that loading or reading files takes from which that is a finding."""
 LEAST_DRAWING = 0.05
@@ -167,21 +166,18 @@ def _find_loading(records: Records) -> Iterator[Finding]:
         ("reset", reset_s, "an episode", reset_s + steps * step_s),
         ("step", step_s, "its time", step_s),
     ):
-        if not (calls := _loading(speed, call)):
-            continue
+        calls = _loading(speed, call)
         seconds = call_s * _share(calls)
         share = seconds / whole_s if whole_s else 0.0
         connects = any(each.kind == "connecting" for each in calls)
-        named = sorted(calls, key=lambda each: (each.kind != "connecting", -each.share))
-        more = f" and {len(named) - NAMED_CALLS} more" if len(named) > NAMED_CALLS else ""
-        is_rare = call == "reset" and not connects and share < LITTLE_LOADING
-        yield Finding(
-            "RL904",
-            f"{call} calls {', '.join(f'{each.name}{_at(each)}' for each in named[:NAMED_CALLS])}{more}: "
-            f"{_time(seconds)} per {call}, {share:.0%} of {part}",
-            {"call": call, "value": [each.name for each in named], "ms": 1e3 * seconds, "share": share},
-            Severity.INFO if is_rare else Severity.WARNING,
-        )
+        if calls and (connects or call == "step" or share >= LITTLE_LOADING):
+            named = sorted(calls, key=lambda each: (each.kind != "connecting", -each.share))
+            names = list_names([f"{each.name}{_at(each)}" for each in named], NAMED_CALLS)
+            yield Finding(
+                "RL904",
+                f"{call} calls {names}: {_time(seconds)} per {call}, {share:.0%} of {part}",
+                {"call": call, "value": [each.name for each in named], "ms": 1e3 * seconds, "share": share},
+            )
 
 
 def format_speed(records: Records) -> str:

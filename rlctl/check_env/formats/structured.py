@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +125,7 @@ def observation_rows(records: Records) -> list[Row]:
         if built is not None and leaf.supported:
             values = [each.observations[index].values for each in records.alone if index in each.observations]
             flat = [each.reshape(len(each), -1).astype(np.float64) for each in values if each.size]
-            rows += [_row(name, leaf, part, flat) for name, part in _parts(built, leaf)]
+            rows += [_row(name, leaf, part, flat) for name, part in _parts(built, leaf).items()]
     return rows
 
 
@@ -137,18 +136,11 @@ def action_rows(records: Records) -> list[Row]:
     return [_row(name, leaf, slice(None), []) for name, leaf in named]
 
 
-def _parts(built: Built, leaf: Leaf) -> Iterator[tuple[str, slice]]:
+def _parts(built: Built, leaf: Leaf) -> dict[str, slice]:
     size = int(np.prod(leaf.shape))
-    if len(built.leaves) == 1 and sum(built.names.values()) == size:
-        start = 0
-        for name, length in built.names.items():
-            yield name, slice(start, start + length)
-            start += length
-    elif not leaf.path and leaf.shape and size <= ELEMENTS_SHOWN:
-        for i in range(size):
-            yield built.element(0, i), slice(i, i + 1)
-    else:
-        yield name_leaf(leaf), slice(0, size)
+    if leaf.path or not leaf.shape or size > ELEMENTS_SHOWN:
+        return built.parts or {name_leaf(leaf): slice(0, size)}
+    return built.parts or {built.element(0, i): slice(i, i + 1) for i in range(size)}
 
 
 def _row(name: str, leaf: Leaf, part: slice, values: list[NDArray[np.float64]]) -> Row:
