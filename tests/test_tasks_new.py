@@ -176,5 +176,5 @@ def test_from_the_wheel_to_a_policy(tmp_path):
     run("pytest", "-q", "-p", "no:cacheprovider", tmp_path / "my-arm", cwd=empty, path=site)
     for seed in range(3):
         result = json.loads(run("rlctl", "train", "my-arm", "--seed", seed, "--json", "-", cwd=empty, path=site))
-        assert result["best"]["episodes"] == 100
+        assert result["best"]["episodes"] == 40
         assert result["best"]["success_rate"] >= 0.95

@@ -55,7 +55,7 @@ class Evaluation(_Section):
         None, ge=1, le=_MOST_STEPS, json_schema_extra=decide_by("a tenth of total_timesteps")
     )
     """Steps between evaluations."""
-    episodes: Whole = Field(100, ge=1, le=1_000_000)
+    episodes: Whole = Field(20, ge=1, le=1_000_000)
     """Episodes per evaluation, the same seeds each time."""
     deterministic: Switch = True
     """Whether to take the mean action, and not a sample."""
