@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.actions import actions, build_action
-from rlctl.check_env.episode import Episode, Moment
+from rlctl.check_env.episode import Episode, Moment, build_action, draw_actions
 from rlctl.check_env.finding import NotJudged
 from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.leaves import Leaf, flatten_action, flatten_numbers, name_element, pick
@@ -100,7 +99,7 @@ class Trials:
 
     def actions(self, seed: int, steps: int) -> list[Any]:
         """Return the actions of an episode before they are changed."""
-        chosen = actions(self.instance.env.action_space, "random", seed)
+        chosen = draw_actions(self.instance.env.action_space, "random", seed)
         return self.instance.call("sample", lambda: list(itertools.islice(chosen, steps)))  # type: ignore[no-any-return]
 
     def plain(self, seed: int, steps: int) -> list[Frame]:

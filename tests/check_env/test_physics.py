@@ -41,7 +41,7 @@ def the_finding(name):
 def test_joint_beyond_its_limits_is_placed():
     finding = the_finding("BeyondLimits")
     # Actions are within +-1, and an action of 1 sets 1.8 rad.
-    assert finding.evidence["joint"] == "shoulder"
+    assert finding.evidence["joint"] == "shoulder of cart"
     assert finding.evidence["expected"] == [-1.0, 1.0]
     assert abs(finding.evidence["value"]) == pytest.approx(1.8)
     assert finding.evidence["actions"] == "extreme"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rlctl.check_env.actions import action_at
+from rlctl.check_env.episode import action_at
+from rlctl.check_env.families.rewards import discounted_steps, discounted_sum
 from rlctl.check_env.families.search import compare_returns
-from rlctl.check_env.rewarded import discounted_steps, discounted_sum
 from tests.check_env.judging import case, check_case, findings, found, rules_of, shared_records_of
 
 BROKEN = "broken_rewards.py"

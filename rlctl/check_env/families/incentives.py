@@ -9,12 +9,7 @@ from numpy.typing import NDArray
 
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.experiment import check, experiment
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
-from rlctl.check_env.instance import Context
-from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
-from rlctl.check_env.recording import Recording
-from rlctl.check_env.records import Records
-from rlctl.check_env.rewarded import (
+from rlctl.check_env.families.rewards import (
     DISCOUNT,
     SUCCESS,
     WITH_SEARCH,
@@ -31,6 +26,11 @@ from rlctl.check_env.rewarded import (
     require_rewarded,
     summarize,
 )
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.instance import Context
+from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
+from rlctl.check_env.recording import Recording
+from rlctl.check_env.records import Records
 
 LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5
 """Part of all rewards that the last one of an episode is as good as, from which its end looks like a goal, or like

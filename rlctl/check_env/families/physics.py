@@ -151,6 +151,7 @@ def _longest_row(is_deep: Sequence[bool]) -> list[int]:
 
 
 def _joint_limits(world: LoggedWorld) -> Iterator[Finding]:
+    """Yield the joint that is farthest outside its limits."""
     found: list[tuple[float, str, Joint, int, Place, float]] = []
     for log in world.logs:
         for body, states in log.bodies:
@@ -159,25 +160,18 @@ def _joint_limits(world: LoggedWorld) -> Iterator[Finding]:
                 outside = _outside(joint, positions)
                 steps, row = int((outside > 0).sum()), int(outside.argmax())
                 if steps >= LASTING_STEPS:
-                    place = log.places[row]
-                    found.append((float(outside[row]), body.name, joint, steps, place, float(positions[row])))
+                    name, place = f"{joint.name} of {body.name}", log.places[row]
+                    found.append((float(outside[row]), name, joint, steps, place, float(positions[row])))
     found.sort(key=lambda each: -each[0])
-    for name in dict.fromkeys(each[1] for each in found):
-        _, _, joint, steps, place, value = next(each for each in found if each[1] == name)
-        others = list(dict.fromkeys(each[2].name for each in found if each[1] == name))[1:]
+    names = list(dict.fromkeys(each[1] for each in found))
+    for _, name, joint, steps, place, value in found[:1]:
         unit = "rad" if joint.is_angle else "m"
-        more = f"; so {'are' if len(others) > 1 else 'is'} {list_names(others, MOST_NAMES)}" if others else ""
+        more = f"; outside of theirs are {list_names(names[1:], MOST_NAMES)}" if names[1:] else ""
         yield Finding(
             "RL804",
-            f"{joint.name} of {name} is at {value:.3g} {unit} {_when(place)}; its limits are [{joint.low:.3g}, "
-            f"{joint.high:.3g}] {unit}; it is outside by much in {steps} steps{more}",
-            {
-                **place,
-                "joint": joint.name,
-                "value": value,
-                "expected": [joint.low, joint.high],
-                "other_joints": others,
-            },
+            f"{name} is at {value:.3g} {unit} {_when(place)}; its limits are [{joint.low:.3g}, {joint.high:.3g}] "
+            f"{unit}; it is outside by much in {steps} steps{more}",
+            {**place, "joint": name, "value": value, "expected": [joint.low, joint.high], "other_joints": names[1:]},
         )
 
 

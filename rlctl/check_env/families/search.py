@@ -16,14 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.actions import action_at, zero_action
-from rlctl.check_env.episode import Episode
+from rlctl.check_env.episode import Episode, action_at, zero_action
 from rlctl.check_env.experiment import experiment
-from rlctl.check_env.finding import Finding, NotJudged
-from rlctl.check_env.instance import Context, find_time_limit
-from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
-from rlctl.check_env.recording import Recording
-from rlctl.check_env.rewarded import (
+from rlctl.check_env.families.rewards import (
     DISCOUNT,
     discounted_steps,
     discounted_sum,
@@ -31,6 +26,10 @@ from rlctl.check_env.rewarded import (
     has_succeeded,
     reports_success,
 )
+from rlctl.check_env.finding import Finding, NotJudged
+from rlctl.check_env.instance import Context, find_time_limit
+from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
+from rlctl.check_env.recording import Recording
 
 MOST_STEPS = 6_000
 """Steps in all. With them the goal of the bundled `reach`, a ball of 5 cm within reach of an arm, is found from most
