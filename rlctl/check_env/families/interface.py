@@ -37,10 +37,6 @@ PICTURE = "a uint8 array of shape (height, width, 3)"
 """What `render` returns in the mode rgb_array."""
 NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)
 """What is raised where this machine has no graphics: whether it works elsewhere is not known."""
-NO_GRAPHICS_FIX = (
-    "Render without a display: with MuJoCo set MUJOCO_GL=egl (or osmesa), with pygame SDL_VIDEODRIVER=dummy; with "
-    "PyBullet use getCameraImage(renderer=p.ER_TINY_RENDERER)."
-)
 
 
 @check("RL201")
@@ -159,9 +155,8 @@ def render(context: Context) -> Iterator[Message]:
             raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
         call = "the constructor" if error.call == "build" else error.call
         message = f"with render_mode='rgb_array' {call} raises {describe(cause)}"
-        is_here = NO_GRAPHICS.search(describe(cause)) is not None
-        severity, fix = (Severity.INFO, NO_GRAPHICS_FIX) if is_here else (None, "")
-        yield Finding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity, fix)
+        severity = Severity.INFO if NO_GRAPHICS.search(describe(cause)) else None
+        yield Finding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity)
         return
     if wrong := _describe_wrong_picture(picture):
         message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"

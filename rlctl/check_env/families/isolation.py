@@ -242,7 +242,8 @@ def find_growth(counts: Counts) -> Iterator[Finding]:
         if growth := _growth(series):
             first, after = series[SETTLING_RESETS], resets - SETTLING_RESETS - 1
             message = f"{what} grow with every reset: from {first} to {series[-1]} in {after} resets"
-            yield _report(message, what, series[-1], first, after, growth / after, LEAKS[what])
+            evidence = {"element": what, "value": series[-1], "expected": first, "resets": after}
+            yield Finding("RL405", message, {**evidence, "per_reset": growth / after}, LEAKS[what])
             return  # a client brings its own bodies, files, threads and memory
     if len(counts.memory) >= FEWEST_MEASUREMENTS:
         start, middle, end = (counts.memory[i] for i in (0, (len(counts.memory) - 1) // 2, -1))
@@ -252,7 +253,8 @@ def find_growth(counts: Counts) -> Iterator[Finding]:
                 f"memory grows with every reset: by {(end - start) / 2**20:.1f} MiB in {resets} resets, of which "
                 f"{(end - middle) / 2**20:.1f} MiB in the second half"
             )
-            yield _report(message, "memory", end, start, resets, (end - start) / resets)
+            evidence = {"element": "memory", "value": end, "expected": start, "resets": resets}
+            yield Finding("RL405", message, {**evidence, "per_reset": (end - start) / resets})
 
 
 def _growth(series: list[int]) -> int:
@@ -261,10 +263,3 @@ def _growth(series: list[int]) -> int:
     first, second = series[: len(series) // 2], series[len(series) // 2 :]
     grows = all(half[-1] - half[0] >= LEAST_GROWTH for half in (first, second)) and min(second) >= max(first)
     return series[-1] - series[0] if grows else 0
-
-
-def _report(
-    message: str, what: str, value: int, first: int, resets: int, per_reset: float, severity: Severity | None = None
-) -> Finding:
-    evidence = {"element": what, "value": value, "expected": first, "resets": resets, "per_reset": per_reset}
-    return Finding("RL405", message, evidence, severity)

@@ -67,8 +67,7 @@ def _play_events(context: Context, repeats: bool) -> Iterator[Finding]:
             yield Finding("RL011", f"{where}: {_explain(error)}")
             continue
         if repeats and not same:
-            fix = "Let the functions of events draw all chance from the generator that they are given."
-            yield Finding("RL011", f"{where}: equal seeds and actions give unequal episodes", fix=fix)
+            yield Finding("RL011", f"{where}: equal seeds and actions give unequal episodes")
 
 
 def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[Finding]:
@@ -89,8 +88,7 @@ def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[Finding]:
             continue
         first = first or info
         if difference := info.find_difference(first, "stage 1's"):
-            fix = "One policy learns in all stages: leave out the task parameter that changes its spaces."
-            yield Finding("RL012", f"stage {number} of {len(specs)}: {difference}", fix=fix)
+            yield Finding("RL012", f"stage {number} of {len(specs)}: {difference}")
 
 
 def _play(context: Context, spec: EnvSpec) -> bool:

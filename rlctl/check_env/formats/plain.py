@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from rlctl import output
@@ -126,18 +126,11 @@ def _facts(report: Report) -> Iterator[str]:
     if built is None:
         yield "not judged: everything else, because no instance could be built"
         return
-    if verdict.judged:
-        yield f"judged {_by_family(verdict.judged)}"
     for kind, unjudged in (("does not apply", verdict.not_applicable), ("not judged", verdict.not_judged)):
         reasons: dict[str, list[str]] = {}
         for name, reason in unjudged.items():
             reasons.setdefault(reason, []).append(name)
         yield from (f"{kind}: {', '.join(_families(names))}: {reason}" for reason, names in reasons.items())
-
-
-def _by_family(judged: Iterable[str]) -> str:
-    counts = Counter(rule[:3] for rule in judged)
-    return ", ".join(f"{FAMILIES[family]} {count}" for family, count in counts.items())
 
 
 def _families(names: list[str]) -> list[str]:
