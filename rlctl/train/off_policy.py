@@ -14,6 +14,7 @@ from rlctl.run.recipe import Recipe
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, to_network_layout
 from rlctl.train.sac_update import SacUpdate
+from rlctl.train.tqc_update import TqcUpdate
 from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
 
 _LONGEST = 1000
@@ -34,7 +35,8 @@ class OffPolicyRollouts(Rollouts):
         # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
         self.overlap = recipe.overlap and recipe.her is None
         default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # else they would not explore at all
-        self._update: SacUpdate | Any = SacUpdate(model) if SacUpdate.supports(model) else model
+        updates = [update(model) for update in (SacUpdate, TqcUpdate) if update.supports(model)]
+        self._update: SacUpdate | Any = updates[0] if updates else model
         self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
 
     def start(self) -> None:

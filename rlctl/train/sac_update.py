@@ -1,132 +1,47 @@
 """SAC's updates with gradients computed without autograd: what SB3's `SAC.train` computes, but for rounding.
 
-T. Haarnoja et al., Soft Actor-Critic Algorithms and Applications, 2018, https://arxiv.org/abs/1812.05905. Below, what a
-gradient is of stands in its name: `to_action` is the gradient of the loss with respect to the action.
+T. Haarnoja et al., Soft Actor-Critic Algorithms and Applications, 2018, https://arxiv.org/abs/1812.05905.
 """
 
 from __future__ import annotations
 
 import collections
-import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from stable_baselines3 import SAC
-from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution, StateDependentNoiseDistribution
 from torch import Tensor
 
-from rlctl.train.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
-
-_LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE
-
-
-@dataclasses.dataclass(frozen=True)
-class Sample:
-    """Actions of a batch that the actor drew, and what their gradients are computed from; (batch, actions) each."""
-
-    values: list[Tensor]
-    """What the layers of the actor made of the observations."""
-    noise: Tensor
-    """What was added to the mean before the actions were squashed."""
-    std: Tensor
-    action: Tensor
-    log_prob: Tensor
-    """Shape (batch, 1)."""
-
-
-class SquashedActor:
-    """SB3's actor of SAC: a normal distribution, with or without gSDE, of actions that tanh squashes."""
-
-    def __init__(self, actor: Any) -> None:
-        self._actor = actor
-        self._network = Mlp(_actor_modules(actor))
-        self._epsilon = float(actor.action_dist.epsilon)
-        self._mean_limit = float(actor.clip_mean) if actor.use_sde and actor.clip_mean > 0 else None
-        share_gradients(actor.parameters())
-
-    def sample(self, features: Tensor) -> Sample:
-        """Draw actions; with gSDE by the matrix that was drawn last."""
-        values = self._network.run(features)
-        latent, mean = values[-2:]
-        if self._actor.use_sde:
-            if self._mean_limit is not None:
-                mean = mean.clamp(-self._mean_limit, self._mean_limit)
-            noise = latent @ self._actor.action_dist.exploration_mat
-            std = (latent.square() @ torch.exp(2 * self._actor.log_std) + self._epsilon).sqrt()
-            log_std, z = std.log(), noise / std
-        else:
-            log_std = self._actor.log_std(latent).clamp(_LOG_STD_MIN, _LOG_STD_MAX)
-            std, z = log_std.exp(), torch.randn_like(mean)
-            noise = std * z
-        action = torch.tanh(mean + noise)
-        squashing = (1 - action.square() + self._epsilon).log()
-        log_prob = (z.square() * -0.5 - log_std - squashing - LOG_SQRT_TAU).sum(1, keepdim=True)
-        return Sample(values, noise, std, action, log_prob)
-
-    def backpropagate(self, sample: Sample, to_action: Tensor, to_log_prob: float) -> None:
-        """Set the gradients of the weights from those of drawn actions and of each of their log-probabilities."""
-        slope = 1 - sample.action.square()
-        to_mean = to_action * slope + sample.action * slope / (slope + self._epsilon) * (2 * to_log_prob)
-        latent, mean = sample.values[-2:]
-        if self._actor.use_sde:
-            to_latent = self._backpropagate_gsde(latent, sample, to_mean, to_log_prob)
-            if self._mean_limit is not None:
-                to_mean = to_mean * (mean.abs() < self._mean_limit)
-        else:
-            layer = self._actor.log_std
-            log_std = layer(latent)
-            within = (log_std >= _LOG_STD_MIN) & (log_std <= _LOG_STD_MAX)
-            to_log_std = (to_mean * sample.noise - to_log_prob) * within
-            torch.mm(to_log_std.t(), latent, out=layer.weight.grad)
-            torch.sum(to_log_std, 0, out=layer.bias.grad)
-            to_latent = to_log_std @ layer.weight
-        self._network.backpropagate(sample.values, to_mean, latent=to_latent)
-
-    def _backpropagate_gsde(self, latent: Tensor, sample: Sample, to_mean: Tensor, to_log_prob: float) -> Tensor:
-        """Set the gradient of `log_std`, and return that of the latent values."""
-        # noise = latent @ matrix, where matrix = exp(log_std) * normal numbers, and
-        # std^2 = latent^2 @ exp(2 log_std) + epsilon.
-        matrix, variances = self._actor.action_dist.exploration_mat, torch.exp(2 * self._actor.log_std)
-        precision = sample.std.square().reciprocal()
-        to_noise = to_mean - sample.noise * precision * to_log_prob
-        to_variance = (sample.noise.square() * precision - 1) * precision * (0.5 * to_log_prob)
-        torch.mul(latent.t() @ to_noise, matrix, out=self._actor.log_std.grad)
-        self._actor.log_std.grad += (latent.square().t() @ to_variance) * variances * 2
-        gradient: Tensor = to_noise @ matrix.t() + latent * (to_variance @ variances.t()) * 2
-        return gradient
+from rlctl.train.mlp import Mlp, is_mlp, share_gradients
+from rlctl.train.squashed_actor import Sample, SquashedActor
 
 
 class SacUpdate:
     """Updates a SAC model whose networks are multi-layer perceptrons."""
 
-    def __init__(self, model: SAC) -> None:
-        self._model: Any = model
+    algorithm: ClassVar[Any] = SAC
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
         self._actor = SquashedActor(model.actor)
         self._critics, self._targets = (
-            [Mlp(modules) for modules in _critic_modules(critic)] for critic in (model.critic, model.critic_target)
+            [Mlp(network) for network in critic.q_networks] for critic in (model.critic, model.critic_target)
         )
         share_gradients(model.critic.parameters())
         self._followed = [each.data for each in model.critic.parameters()]
         self._following = [each.data for each in model.critic_target.parameters()]
 
-    @staticmethod
-    def supports(model: Any) -> bool:
+    @classmethod
+    def supports(cls, model: Any) -> bool:
         """Return whether a model can be updated so; otherwise SB3 does it."""
-        if type(model) is not SAC:
+        if type(model) is not cls.algorithm:
             return False
         actor, critic = model.actor, model.critic
-        distribution = actor.action_dist
-        if isinstance(distribution, StateDependentNoiseDistribution):
-            plain = distribution.full_std and not distribution.use_expln
-        else:
-            plain = type(distribution) is SquashedDiagGaussianDistribution
-        networks = [_actor_modules(actor), *_critic_modules(critic)]
         extractors = (actor.features_extractor, critic.features_extractor)
         return (
-            plain
-            and len(actor.latent_pi) > 0
-            and all(map(is_mlp, networks))
+            SquashedActor.supports(actor)
+            and all(is_mlp(network) for network in critic.q_networks)
             and not any(list(each.parameters()) for each in extractors)
         )
 
@@ -149,45 +64,18 @@ class SacUpdate:
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
     def _update(self, batch: Any, logged: dict[str, list[float]]) -> None:
-        model, actor = self._model, self._model.actor
+        actor = self._model.actor
         features, next_features = (
             actor.extract_features(each, actor.features_extractor)
             for each in (batch.observations, batch.next_observations)
         )
-        if model.use_sde:
+        if self._model.use_sde:
             actor.reset_noise()
         sample = self._actor.sample(features)
         coefficient = self._update_coefficient(sample, logged)
-
-        then = self._actor.sample(next_features)
-        next_value = self._run(self._targets, next_features, then.action)[1] - coefficient * then.log_prob
-        discount = model.gamma if batch.discounts is None else batch.discounts
-        target = batch.rewards + (1 - batch.dones) * discount * next_value
-        inputs = torch.cat([features, batch.actions], 1)
-        loss = 0.0
-        for critic in self._critics:
-            values = critic.run(inputs)
-            error = values[-1] - target
-            loss += 0.5 * error.square().mean().item()
-            critic.backpropagate(values, error / len(error))
-        model.critic.optimizer.step()
-        logged["critic_loss"].append(loss)
-
-        passes, value, lowest = self._run(self._critics, features, sample.action)
-        logged["actor_loss"].append((coefficient * sample.log_prob - value).mean().item())
-        to_action = torch.zeros_like(sample.action)
-        for index, (critic, values) in enumerate(zip(self._critics, passes, strict=True)):
-            to_value = (lowest == index) / -len(value)
-            to_action += critic.input_gradient(values, to_value)[:, features.shape[1] :]
-        self._actor.backpropagate(sample, to_action, coefficient / len(value))
-        actor.optimizer.step()
-
-    @staticmethod
-    def _run(critics: list[Mlp], features: Tensor, action: Tensor) -> tuple[list[list[Tensor]], Tensor, Tensor]:
-        """Return what critics make of actions, the lowest value of each, and which critic's it is; (batch, 1) both."""
-        inputs = torch.cat([features, action], 1)
-        passes = [critic.run(inputs) for critic in critics]
-        return passes, *torch.cat([values[-1] for values in passes], 1).min(1, keepdim=True)
+        target = self._compute_target(batch, next_features, coefficient)
+        logged["critic_loss"].append(self._update_critics(torch.cat([features, batch.actions], 1), target))
+        logged["actor_loss"].append(self._update_actor(features, sample, coefficient))
 
     def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> float:
         """Return the entropy coefficient, and learn it if it is to be learnt."""
@@ -203,11 +91,48 @@ class SacUpdate:
         logged["ent_coef"].append(coefficient)
         return coefficient
 
+    def _compute_target(self, batch: Any, next_features: Tensor, coefficient: float) -> Tensor:
+        """Return what the critics are to expect, shape (batch, estimates)."""
+        sample = self._actor.sample(next_features)
+        inputs = torch.cat([next_features, sample.action], 1)
+        estimates = self._choose_estimates([target.run(inputs)[-1] for target in self._targets])
+        discount = self._model.gamma if batch.discounts is None else batch.discounts
+        result: Tensor = batch.rewards + (1 - batch.dones) * discount * (estimates - coefficient * sample.log_prob)
+        return result
 
-def _actor_modules(actor: Any) -> list[torch.nn.Module]:
-    mean = actor.mu[0] if isinstance(actor.mu, torch.nn.Sequential) else actor.mu  # gSDE clips it
-    return [*actor.latent_pi, mean]
+    def _update_critics(self, inputs: Tensor, target: Tensor) -> float:
+        """Return the sum of the critics' losses."""
+        loss = 0.0
+        for critic in self._critics:
+            values = critic.run(inputs)
+            loss_of_one, to_output = self._compare(values[-1], target)
+            critic.backpropagate(values, to_output)
+            loss += loss_of_one
+        self._model.critic.optimizer.step()
+        return loss
 
+    def _update_actor(self, features: Tensor, sample: Sample, coefficient: float) -> float:
+        """Return the actor's loss."""
+        inputs = torch.cat([features, sample.action], 1)
+        passes = [critic.run(inputs) for critic in self._critics]
+        value, to_outputs = self._judge([values[-1] for values in passes])
+        to_action = torch.zeros_like(sample.action)
+        for critic, values, to_output in zip(self._critics, passes, to_outputs, strict=True):
+            to_action -= critic.input_gradient(values, to_output / len(value))[:, features.shape[1] :]
+        self._actor.backpropagate(sample, to_action, coefficient / len(value))
+        self._model.actor.optimizer.step()
+        return (coefficient * sample.log_prob - value).mean().item()
 
-def _critic_modules(critic: Any) -> list[list[torch.nn.Module]]:
-    return [list(network) for network in critic.q_networks]
+    def _choose_estimates(self, outputs: list[Tensor]) -> Tensor:
+        """Return the estimates of target critics that count, shape (batch, estimates)."""
+        return torch.cat(outputs, 1).amin(1, keepdim=True)
+
+    def _compare(self, output: Tensor, target: Tensor) -> tuple[float, Tensor]:
+        """Return a critic's share of the loss, and its gradient with respect to the critic's output."""
+        error = output - target
+        return 0.5 * error.square().mean().item(), error / len(error)
+
+    def _judge(self, outputs: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
+        """Return the value of actions by the critics' outputs, shape (batch, 1), and its gradient for each output."""
+        value, lowest = torch.cat(outputs, 1).min(1, keepdim=True)
+        return value, [(lowest == index).float() for index in range(len(outputs))]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from sb3_contrib import TQC
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
@@ -13,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from rlctl.dict_spaces import split
 from rlctl.train.ppo_update import PpoUpdate
 from rlctl.train.sac_update import SacUpdate
+from rlctl.train.tqc_update import TqcUpdate
 
 pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 
@@ -91,12 +93,12 @@ def test_ppo_updates_as_sb3(name):
     assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
 
 
-def make_sac(observations=VECTOR, actions=ACTIONS, policy="MlpPolicy", network=None, **settings):
+def make_off_policy(algorithm=SAC, observations=VECTOR, policy="MlpPolicy", network=None, **settings):
     """A model with a replay buffer of made-up numbers."""
     settings = {"batch_size": 16, "learning_rate": 1e-2, "buffer_size": 200, "seed": 0, **settings}
     network = {"net_arch": [16, 16], **(network or {})}
-    envs = DummyVecEnv([lambda: Still(observations, actions)])
-    model = SAC(policy, envs, policy_kwargs=network, device="cpu", **settings)
+    envs = DummyVecEnv([lambda: Still(observations, ACTIONS)])
+    model = algorithm(policy, envs, policy_kwargs=network, device="cpu", **settings)
     model.set_logger(Logger(None, []))
     rng, buffer = np.random.default_rng(0), model.replay_buffer
     both = (buffer.observations, buffer.next_observations)
@@ -122,15 +124,24 @@ SAC_CASES = {
 }
 
 
-@pytest.mark.parametrize("name", SAC_CASES)
-def test_sac_updates_as_sb3(name):
-    one, other = make_sac(**SAC_CASES[name]), make_sac(**SAC_CASES[name])
+TQC_CASES = {
+    "tqc": {"network": {"n_quantiles": 7, "n_critics": 3}},
+    "tqc, gSDE, nothing dropped": {"use_sde": True, "top_quantiles_to_drop_per_net": 0},
+}
+OFF_POLICY_CASES = {name: (SacUpdate, SAC, case) for name, case in SAC_CASES.items()}
+OFF_POLICY_CASES |= {name: (TqcUpdate, TQC, case) for name, case in TQC_CASES.items()}
+
+
+@pytest.mark.parametrize("name", OFF_POLICY_CASES)
+def test_off_policy_updates_as_sb3(name):
+    update, algorithm, case = OFF_POLICY_CASES[name]
+    one, other = make_off_policy(algorithm, **case), make_off_policy(algorithm, **case)
     before = weights(one)
-    assert SacUpdate.supports(other)
+    assert update.supports(other)
     set_random_seed(1)
     one.train(gradient_steps=7, batch_size=16)
     set_random_seed(1)
-    SacUpdate(other).train(gradient_steps=7, batch_size=16)
+    update(other).train(gradient_steps=7, batch_size=16)
     assert_same_weights(weights(one), weights(other), before)
     expected, logged = one.logger.name_to_value, other.logger.name_to_value
     assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
@@ -140,6 +151,8 @@ def test_what_sb3_updates_itself():
     image = spaces.Box(0, 255, (3, 36, 36), np.uint8)
     elu = {"activation_fn": torch.nn.ELU}
     ppo = [make_ppo(actions=spaces.Discrete(3)), make_ppo(image, policy="CnnPolicy"), make_ppo(network=elu)]
-    sac = [make_sac(image, policy="CnnPolicy"), make_sac(network=elu), make_sac(network={"net_arch": []})]
+    sac = [make_off_policy(network=elu), make_off_policy(network={"net_arch": []}), make_off_policy(TQC)]
+    sac += [make_off_policy(observations=image, policy="CnnPolicy")]
+    sac += [make_off_policy(use_sde=True, network={"use_expln": True})]
     assert [PpoUpdate.supports(model) for model in ppo] == [False] * 3
-    assert [SacUpdate.supports(model) for model in sac] == [False] * 3
+    assert [SacUpdate.supports(model) for model in sac] == [False] * 5
