@@ -49,7 +49,7 @@ def rlctl(tmp_path):
             environment["PYTHONPATH"] = str(path)
         command = [sys.executable, "-m", "rlctl", *map(str, arguments)]
         return fork_server.for_commands().run(
-            command, **{"cwd": tmp_path, "timeout": 120, "env": environment, **options}
+            command, **{"cwd": tmp_path, "timeout": 250, "env": environment, **options}
         )
 
     return run
@@ -62,7 +62,7 @@ def installed_rlctl(tmp_path):
     def run(*arguments, **options) -> subprocess.CompletedProcess:
         return subprocess.run(
             [sys.executable, "-m", "rlctl", *map(str, arguments)],
-            **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 60, **options},
+            **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 250, **options},
         )
 
     return run
@@ -125,5 +125,5 @@ def no_child_left(request):
     before = set(psutil.Process().children(recursive=True))
     yield
     left = [child for child in psutil.Process().children(recursive=True) if child not in before]
-    _, alive = psutil.wait_procs(left, timeout=3)
+    _, alive = psutil.wait_procs(left, timeout=60)
     assert alive == []

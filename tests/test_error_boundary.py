@@ -13,7 +13,7 @@ RLCTL = f"{sys.executable} -m rlctl"
 
 def shell(command, **environment):
     return subprocess.run(
-        ["bash", "-c", command], env={**os.environ, **environment}, capture_output=True, timeout=120, check=False
+        ["bash", "-c", command], env={**os.environ, **environment}, capture_output=True, timeout=250, check=False
     )
 
 

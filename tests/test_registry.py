@@ -233,7 +233,7 @@ def test_an_alarm_in_a_module(rlctl, write_module):  # a process of its own: her
     done = rlctl("tasks", "show", "early.py:E")
     assert done.returncode == 3
     assert "import failed: TimeoutError: an alarm that the module sets goes off while it is imported" in done.stderr
-    write_module("late.py", "import signal; signal.alarm(1)\nclass E: pass")
+    write_module("late.py", "import signal; signal.alarm(60)\nclass E: pass")
     done = rlctl("tasks", "show", "late.py:E")
     assert done.stderr.startswith("warning: task 'late.py:E': its module sets an alarm; cancelled\n")
 

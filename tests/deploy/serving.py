@@ -60,7 +60,7 @@ class RunningServer:
         self._started = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
-        assert self._started.wait(30)
+        assert self._started.wait(120)
 
     def _run(self):
         with asyncio.Runner(loop_factory=make_loop) as runner:
@@ -77,7 +77,7 @@ class RunningServer:
 
     def close(self):
         self._loop.call_soon_threadsafe(self._end.set)
-        self._thread.join(30)
+        self._thread.join(120)
 
     @contextlib.contextmanager
     def client(self):
@@ -92,7 +92,7 @@ class RunningServer:
         content = body if isinstance(body, bytes | None) else json.dumps(body).encode()
         request = urllib.request.Request(f"http://{self.address}{path}", content, headers or {}, method=method)
         try:
-            with urllib.request.urlopen(request, timeout=30) as answer:
+            with urllib.request.urlopen(request, timeout=120) as answer:
                 return answer.status, answer.read().decode()
         except urllib.error.HTTPError as error:
             return error.code, error.read().decode()

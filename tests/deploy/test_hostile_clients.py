@@ -23,7 +23,7 @@ def server(tmp_path_factory):
 
 
 def open_socket(server):
-    connection = socket.create_connection(("127.0.0.1", server.port), timeout=30)
+    connection = socket.create_connection(("127.0.0.1", server.port), timeout=120)
     connection.sendall(
         b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
@@ -97,7 +97,7 @@ def test_a_flood_that_reads_nothing(server):
 def test_two_hundred_connections(server):
     with server.client() as client:
         opened = [open_socket(server) for _ in range(100)]
-        idle = [socket.create_connection(("127.0.0.1", server.port), timeout=30) for _ in range(100)]
+        idle = [socket.create_connection(("127.0.0.1", server.port), timeout=120) for _ in range(100)]
         for connection in idle:
             connection.sendall(b"POST /act HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\n{")
         assert client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]

@@ -46,7 +46,7 @@ def test_it_acts_through_our_server(tmp_path):
     server = RunningServer(file, watchdog=False, key_file=tmp_path / "key")
     try:
         done = subprocess.run(
-            [python, "-c", CLIENT, str(server.port), "secret"], capture_output=True, text=True, timeout=60
+            [python, "-c", CLIENT, str(server.port), "secret"], capture_output=True, text=True, timeout=250
         )
     finally:
         server.close()

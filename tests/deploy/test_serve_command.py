@@ -29,7 +29,7 @@ def served(tmp_path):
 
 
 def read_metadata(address):
-    with urllib.request.urlopen(f"http://{address}metadata", timeout=30) as answer:
+    with urllib.request.urlopen(f"http://{address}metadata", timeout=120) as answer:
         return json.load(answer)
 
 
@@ -45,7 +45,7 @@ def test_signals(served):
     assert "reloaded" in process.stderr.readline()
     assert read_metadata(address)["policy"] == "policy.safetensors"
     process.send_signal(signal.SIGTERM)
-    assert process.wait(30) == 0
+    assert process.wait(120) == 0
     assert "policy refused" in (file.parent / "log.jsonl").read_text()
 
 
@@ -77,22 +77,19 @@ def test_without_the_extra(rlctl, tmp_path):
     assert "rlctl serve needs aiohttp: pip install 'rlctl[serve]'" in done.stderr
 
 
-@pytest.mark.slow
-def test_starts_at_once_and_without_torch(tmp_path):
-    """A bound on processor time, which a busy machine does not change."""
+def test_starts_without_what_takes_long_to_import(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
     code = (
-        "import pathlib, resource, sys\n"
+        "import pathlib, sys\n"
         "from rlctl.deploy.serve import make_server\n"
         "from rlctl.deploy.routes import make_app\n"
         f"make_app(make_server(pathlib.Path({str(file)!r})))\n"
-        "usage = resource.getrusage(resource.RUSAGE_SELF)\n"
-        "print(usage.ru_utime + usage.ru_stime, 'torch' in sys.modules, 'stable_baselines3' in sys.modules)\n"
+        "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    seconds, *heavy = done.stdout.split()
-    assert heavy == ["False", "False"]
-    assert float(seconds) < 1.5
+    loaded = set(done.stdout.split())
+    assert "aiohttp" in loaded
+    assert not loaded & {"torch", "stable_baselines3", "scipy", "pybullet", "onnxruntime", "rerun", "typer"}
 
 
 @pytest.mark.slow
@@ -105,7 +102,7 @@ def test_the_page(served, tmp_path):
         pytest.skip("no Chromium here")
     _, _, address = served
     body = json.dumps({"observation": [0.1, 0.2, 1, 2, 3]}).encode()
-    urllib.request.urlopen(urllib.request.Request(f"http://{address}act", body), timeout=30).close()
+    urllib.request.urlopen(urllib.request.Request(f"http://{address}act", body), timeout=120).close()
     time.sleep(0.5)  # longer than the watchdog waits
     done = subprocess.run(
         [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'browser'}",

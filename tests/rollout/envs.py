@@ -90,7 +90,7 @@ class Holder(Walk):
 
     def __init__(self):
         super().__init__()
-        self.child = subprocess.Popen(["sleep", "20"])
+        self.child = subprocess.Popen(["sleep", "600"])
 
     def close(self):
         self.child.kill()

@@ -60,7 +60,7 @@ def is_alive(pid):
 
 
 def wait_until_dead(pid):
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while is_alive(pid) and time.monotonic() < deadline:
         time.sleep(0.02)
     return not is_alive(pid)
@@ -100,7 +100,7 @@ def test_a_child_ends_with_its_parent():
         f"child = ChildProcess('{HERE}:answer', {{}}, stdout=2, stderr=2); child.connection.recv_bytes(); "
         f"print(child.process.pid, flush=True); os._exit(0)"
     )
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=250, check=True)
     assert wait_until_dead(int(run.stdout))
 
 

@@ -90,7 +90,9 @@ def test_the_environments_own_traceback_comes_along(spec, start, goals):
 
 
 def test_a_hang_is_ended(spec, start, goals):
-    workers = start(spec("Goals", fault="hang"), 2, timeout_s=1.0)
+    workers = start(spec("Goals", fault="hang"), 2)
+    assert workers.info.has_compute_reward  # they are built
+    workers.timeout_s = 1.0
     with pytest.raises(TaskError, match=r"no answer for 1 s while in compute_reward; .* raise --env-timeout"):
         workers.compute_rewards(*goals)
 

@@ -108,7 +108,7 @@ def forward_lines(content: bytes, receive=None):
     thread.start()
     with os.fdopen(write_end, "wb") as pipe:
         pipe.write(content)
-    thread.join(timeout=20)
+    thread.join(timeout=120)
     assert not thread.is_alive()
     return lines
 
@@ -141,8 +141,8 @@ def test_a_flood_is_counted():
     left_out = [int(line.split()[0].strip("(").replace(",", "")) for line in lines if "left out" in line]
     # The last line comes in ten parts, all alike: one of them counts.
     assert sum(left_out) + len(lines) - len(left_out) == 200_001
-    assert len(lines) < 200_000 / 100
-    assert len(lines) > MAX_LINES_PER_S
+    # So many for each second that it takes, and a line that counts the others.
+    assert MAX_LINES_PER_S < len(lines) < 200_000 / 10
 
 
 def test_nobody_to_tell():

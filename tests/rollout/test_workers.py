@@ -87,7 +87,7 @@ def test_what_environments_print_is_forwarded_at_once(spec, start, capfd):
     lines = []
     workers = start(spec("Walk", fault="print"), 1, on_output=lines.append)
     workers.replay_actions({0: still(7, 3)})
-    deadline = time.monotonic() + 5
+    deadline = time.monotonic() + 60
     while len(lines) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
     assert sorted(lines) == ["hello from its child", "hello from the environment"]
@@ -142,7 +142,7 @@ def test_a_child_of_an_environment_does_not_hold_up_the_end(spec):
     workers.reset({0: 0})
     began = time.monotonic()
     workers.close()
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 60
 
 
 def test_a_misspelt_parameter_keeps_its_kind_of_error(spec, start):

@@ -209,7 +209,6 @@ def test_json_that_is_too_large(tmp_path):
         files.read_json(path)
 
 
-@pytest.mark.timeout(120)
 @pytest.mark.parametrize("suffix", [".json", ".npz", ".safetensors", ".onnx"])
 @pytest.mark.parametrize("kind", ["pipe", "folder", "missing", "device"])
 def test_what_is_no_file(kind, suffix, tmp_path):

@@ -163,7 +163,7 @@ def test_browser_shows_it(group, tmp_path, width):
         [*command, f"--window-size={width},900", "--dump-dom", page.as_uri()],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=250,
     )
     content, inside = re.search(r"<title>(\d+) of (\d+)</title>", done.stdout).groups()
     assert int(content) <= int(inside)  # nothing to scroll sideways

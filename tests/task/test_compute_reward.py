@@ -40,6 +40,6 @@ def test_only_tasks_that_define_it_have_it(make):
 def test_check_env_finds_nothing_wrong_with_it():
     # One study and its rule: the whole check takes half a minute.
     spec = EnvSpec(f"{tasks.__file__}:Place")
-    report = check(spec, rules=["RL614"], only=("hindsight",), budget_s=2.0, env_timeout_s=60.0, show_progress=False)
+    report = check(spec, rules=["RL614"], only=("hindsight",), env_timeout_s=60.0, show_progress=False)
     assert report.verdict.findings == []
     assert report.verdict.judged == ["RL614"]

@@ -3,7 +3,6 @@
 import errno
 import fcntl
 import os
-import time
 
 import psutil
 import pytest
@@ -62,9 +61,7 @@ QUICK = ("raise", "out of memory")
 )
 @pytest.mark.usefixtures("no_child_left")
 def test_a_fault_is_named_and_the_run_goes_on_after_it(fail, resume, monkeypatch, whole, fault):
-    began = time.monotonic()
     error, run = fail(fault=fault, timeout_s=3.0 if fault in HANGS else 60.0)
-    assert time.monotonic() - began < 60
     message = ENDS.get(fault, "no answer for 3 s while stepping; if that may take so long, raise --env-timeout")
     assert str(error).splitlines() == [
         f"task '{ENVS}:Faulty': {message}",

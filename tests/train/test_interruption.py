@@ -23,7 +23,7 @@ SMALL = [
 ]
 
 
-def wait_for(condition, seconds=60):
+def wait_for(condition, seconds=120):
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         if condition():
@@ -45,7 +45,7 @@ class Training:
     stdout: Path
     stderr: Path
 
-    def wait(self, timeout: float = 60.0) -> tuple[int, str, str]:
+    def wait(self, timeout: float = 120.0) -> tuple[int, str, str]:
         """Wait for its end; return its exit code and what it wrote."""
         code = self.process.wait(timeout=timeout)
         return code, self.stdout.read_text(), self.stderr.read_text()
@@ -91,7 +91,7 @@ def test_a_signal_saves_a_checkpoint_and_leaves_no_child(start, rlctl, tmp_path,
     assert last.startswith("error: interrupted at step ")
     assert "checkpoint saved. Go on with: rlctl train --resume runs/" in last
     assert "Traceback" not in stderr
-    wait_for(lambda: not any(child.is_running() for child in children), 5)
+    wait_for(lambda: not any(child.is_running() for child in children))
     (run,) = tmp_path.glob("runs/Line/*")
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
     steps = max(int(each.name) for each in (run / "checkpoints").iterdir())
@@ -106,7 +106,7 @@ def test_a_killed_run_leaves_no_worker_and_does_not_block_the_next(start, rlctl,
     children = psutil.Process(training.process.pid).children(recursive=True)
     training.process.kill()
     training.wait()
-    wait_for(lambda: not any(child.is_running() for child in children), 10)
+    wait_for(lambda: not any(child.is_running() for child in children))
     (run,) = tmp_path.glob("runs/Line/*")
     steps = max(int(each.name) for each in (run / "checkpoints").iterdir() if each.name.isdigit())
     done = rlctl("train", "--resume", "latest", "-n", steps + 64)
@@ -146,7 +146,7 @@ def test_a_full_disk_costs_warnings_and_an_exit_code(start, rlctl, small_disk):
     wait_for(lambda: list(small_disk.glob("runs/*/*/checkpoints/0*")))
     with filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space left"):
         fill(file)
-    code, _, stderr = training.wait(timeout=120)
+    code, _, stderr = training.wait()
     assert code == 5, stderr
     assert "warning: not saved: " in stderr
     assert "No space left on device" in stderr

@@ -25,7 +25,7 @@ def test_in_a_thread_a_training_is_the_same(train):
 
     thread = threading.Thread(target=run)
     thread.start()
-    thread.join(timeout=120)
+    thread.join(timeout=250)
     run, during = found
     assert during == before
     assert_same_run(whole, run)
@@ -45,7 +45,7 @@ def test_two_processes_that_begin_the_same_run_at_once(tmp_path):
         )
         for _ in range(2)
     ]
-    results = [process.communicate(timeout=120) for process in both]
+    results = [process.communicate(timeout=250) for process in both]
     assert [process.returncode for process in both] == [0, 0], results
     one, other = (json.loads(stdout) for stdout, _ in results)
     assert one["run"] != other["run"]

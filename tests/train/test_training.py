@@ -290,5 +290,5 @@ finally:
 """
     command = [sys.executable, "-c", code, "train", f"{ENVS}:Line", "--no-check", "-o", str(tmp_path)]
     command += ["--algo", algo, "-n", "200", "--set", "n_envs=2", "--set", "eval.episodes=1"]
-    done = fork_server.for_commands().run(command, timeout=120)
+    done = fork_server.for_commands().run(command, timeout=250)
     assert done.returncode == 0, done.stderr
