@@ -1,7 +1,8 @@
 """Environments with one mistake each in what their observation holds."""
 
 import numpy as np
-from broken_envs import LIMIT, Clean, FixedStart
+from broken_envs import LIMIT, Clean
+from broken_repeats import FixedStart
 from gymnasium import spaces
 
 

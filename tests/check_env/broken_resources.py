@@ -5,7 +5,8 @@ import threading
 
 import numpy as np
 import pybullet
-from broken_envs import Clean, OwnWorld
+from broken_envs import Clean
+from broken_repeats import OwnWorld
 from gymnasium import spaces
 
 

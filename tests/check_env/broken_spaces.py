@@ -1,7 +1,7 @@
 """Spaces that learners treat otherwise than was meant."""
 
 import numpy as np
-from broken_envs import Clean
+from broken_envs import Clean, CleanDict
 from gymnasium import spaces
 
 
@@ -73,3 +73,32 @@ class CountsFromOne(Clean):
 
     def step(self, action):
         return super().step(np.full(2, action - 1.5, np.float32))
+
+
+class OddImage(Clean):
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+    def observe(self):
+        return np.full((8, 8, 3), int(100 + 10 * self.position[0]), np.uint8)
+
+
+class TupleObservation(CleanDict):
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Tuple(list(self.observation_space.spaces.values()))
+
+    def observe(self):
+        return self.position.copy(), self.steps
+
+
+class TextObservation(Clean):
+    """Of a space that no rule can look into."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Dict({"position": self.observation_space, "say": spaces.Text(5)})
+
+    def observe(self):
+        return {"position": self.position.copy(), "say": "abc"}

@@ -16,6 +16,8 @@ from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
 
 FOLDER = Path(__file__).parent
+SECONDS = 10 * families.PROCESS_S
+"""For the experiments of a process: a slow machine judges as a fast one does."""
 sys.dont_write_bytecode = False  # each experiment imports its environment's file anew
 
 
@@ -28,8 +30,6 @@ class Case:
     expected: frozenset[tuple[str, str]]
     """Every finding: rule and severity."""
     twin: str = "broken_envs.py:Clean"
-    seconds: float = families.PROCESS_S
-    """What its experiments may take: less for one that would take all of it."""
 
     @property
     def rules(self) -> tuple[str, ...]:
@@ -40,50 +40,50 @@ def case(broken: str, *expected: tuple[str, str], **settings: Any) -> Case:
     return Case(broken, frozenset(expected), **settings)
 
 
-def records_of(task, *experiments, seconds=families.PROCESS_S):
+def records_of(task, *experiments):
     """What some experiments find out, or all."""
     records = Records(_path(task))
     for name, process in families.PROCESSES.items():
         wanted = [each.name for each in process.experiments if not experiments or each.name in experiments]
-        for message in _run(task, name, wanted, seconds):
+        for message in _run(task, name, wanted):
             records.add(message)
     return records
 
 
-def shared_records_of(task, *experiments, seconds=families.PROCESS_S):
+def shared_records_of(task, *experiments):
     """What some experiments find out, each in a process of its own, and once for all tests: many have one twin."""
     records = Records(_path(task))
     for experiment in families.EXPERIMENTS:
         if experiment == "build" or (experiment in experiments and records.built):
-            for message in _play(task, experiment, seconds):
+            for message in _play(task, experiment):
                 records.add(message)
     return records
 
 
 @functools.cache
-def _play(task, experiment, seconds):
+def _play(task, experiment):
     (process,) = [
         name for name, each in families.PROCESSES.items() if families.EXPERIMENTS[experiment] in each.experiments
     ]
-    return _run(task, process, [experiment], seconds)
+    return _run(task, process, [experiment])
 
 
-def _run(task, process, experiments, seconds):
+def _run(task, process, experiments):
     """Run experiments of a process, which begins with nothing that an earlier one left."""
     for client in find_clients():  # of an environment that was not closed
         pybullet.disconnect(client)
     for module in [module for module in sys.modules if module.startswith("broken_")]:
         del sys.modules[module]
-    return list(child.run(process, EnvSpec(_path(task)), experiments, seconds)) if experiments else []
+    return list(child.run(process, EnvSpec(_path(task)), experiments, SECONDS)) if experiments else []
 
 
 def _path(task):
     return str(FOLDER / task) if ".py:" in task else task
 
 
-def verdict_of(task, *rules, **settings):
+def verdict_of(task, *rules):
     """The verdict by some rules, from the experiments that they need; or by all, from one process after the other."""
-    records = shared_records_of(task, *families.find_needs(rules), **settings) if rules else _whole(task)
+    records = shared_records_of(task, *families.find_needs(rules)) if rules else _whole(task)
     verdict = judge(records, rules or tuple(RULES))
     assert verdict.crashed == {}
     return verdict
@@ -94,12 +94,12 @@ def _whole(task):
     return records_of(task)
 
 
-def findings(task, *rules, **settings):
-    return verdict_of(task, *rules, **settings).findings
+def findings(task, *rules):
+    return verdict_of(task, *rules).findings
 
 
-def found(task, *rules, **settings):
-    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules, **settings)}
+def found(task, *rules):
+    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules)}
 
 
 def rules_of(family):
@@ -110,5 +110,5 @@ def rules_of(family):
 def check_case(case):
     """The mistake is found by its rules, and nothing by them in the twin. That no other rule finds anything in it is
     tested in test_all_rules.py."""
-    assert found(case.broken, *case.rules, seconds=case.seconds) == case.expected
+    assert found(case.broken, *case.rules) == case.expected
     assert found(case.twin, *case.rules) == set()

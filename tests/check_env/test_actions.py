@@ -58,5 +58,5 @@ def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
 
 def test_what_is_not_repeatable_is_not_judged():
     for rule in ("RL701", "RL702"):
-        verdict = verdict_of("broken_envs.py:NoisyStep", rule)
+        verdict = verdict_of("broken_repeats.py:NoisyStep", rule)
         assert verdict.not_judged[rule] == "equal seeds and actions give unequal episodes (RL3)"

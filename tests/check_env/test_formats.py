@@ -36,7 +36,7 @@ def report_of(task, rules=tuple(RULES), experiments=None):
 def rlctl(*arguments, folder=ROOT, **environment):
     command = [sys.executable, "-m", "rlctl", "check-env", *arguments]
     variables = {**os.environ, **environment}
-    return fork_server.for_commands().run(command, cwd=folder, timeout=60, env=variables)
+    return fork_server.for_commands().run(command, cwd=folder, timeout=250, env=variables)
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def test_a_waiver_that_is_none_is_refused(task, message):
 
 
 def test_strict_counts_warnings():
-    report = report_of("broken_envs.py:UnseededLater", ["RL308"])
+    report = report_of("broken_repeats.py:UnseededLater", ["RL308"])
     assert report.exit_code == 0
     assert dataclasses.replace(report, strict=True).exit_code == 1
 

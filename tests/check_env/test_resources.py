@@ -9,7 +9,7 @@ from tests.check_env.judging import case, check_case, findings, records_of
 
 FILE = "broken_resources.py"
 CASES = [
-    case(f"{FILE}:LeavesBodies", ("RL405", "error"), twin="broken_envs.py:OwnWorld"),
+    case(f"{FILE}:LeavesBodies", ("RL405", "error"), twin="broken_repeats.py:OwnWorld"),
     case(f"{FILE}:KeepsFiles", ("RL405", "warning")),
     case(f"{FILE}:KeepsThreads", ("RL405", "warning")),
     case(f"{FILE}:KeepsMemory", ("RL405", "warning"), twin=f"{FILE}:Caches"),

@@ -11,15 +11,11 @@ from rlctl.errors import AnswerIsNo, RecipeError, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation, run_evaluations
 from rlctl.eval.report import show_all
 from rlctl.replay.reproduce import verify_episode
-from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.workers import available_cores
 from rlctl.run.episode import load_episode
 from rlctl.run.policy import load_policy, read_policy
-from rlctl.run.recipe import validate
 from rlctl.train import checkpoint
-from rlctl.train.curriculum import Curriculum
 from rlctl.train.display import LiveDisplay
-from rlctl.train.progress import Progress
 from rlctl.train.request import TrainRequest, run_training
 from tests.train.comparing import replay_buffer
 from tests.train.conftest import ENVS, SMALL, SMALL_PPO
@@ -48,55 +44,6 @@ def staged(tmp_path_factory):
     """A run that goes from EASY to HARD at step 128, the second boundary."""
     root = tmp_path_factory.mktemp("runs")
     return run_training(TrainRequest(f"{ENVS}:Staged", settings={**SMALL_PPO, "stages": BY_SUCCESS}, root=root))
-
-
-def curriculum(*stages):
-    recipe = validate({"stages": [*stages, {}]}, "recipe")
-    return Curriculum(recipe.stages, recipe.env_specs("any"), None, Progress(next_eval=1))
-
-
-def ended(*successes, total=0.0):
-    return [EpisodeResult(0, 0, total, 10, success, {}, None) for success in successes]
-
-
-def test_a_window_must_be_full_and_only_its_episodes_count():
-    stages = curriculum({"promote": {"success": 0.75, "window": 4}})
-    stages.count(ended(True, True, True))
-    assert not stages.is_due(1000)
-    stages.count(ended(False, False))  # the last four: 2 of 4
-    assert not stages.is_due(1000)
-    stages.count(ended(True, True, True))  # 3 of 4
-    assert stages.is_due(1000)
-    assert stages.enter_next_stage(1000) == (
-        "stage 2 of 2: the recipe's own task",
-        "after 1,000 steps: success 75.0% over 4 episodes",
-    )
-    stages.count(ended(*[True] * 9))
-    assert not stages.is_due(2000)
-
-
-def test_min_steps_are_steps_of_the_stage():
-    stages = curriculum(*[{"promote": {"return": 5.0, "window": 1, "min_steps": 100}}] * 2)
-    stages.count(ended(None, total=5.0))
-    assert not stages.is_due(99)
-    assert stages.is_due(100)
-    stages.enter_next_stage(120)
-    stages.count(ended(None, total=5.0))
-    assert not stages.is_due(219)
-    assert stages.is_due(220)
-
-
-def test_missing_success_is_warned_of_once():
-    stages = curriculum({"promote": {"success": 0.5, "window": 2}})
-    assert stages.warning() is None
-    stages.count(ended(None, None))
-    assert not stages.is_due(1000)
-    assert (
-        "promote.success waits for info['is_success'], which none of the last 2 episodes has given" in stages.warning()
-    )
-    assert stages.warning() is None
-    stages.count(ended(True))  # of an environment that speaks of success only when there is one: 1 of 2
-    assert stages.is_due(1000)
 
 
 def test_promotion_by_success(staged):

@@ -1,0 +1,170 @@
+"""Environments that do not repeat, and instances that disturb each other."""
+
+import random
+import time
+
+import numpy as np
+import pybullet
+from broken_envs import LIMIT, Clean
+
+
+class GlobalRandom(Clean):
+    def start(self):
+        self.position = np.random.uniform(-1, 1, 2).astype(np.float32)  # noqa: NPY002
+
+
+class NoisyStep(Clean):
+    def move(self, action):
+        super().move(action + np.float32(0.01 * random.random()))
+
+
+class LeakyReset(Clean):
+    """Keeps the wind of an episode that did not come to its end."""
+
+    wind = np.zeros(2, np.float32)
+
+    def start(self):
+        super().start()
+        self.wind = self.wind if getattr(self, "unfinished", False) else np.zeros(2, np.float32)
+        self.unfinished = True
+
+    def move(self, action):
+        self.wind = (self.wind + 0.01 * action).astype(np.float32)
+        super().move(self.wind)
+        self.unfinished = self.steps < LIMIT
+
+
+class ClassCounter(Clean):
+    count = 0
+
+    def __init__(self):
+        super().__init__()
+        type(self).count += 1
+        self.bias = 0.1 * type(self).count
+
+    def start(self):
+        super().start()
+        self.position += np.float32(self.bias)
+
+
+class HashOrder(Clean):
+    def start(self):
+        super().start()
+        self.position += np.float32(0.1 * next(iter({"left": 0, "right": 1, "up": 2, "down": 3}.keys())).__len__())
+        self.position += np.float32(0.01 * (hash("goal") % 7))
+
+
+class FixedStart(Clean):
+    def start(self):
+        self.position = np.array([0.5, -0.3], np.float32)
+
+
+class FixedStartNoise(FixedStart):
+    """A fixed start, with chance in the steps: nothing is wrong with it."""
+
+    def move(self, action):
+        super().move(action + self.np_random.uniform(-0.1, 0.1, 2).astype(np.float32))
+
+
+class TimeInInfo(Clean):
+    def info(self):
+        return {**super().info(), "time": time.perf_counter()}
+
+
+class UnseededLater(Clean):
+    """Draws from a new generator at every reset, seeded or not."""
+
+    def start(self):
+        own = self.np_random if self.steps_seeded else np.random.default_rng()
+        self.position = own.uniform(-1, 1, 2).astype(np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        self.steps_seeded = seed is not None
+        return super().reset(seed=seed)
+
+
+class Residue(Clean):
+    """Keeps a trace of what was before, far below what matters, like a simulation that is not reset in full."""
+
+    trace = np.float32(0.0)
+
+    def start(self):
+        super().start()
+        self.position += self.trace
+        self.trace += np.float32(1e-6)
+
+
+class SharedWorld(Clean):
+    """PyBullet without physicsClientId, as most tutorials have it."""
+
+    def __init__(self):
+        super().__init__(size=100.0)
+        self.client = pybullet.connect(pybullet.DIRECT)
+
+    def start(self):
+        super().start()
+        pybullet.resetSimulation()
+        pybullet.setGravity(0, 0, -10)
+        shape = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.1)
+        self.ball = pybullet.createMultiBody(1.0, shape, basePosition=[*self.position, 1.0])
+
+    def move(self, action):
+        pybullet.resetBaseVelocity(self.ball, [float(action[0]), float(action[1]), 0.0])
+        pybullet.stepSimulation()
+        place, _ = pybullet.getBasePositionAndOrientation(self.ball)
+        self.position = np.array(place[:2], np.float32)
+
+    def close(self):
+        if self.client >= 0:
+            pybullet.disconnect(self.client)
+        self.client = -1
+
+
+class OwnWorld(SharedWorld):
+    """The same with physicsClientId everywhere: nothing is wrong with it."""
+
+    def start(self):
+        Clean.start(self)
+        own = {"physicsClientId": self.client}
+        pybullet.resetSimulation(**own)
+        pybullet.setGravity(0, 0, -10, **own)
+        shape = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.1, **own)
+        self.ball = pybullet.createMultiBody(1.0, shape, basePosition=[*self.position, 1.0], **own)
+
+    def move(self, action):
+        own = {"physicsClientId": self.client}
+        pybullet.resetBaseVelocity(self.ball, [float(action[0]), float(action[1]), 0.0], **own)
+        pybullet.stepSimulation(**own)
+        place, _ = pybullet.getBasePositionAndOrientation(self.ball, **own)
+        self.position = np.array(place[:2], np.float32)
+
+
+class CloseBreaks(Clean):
+    """The last thing that `close` ends is needed by all."""
+
+    device = {"open": 0}
+
+    def __init__(self):
+        super().__init__()
+        self.device["open"] = 1
+
+    def move(self, action):
+        if not self.device["open"]:
+            raise RuntimeError("device is closed")
+        super().move(action)
+
+    def close(self):
+        self.device["open"] = 0
+
+
+class OnlyOne(Clean):
+    taken = False
+
+    def __init__(self):
+        if OnlyOne.taken:
+            raise OSError("port 5000 is in use")
+        OnlyOne.taken = True
+        super().__init__()
+
+    def close(self):
+        pass
