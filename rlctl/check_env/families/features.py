@@ -150,7 +150,8 @@ def _first_steps(records: Records) -> list[_Step]:
 
 def _near(rows: Numbers) -> Numbers:
     """Return how near two values of each element are that count as alike."""
-    near = NEAR * np.where(np.isfinite(rows), rows, 0.0).std(axis=0)
-    if np.issubdtype(rows.dtype, np.integer):  # places and kinds are alike only if they are equal
-        near = np.minimum(near, 0.5)
+    rows = np.where(np.isfinite(rows), rows, 0.0)
+    near = NEAR * rows.std(axis=0)
+    is_whole = (rows == np.round(rows)).all(axis=0)  # places and kinds are alike only if they are equal
+    near[is_whole] = np.minimum(near[is_whole], 0.5)
     return np.where(near > 0, near, 1.0)
