@@ -11,8 +11,7 @@ from pathlib import Path
 
 from rlctl import registry
 from rlctl.check_env import families
-from rlctl.check_env.experiment import Experiment
-from rlctl.check_env.finding import RULES, Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.finding import RULES, Experiment, Finding, NotApplicable, NotJudged, Severity
 from rlctl.check_env.leaves import name_leaf
 from rlctl.check_env.messages import Message, Mistake
 from rlctl.check_env.progress import Position

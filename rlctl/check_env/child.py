@@ -12,9 +12,8 @@ from typing import Any
 from rlctl import env_spec
 from rlctl.check_env import families
 from rlctl.check_env.clock import read_clock
-from rlctl.check_env.experiment import Experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
+from rlctl.check_env.finding import Experiment, Finding, NotApplicable, NotJudged
 from rlctl.check_env.instance import Budget, Context
 from rlctl.check_env.messages import End, Failure, Finished, Message, Mistake, Skipped, encode
 from rlctl.check_env.progress import Progress

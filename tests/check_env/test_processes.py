@@ -11,8 +11,7 @@ import pytest
 
 from rlctl.check_env import families
 from rlctl.check_env.check import check, judge
-from rlctl.check_env.experiment import Check
-from rlctl.check_env.finding import choose_rules
+from rlctl.check_env.finding import Check, choose_rules
 from rlctl.check_env.messages import Fact, Series, decode, encode
 from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec

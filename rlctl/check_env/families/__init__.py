@@ -35,7 +35,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Iterable
 
-from rlctl.check_env.experiment import Check, Experiment
 from rlctl.check_env.families import (
     actions,
     determinism,
@@ -53,7 +52,7 @@ from rlctl.check_env.families import (
     speed,
     variants,
 )
-from rlctl.check_env.finding import RULES
+from rlctl.check_env.finding import RULES, Check, Experiment
 
 PROCESS_S = 18.0
 """How long the experiments of one process may take together [s]; importing and building comes on top."""

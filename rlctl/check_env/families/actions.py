@@ -14,8 +14,7 @@ from rlctl.check_env.action_trials import (
     find_other_rewards,
     observations_differ,
 )
-from rlctl.check_env.experiment import experiment
-from rlctl.check_env.finding import Finding, NotJudged, Severity, list_names
+from rlctl.check_env.finding import Finding, NotJudged, Severity, experiment, list_names
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message
 

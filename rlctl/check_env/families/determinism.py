@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import check, experiment
-from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.finding import Finding, NotJudged, Severity, check, experiment
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Built, Message, Skipped, Trajectory
 from rlctl.check_env.recording import Recording

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import check, experiment
-from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.finding import Finding, NotJudged, Severity, check, experiment
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import ENDS, FIRST_SEED, Message, Trajectory
 from rlctl.check_env.recording import Recording

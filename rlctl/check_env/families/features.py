@@ -9,9 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.experiment import check
 from rlctl.check_env.families.rewards import WITH_SEARCH, require_rewarded
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, list_names
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, check, list_names
 from rlctl.check_env.leaves import Leaf
 from rlctl.check_env.records import Records
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.families.rewards import (
     DISCOUNT,
     SUCCESS,
@@ -26,7 +25,7 @@ from rlctl.check_env.families.rewards import (
     require_rewarded,
     summarize,
 )
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, check, experiment
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
 from rlctl.check_env.recording import Recording

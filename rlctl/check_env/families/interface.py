@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.check_env.experiment import RECORDING, check, experiment
 from rlctl.check_env.failures import (
     NO_DISPLAY,
     EnvironmentRaised,
@@ -17,15 +16,15 @@ from rlctl.check_env.failures import (
     iterate_causes,
     lacks_display,
 )
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.finding import RECORDING, Finding, NotApplicable, NotJudged, Severity, check, experiment
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, Failure, Form, Message, Trajectory
 from rlctl.check_env.records import Records
 
 NUMBERS = ("float", "int", "numpy.float64")
 """Reward types that both libraries accept."""
-MANY_LINES = 0.1
-"""Lines printed per step from which printing is slow."""
+MANY_LINES = 0.5
+"""Lines printed per step from which printing is slow: about one each, and not a few per reset."""
 FEWEST_STEPS = 20
 """With fewer, what is printed belongs to the start."""
 MOST_FAILURES = 3

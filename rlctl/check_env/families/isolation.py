@@ -13,11 +13,10 @@ from typing import Any
 
 from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.check_env.families.interface import select_failures
-from rlctl.check_env.finding import Finding, NotJudged, Severity
+from rlctl.check_env.finding import Finding, NotJudged, Severity, check, experiment
 from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.messages import FIRST_SEED, SECOND_SEED, Message, Skipped
 from rlctl.check_env.recording import Recording

@@ -12,9 +12,8 @@ from typing import Any
 
 from rlctl import registry
 from rlctl.check_env.bullet_worlds import find_clients
-from rlctl.check_env.experiment import RECORDING, check, experiment
 from rlctl.check_env.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
-from rlctl.check_env.finding import Finding
+from rlctl.check_env.finding import RECORDING, Finding, check, experiment
 from rlctl.check_env.instance import Context, Instance, find_author, find_time_limit, is_task
 from rlctl.check_env.messages import Built, Message
 from rlctl.check_env.records import Records

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.check_env.experiment import RECORDING, check
-from rlctl.check_env.finding import Finding, Severity
+from rlctl.check_env.finding import RECORDING, Finding, Severity, check
 from rlctl.check_env.leaves import Leaf, name_leaf
 from rlctl.check_env.messages import Form, Series, Trajectory
 from rlctl.check_env.records import Records

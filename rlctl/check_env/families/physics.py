@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from rlctl.check_env.bullet_calls import BulletCall, record_calls
 from rlctl.check_env.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Body, Joint, Jump, Pair, find_clients
-from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, list_names
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, experiment, list_names
 from rlctl.check_env.instance import Context, is_task
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
 from rlctl.check_env.world_logs import Log, LoggedWorld, Place, WorldLogger

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, Severity, check, experiment
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, Message, Trajectory
 from rlctl.check_env.records import Records

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.episode import Episode, action_at, zero_action
-from rlctl.check_env.experiment import experiment
 from rlctl.check_env.families.rewards import (
     DISCOUNT,
     discounted_steps,
@@ -26,7 +25,7 @@ from rlctl.check_env.families.rewards import (
     has_succeeded,
     reports_success,
 )
-from rlctl.check_env.finding import Finding, NotJudged
+from rlctl.check_env.finding import Finding, NotJudged, experiment
 from rlctl.check_env.instance import Context, find_time_limit
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
 from rlctl.check_env.recording import Recording

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import check, experiment
 from rlctl.check_env.families.determinism import compare
-from rlctl.check_env.finding import Finding, NotJudged
+from rlctl.check_env.finding import Finding, NotJudged, check, experiment
 from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.leaves import flatten_numbers
 from rlctl.check_env.messages import FIRST_SEED, Message

@@ -10,8 +10,7 @@ from typing import Any
 from rlctl.check_env.bullet_calls import visible_to_profilers
 from rlctl.check_env.clock import read_clock
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import check, experiment
-from rlctl.check_env.finding import Finding, NotJudged, list_names
+from rlctl.check_env.finding import Finding, NotJudged, check, experiment, list_names
 from rlctl.check_env.instance import Context, Instance, rebuilds_world
 from rlctl.check_env.messages import Fact, Message
 from rlctl.check_env.profiling import Profiler, Stopwatch, TimedCall, find_own_code

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from rlctl import registry
 from rlctl.check_env.episode import Episode
-from rlctl.check_env.experiment import experiment
 from rlctl.check_env.failures import EnvironmentRaised, describe
-from rlctl.check_env.finding import Finding, NotApplicable, NotJudged
+from rlctl.check_env.finding import Finding, NotApplicable, NotJudged, experiment
 from rlctl.check_env.instance import Context, Instance
 from rlctl.check_env.leaves import flatten_numbers
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped
