@@ -17,8 +17,6 @@ from rlctl.rollout.messages import Answer, Job, Message
 from rlctl.rollout.process_start import StartProcess
 from rlctl.rollout.worker_output import forward
 
-# A PyBullet world is one block of 28 MB, which huge pages fill in half the time. Other C libraries ignore this.
-_TUNED = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 _CHECK_EVERY_S = 0.2
 
 
@@ -143,6 +141,5 @@ def _start_process(job: Job, printing: int, start: StartProcess | None) -> Child
         stdout=printing,
         stderr=printing,
         descriptors=(job.memory, job.numbers),
-        environment={name: value for name, value in _TUNED.items() if name not in os.environ},
         start=start,
     )
