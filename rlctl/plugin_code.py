@@ -67,8 +67,9 @@ def import_file(task: str, file: Path) -> Any:
     file = _find_loaded(file.expanduser())
     if not file.is_file():
         raise UsageError(f"task {task!r}: no file {file}")
+    path = str(file)
     for loaded, known in list(sys.modules.items()):
-        if getattr(known, "__file__", None) == str(file) and loaded != "__main__":
+        if getattr(known, "__file__", None) == path and loaded != "__main__":
             return known
     folder = str(file.parent)
     if folder not in sys.path:

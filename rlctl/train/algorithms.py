@@ -38,7 +38,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     check_spaces(recipe.algo, env.observation_space, env.action_space)
     _check_rollout(recipe, env.num_envs)
     footprint.check(recipe, env.observation_space, env.action_space, env.num_envs)
-    _keep_compiler_out()
+    keep_compiler_out()
     try:
         model: BaseAlgorithm = cls(
             name,
@@ -54,7 +54,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error), 300)}") from error
 
 
-def _keep_compiler_out() -> None:
+def keep_compiler_out() -> None:
     """Take torch's marks for its compiler off the optimisers: nothing is compiled here, and to honour them imports it.
 
     That takes 1.6 s, more than torch itself.

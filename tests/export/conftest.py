@@ -12,7 +12,7 @@ from rlctl.run.env_info import describe
 from rlctl.run.policy import save_policy
 from rlctl.run.recipe import Normalize
 from rlctl.run.torch_policy import ALGORITHMS, policy_name
-from rlctl.train.algorithms import wrap_normalize
+from rlctl.train.algorithms import keep_compiler_out, wrap_normalize
 from rlctl.train.pack import pack
 
 SMALL = f"{Path(__file__).parent / 'envs.py'}:Small"
@@ -22,6 +22,9 @@ ON_POLICY = {
     "recurrent_ppo": {"n_steps": 32, "batch_size": 32, "n_epochs": 1},
 }
 OFF_POLICY = {"learning_starts": 16, "buffer_size": 200, "batch_size": 16}
+
+
+keep_compiler_out()  # for the models of all tests: importing it takes longer than training them
 
 
 @pytest.fixture(autouse=True)
@@ -46,7 +49,8 @@ def train():
     def trained(algo, spec, steps=32, **kwargs):
         env = wrap_normalize(DummyVecEnv([spec.make]), Normalize(), 0.99)
         name = policy_name(algo, env.observation_space)
-        settings = {**ON_POLICY.get(algo, OFF_POLICY), "policy_kwargs": {"net_arch": [16, 16]}, **kwargs}
+        network = {"net_arch": [16, 16], **({"lstm_hidden_size": 16} if algo == "recurrent_ppo" else {})}
+        settings = {**ON_POLICY.get(algo, OFF_POLICY), "policy_kwargs": network, **kwargs}
         model = ALGORITHMS[algo](name, env, device="cpu", seed=0, **settings)
         if steps:
             model.learn(steps)
