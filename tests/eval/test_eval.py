@@ -189,7 +189,7 @@ def test_an_exported_policy_is_evaluated_alike_and_without_torch(reach_run, eval
         "import sys; from rlctl.cli import run\n"
         f"code = run(['eval', {str(exported)!r}, '--task', 'reach', '--episodes', '6', '--n-envs', '1',"
         " '--json', 'result.json'])\n"
-        "sys.exit(99 if {'torch', 'stable_baselines3'} & set(sys.modules) else code)"
+        "sys.exit(99 if {'torch', 'stable_baselines3', 'scipy'} & set(sys.modules) else code)"
     )
     done = fork_server.for_workers().run([sys.executable, "-c", code], cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -8,6 +8,7 @@ import psutil
 import pytest
 
 from rlctl.errors import TaskError
+from rlctl.rollout import workers
 from rlctl.train import checkpoint, saving
 from tests.train import faulty_envs
 from tests.train.comparing import assert_same_run
@@ -22,9 +23,10 @@ pytestmark = pytest.mark.usefixtures("every_boundary")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _two_workers(use_cores):
+def _two_workers():
     """One environment each: what harms a worker is seen apart from what harms the other environment."""
-    with use_cores(2):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workers, "available_cores", lambda: 2)
         yield
 
 
