@@ -29,10 +29,7 @@ from rlctl.rollout.process_start import set_default_start
 from tests.forked_process import SIGNALS, become
 
 ROOT = Path(__file__).parents[1]
-FOR_WORKERS = (
-    *("rlctl.rollout.worker_process", "rlctl.task.env", "rlctl.run.env_info", "rlctl.check_env.child"),
-    "gymnasium.envs.registration",
-)
+FOR_WORKERS = ("rlctl.rollout.worker_process", "rlctl.task.env", "rlctl.run.env_info", "rlctl.check_env.child")
 FOR_COMMANDS = (
     *("torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
     *("rlctl.eval.evaluate", "rlctl.eval.report", "rlctl.run.torch_policy", "rlctl.tasks.listing"),
