@@ -7,11 +7,14 @@ import threading
 
 import hypothesis.strategies as st
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 
 from rlctl.deploy import messages
 from rlctl.deploy.measurements import read_memory
 from tests.deploy.serving import OBSERVATION, RunningServer, write_policy
+
+REPEATABLE = settings(deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+"""The same examples each time, however slow the machine is."""
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +111,7 @@ def test_two_hundred_connections(server):
             connection.close()
 
 
-@settings(deadline=None, max_examples=100)
+@settings(REPEATABLE, max_examples=100)
 @given(st.one_of(st.binary(max_size=200), st.integers(0, 255).map(lambda byte: bytes([byte]) * 50)))
 def test_any_bytes_are_a_message_or_not(content):
     for read in (messages.unpack, messages.parse_json):

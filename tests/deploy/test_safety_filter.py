@@ -7,7 +7,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 
 from rlctl.deploy import Limits, SafetyFilter
 from rlctl.errors import UsageError
@@ -15,6 +15,8 @@ from rlctl.run.env_info import EnvInfo, space_to_json
 from tests.deploy.conftest import make_arm, make_filter, observe_at, run_filter
 
 REST = observe_at(0.0, 0.0)
+REPEATABLE = settings(deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+"""The same examples each time, however slow the machine is."""
 
 
 def test_speed_by_hand(arm):
@@ -222,7 +224,7 @@ def give_order(safety, order):
         getattr(safety, order)()
 
 
-@settings(deadline=None, max_examples=40)
+@settings(REPEATABLE, max_examples=40)
 @given(steps=STEPS, on_fault=st.sampled_from(["hold", "home", "stop"]), lowpass=st.sampled_from([None, 2.0]))
 def test_positions_keep_every_limit(steps, on_fault, lowpass):
     limits = {"position": [-1.0, 0.8], "speed": 2.0, "acceleration": 6.0}
@@ -247,7 +249,7 @@ def test_positions_keep_every_limit(steps, on_fault, lowpass):
     assert (np.abs(np.diff(moved, axis=0)) <= 0.06 + 1e-5).all()  # 6 rad/s^2 over 0.1 s twice
 
 
-@settings(deadline=None, max_examples=40)
+@settings(REPEATABLE, max_examples=40)
 @given(steps=STEPS, command=st.sampled_from(["step", "speed"]))
 def test_motions_keep_every_limit(steps, command):
     limits = {"position": [-1.0, 0.8], "speed": 2.0}
@@ -267,7 +269,7 @@ def test_motions_keep_every_limit(steps, command):
             assert ((known + x >= -1.0 - tolerance) | (x >= -tolerance)).all()
 
 
-@settings(deadline=None, max_examples=40)
+@settings(REPEATABLE, max_examples=40)
 @given(steps=STEPS, command=st.sampled_from(["torque", "action"]))
 def test_values_keep_every_limit(steps, command):
     limits = {"rate": 5.0, "action": [-1.5, 2.0], **({"torque": 1.8} if command == "torque" else {})}
