@@ -123,18 +123,20 @@ def anonymous_file() -> int:
 class LineReader:
     """Hands each line that is written to `descriptor` to a function, in a thread of its own.
 
-    Close `descriptor` (`close_descriptor`) once the children that write to it have been started.
+    Close `descriptor` (`close_descriptor`) once the children that write to it have been started. A line of more than
+    `max_bytes` comes in parts.
     """
 
-    def __init__(self, receive: Callable[[str], None]) -> None:
+    def __init__(self, receive: Callable[[str], None], max_bytes: int = -1) -> None:
         read_end, self.descriptor = os.pipe()
         self._receive = receive
+        self._max_bytes = max_bytes
         self._thread = threading.Thread(target=self._read, args=(read_end,), daemon=True)
         self._thread.start()
 
     def _read(self, read_end: int) -> None:
         with os.fdopen(read_end, "rb") as pipe:
-            for line in pipe:
+            while line := pipe.readline(self._max_bytes):
                 self._receive(line.decode(errors="replace").rstrip("\r\n"))
 
     def close_descriptor(self) -> None:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import signal
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Iterable
 from multiprocessing.connection import wait
 
 from rlctl.rollout import messages
-from rlctl.rollout.child_process import ChildProcess
+from rlctl.rollout.child_process import ChildProcess, LineReader
 from rlctl.rollout.messages import Answer, Job, Message
 from rlctl.rollout.process_start import StartProcess
-from rlctl.rollout.worker_output import forward
+from rlctl.rollout.worker_output import MAX_LINE_BYTES, LineFilter
 
 _CHECK_EVERY_S = 0.2
 
@@ -46,17 +44,16 @@ class ProcessPool:
         self.waiting_for: set[int] = set()
         """The workers that have not answered yet."""
         self._processes: list[ChildProcess] = []
-        read_end, printing = os.pipe()
-        self._output = threading.Thread(target=forward, args=(read_end, on_output), daemon=True)
-        self._output.start()
+        self._printed = LineFilter(on_output)
+        self._output = LineReader(self._printed.line, MAX_LINE_BYTES)
         try:
             for job in jobs:
-                self._processes.append(_start_process(job, printing, start))
+                self._processes.append(_start_process(job, self._output.descriptor, start))
         except BaseException:
             self.close(grace_s=0.0)
             raise
         finally:
-            os.close(printing)
+            self._output.close_descriptor()
 
     def __len__(self) -> int:
         return len(self._processes)
@@ -131,7 +128,8 @@ class ProcessPool:
         self._processes = []
         self.waiting_for = set()
         self._progress = bytes  # or it would hold its owner, and the memory that this maps
-        self._output.join(timeout=1.0)
+        self._output.wait()
+        self._printed.end()
 
 
 def _start_process(job: Job, printing: int, start: StartProcess | None) -> ChildProcess:

@@ -1,4 +1,4 @@
-"""What environments print, forwarded line by line at a readable rate."""
+"""What environments print: each line once, cleaned, and not more than can be read."""
 
 from __future__ import annotations
 
@@ -11,20 +11,13 @@ MAX_LINE_BYTES = 1000  # bytes
 MAX_LINES_PER_S = 100
 
 
-def forward(read_end: int, receive: Callable[[str], None]) -> None:
-    """Hand what comes out of a pipe to `receive`, until all its writers are gone; closes it.
+class LineFilter:
+    """Hands lines that environments print to `receive`, at a rate that can be read.
 
     A process that prints blocks while nobody reads, so lines that come too fast are counted and dropped, and if
-    `receive` raises `OSError`, as a closed stderr does, the rest is read and dropped.
+    `receive` raises `OSError`, as a closed stderr does, all that follow.
     """
-    filter_ = _LineFilter(receive)
-    with os.fdopen(read_end, "rb") as pipe:
-        while line := pipe.readline(MAX_LINE_BYTES):
-            filter_.line(line.decode(errors="replace"))
-    filter_.end()
 
-
-class _LineFilter:
     def __init__(self, receive: Callable[[str], None]) -> None:
         self._receive = receive
         self._closed = False
@@ -36,12 +29,13 @@ class _LineFilter:
         self._bullet_warnings: set[str] = set()
 
     def line(self, text: str) -> None:
+        """Take a line."""
         # Many environments print the same line; once is enough.
         if text == self._last or text.startswith("pybullet build time"):
             return
         # PyBullet's warnings have two lines, the second of which says what is wrong.
         if text.startswith(("b3Warning[", "b3Error[")):
-            self._bullet_head = text.rstrip()
+            self._bullet_head = text
             return
         if self._bullet_head:
             text, self._bullet_head = f"{self._bullet_head} {text}", ""
@@ -60,6 +54,7 @@ class _LineFilter:
             self._report(replace_control_characters(text))
 
     def end(self) -> None:
+        """Report how many lines were left out, if any."""
         if self._left_out:
             self._report(f"({self._left_out:,} more lines of what environments print are left out)")
         self._left_out = 0
@@ -74,7 +69,7 @@ class _LineFilter:
 
 def replace_control_characters(text: str) -> str:
     """Return a line without what would move a terminal's cursor, or worse."""
-    return "".join(each if each.isprintable() or each == "\t" else "\ufffd" for each in text.rstrip("\r\n"))
+    return "".join(each if each.isprintable() or each == "\t" else "\ufffd" for each in text)
 
 
 def write_stderr(text: str) -> None:

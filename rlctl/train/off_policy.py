@@ -35,8 +35,8 @@ class OffPolicyRollouts(Rollouts):
         # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
         self.overlap = recipe.overlap and recipe.her is None
         default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # else they would not explore at all
-        updates = [update(model) for update in (SacUpdate, TqcUpdate) if update.supports(model)]
-        self._update: SacUpdate | Any = updates[0] if updates else model
+        kinds = [update for update in (SacUpdate, TqcUpdate) if update.supports(model)]
+        self._learner: Any = kinds[0](model) if kinds else model
         self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
 
     def start(self) -> None:
@@ -103,4 +103,4 @@ class OffPolicyRollouts(Rollouts):
         if steps and model.num_timesteps > model.learning_starts:
             updates = model.gradient_steps if model.gradient_steps >= 0 else steps
             if updates > 0:
-                self._update.train(batch_size=model.batch_size, gradient_steps=updates)
+                self._learner.train(batch_size=model.batch_size, gradient_steps=updates)

@@ -34,7 +34,7 @@ class OnPolicyRollouts(Rollouts):
 
     def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
         super().__init__(model, env, recipe, progress)
-        self._update: PpoUpdate | Any = PpoUpdate(model) if PpoUpdate.supports(model) else model
+        self._learner: Any = PpoUpdate(model) if PpoUpdate.supports(model) else model
 
     def start(self) -> None:
         model = self.model
@@ -50,7 +50,7 @@ class OnPolicyRollouts(Rollouts):
         self.finish_segment(segment)
 
     def learn(self) -> None:
-        self._update.train()
+        self._learner.train()
 
     def _fill_buffer(self, segment: PlayedSegment, rewards: NDArray[np.float32]) -> None:
         """Write a segment into SB3's buffer, whose arrays have the shape (steps, environments, ...)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import signal
@@ -19,6 +20,7 @@ from rlctl import output, registry
 from rlctl.errors import Interrupted, RlctlError, UsageError
 from rlctl.eval.evaluate import EvalRequest
 from rlctl.eval.group import GroupScore, as_json, evaluate_group
+from rlctl.rollout.child_process import LineReader
 from rlctl.rollout.process_start import Process, default_start
 from rlctl.rollout.workers import available_cores
 from rlctl.run import files
@@ -147,7 +149,7 @@ class _Trainings:
         self._failed: dict[int, int] = {}
         self._jobs = jobs
         self._signals: list[int] = []
-        self._readers: list[threading.Thread] = []
+        self._readers: list[LineReader] = []
 
     def run(self, group: Group) -> dict[int, int]:
         """Train all; return the exit code of each seed that failed."""
@@ -165,7 +167,7 @@ class _Trainings:
                 self._take_ended()
                 time.sleep(_POLL_S)
         for reader in self._readers:
-            reader.join(timeout=1.0)
+            reader.wait()
         if first is not None:
             raise Interrupted(f"interrupted; go on with: rlctl train --resume {group.path}", first)
         return self._failed
@@ -196,18 +198,16 @@ class _Trainings:
             seed = next(iter(self._waiting))
             arguments = self._waiting.pop(seed)
             with _share_of_cores(place, self._jobs):
-                read, write = os.pipe()
+                reader = LineReader(functools.partial(_print_line, seed))
                 process = default_start()(
                     [sys.executable, "-m", "rlctl", *arguments],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
-                    stderr=write,
+                    stderr=reader.descriptor,
                     process_group=0,
                 )
-            os.close(write)
+            reader.close_descriptor()
             self._running[place] = seed, process
-            reader = threading.Thread(target=_print_lines, args=(seed, read), daemon=True)
-            reader.start()
             self._readers.append(reader)
 
     def _take_ended(self) -> None:
@@ -219,10 +219,8 @@ class _Trainings:
                     self._failed[seed] = code if code > 0 else 128 - code
 
 
-def _print_lines(seed: int, descriptor: int) -> None:
-    with os.fdopen(descriptor, encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            print(f"seed {seed}: {line}", end="", file=sys.stderr, flush=True)
+def _print_line(seed: int, line: str) -> None:
+    print(f"seed {seed}: {line}", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

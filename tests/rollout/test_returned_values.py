@@ -1,16 +1,15 @@
 """What a worker says of what environments do and return: here in this process, without one."""
 
 import os
-import threading
 
 import pytest
 
 from rlctl.env_spec import EnvSpec
-from rlctl.rollout.child_process import anonymous_file
+from rlctl.rollout.child_process import LineReader, anonymous_file
 from rlctl.rollout.failures import FailedInEpisode, describe_failure
 from rlctl.rollout.messages import Attach, Build, Failure, Job, LoadPolicy, Play, Segment
 from rlctl.rollout.worker import Worker
-from rlctl.rollout.worker_output import MAX_LINE_BYTES, MAX_LINES_PER_S, forward, replace_control_characters
+from rlctl.rollout.worker_output import MAX_LINE_BYTES, MAX_LINES_PER_S, LineFilter, replace_control_characters
 from tests.train import faulty_envs
 
 ENVS = faulty_envs.__file__
@@ -103,13 +102,13 @@ def test_functions_that_call_each_other_for_ever():
 
 def forward_lines(content: bytes, receive=None):
     lines = []
-    read_end, write_end = os.pipe()
-    thread = threading.Thread(target=forward, args=(read_end, receive or lines.append))
-    thread.start()
-    with os.fdopen(write_end, "wb") as pipe:
+    printed = LineFilter(receive or lines.append)
+    reader = LineReader(printed.line, MAX_LINE_BYTES)
+    with os.fdopen(os.dup(reader.descriptor), "wb") as pipe:
         pipe.write(content)
-    thread.join(timeout=120)
-    assert not thread.is_alive()
+    reader.close_descriptor()
+    reader.wait(timeout_s=120)
+    printed.end()
     return lines
 
 
