@@ -140,7 +140,7 @@ def _status(task: str, wanted: bool) -> Iterator[Callable[[Position], None]]:
 
 def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> Verdict:
     """Apply the rules; the findings come worst first. Raises `UsageError` for a waiver that cannot be used."""
-    verdict = Verdict(crashed=dict(records.crashes))
+    verdict = Verdict(crashed={name: each.crash for name, each in records.finished.items() if each.crash})
     for rule in rules:
         _apply(rule, records, verdict)
     if records.built is not None:
@@ -188,7 +188,9 @@ def _require_complete(records: Records, experiment: Experiment, rule: str) -> No
         raise NotJudged(records.skipped[rule])
     if rule in records.not_applicable:
         raise NotApplicable(records.not_applicable[rule])
-    if experiment.name not in records.complete and not (records.built is None and experiment.name == "build"):
+    finished = records.finished.get(experiment.name)
+    is_complete = finished is not None and finished.is_complete
+    if not is_complete and not (records.built is None and experiment.name == "build"):
         raise NotJudged(records.why_missing(experiment.name))
 
 

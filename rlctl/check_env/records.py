@@ -38,12 +38,8 @@ class Records:
     """Experiments, roles and rules that were left out, and why."""
     not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
     """Rules that an experiment found nothing to look at for, and why."""
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Per experiment that was run, how long it took."""
-    complete: set[str] = dataclasses.field(default_factory=set)
-    """Experiments that came to their end."""
-    crashes: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Per experiment that crashed by itself, its traceback."""
+    finished: dict[str, Finished] = dataclasses.field(default_factory=dict)
+    """Per experiment that was run and did not end its process."""
     normalizes_rewards: Callable[[], bool] = lambda: False
     """Says whether there is a packaged recipe, and it normalises rewards."""
     printed_lines: int = 0
@@ -66,11 +62,7 @@ class Records:
             case Skipped():
                 (self.skipped if message.applies else self.not_applicable)[message.name] = message.reason
             case Finished():
-                self.seconds[message.experiment] = message.seconds
-                if message.is_complete:
-                    self.complete.add(message.experiment)
-                if message.crash:
-                    self.crashes[message.experiment] = message.crash
+                self.finished[message.experiment] = message
 
     def role(self, role: str) -> list[Trajectory]:
         """Return what was recorded for one purpose."""

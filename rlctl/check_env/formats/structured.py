@@ -53,7 +53,7 @@ def content(report: Report) -> dict[str, Any]:
         "steps": sum(each.steps for each in records.trajectories),
         "seconds": report.seconds,
         "budget_seconds": report.budget_s,
-        "experiments": records.seconds,
+        "experiments": {name: each.seconds for name, each in records.finished.items()},
     }
 
 
