@@ -84,7 +84,7 @@ def _left_out_clients(calls: Sequence[BulletCall]) -> Iterator[Finding]:
 
 def _model_faults(env: Any) -> Iterator[Message]:
     if not is_task(env):
-        yield Skipped("RL809", "only of a task of rlctl are the model files known", applies=False)
+        yield Skipped("RL809", "model files are known of tasks of rlctl only", applies=False)
         return
     from rlctl.task.inertia import find_inertia_faults
 
