@@ -68,6 +68,8 @@ class ReplaySegments:
         """Write what is new after `added` transitions in all; return the segments that make up the buffer."""
         oldest = max(0, added - self.buffer.buffer_size)
         segments = [each for each in self._segments if each.last > oldest]
+        if not all((self.folder / each.name).exists() for each in segments):  # somebody has removed some
+            segments, self._written = [], 0
         first = max(self._written, oldest)
         while first < added and segments and self._should_merge(segments[-1], first, added):
             first = max(min(first, segments.pop().first), oldest)

@@ -23,13 +23,16 @@ PHASES = {
     "evaluation": (rlctl.train.evaluation.Evaluator, "run", 1),
     "first checkpoint": (rlctl.run.files, "os.rename", 1),
     "checkpoint": (rlctl.run.files, "os.rename", 2),
-    "evaluated checkpoint": (rlctl.run.files, "os.rename", 3),
+    "evaluated checkpoint": (rlctl.run.files, "os.rename", 4),
     "final evaluation": (rlctl.train.evaluation.Evaluator, "run", 2),
     "the end": (rlctl.train.loop.TrainingLoop, "finish", 1),
-    "last checkpoint": (rlctl.run.files, "os.rename", 4),
+    "last checkpoint": (rlctl.run.files, "os.rename", 6),
     "done": (rlctl.train.status, "write_end", 1),
 }
-"""Phase -> the function that is in it, and which call of it."""
+"""Phase -> the function that is in it, and which call of it.
+
+Each checkpoint is renamed into its place; after all but the first, the one before is renamed aside, to be removed.
+"""
 
 
 def send(number, phase, everybody=False, again=False):
