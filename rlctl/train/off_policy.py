@@ -13,8 +13,8 @@ from rlctl.run.network import DETERMINISTIC
 from rlctl.run.recipe import Recipe
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, to_network_layout
-from rlctl.train.sac_update import SacUpdate
-from rlctl.train.tqc_update import TqcUpdate
+from rlctl.train.updates.sac import SacUpdate
+from rlctl.train.updates.tqc import TqcUpdate
 from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
 
 _LONGEST = 1000

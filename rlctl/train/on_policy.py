@@ -16,9 +16,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from rlctl.dict_spaces import join, split, split_space
 from rlctl.run.acting import Exploration
 from rlctl.run.recipe import Recipe
-from rlctl.train.ppo_update import PpoUpdate
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, Statistics, to_network_layout
+from rlctl.train.updates.ppo import PpoUpdate
 from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
 
 Arrays = dict[str, NDArray[Any]]

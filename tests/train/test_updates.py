@@ -12,9 +12,9 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rlctl.dict_spaces import split
-from rlctl.train.ppo_update import PpoUpdate
-from rlctl.train.sac_update import SacUpdate
-from rlctl.train.tqc_update import TqcUpdate
+from rlctl.train.updates.ppo import PpoUpdate
+from rlctl.train.updates.sac import SacUpdate
+from rlctl.train.updates.tqc import TqcUpdate
 
 pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 

@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import explained_variance
 from torch import Tensor
 
 from rlctl.dict_spaces import join, split
-from rlctl.train.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
+from rlctl.train.updates.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
 
 _FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
 

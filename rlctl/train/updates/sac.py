@@ -13,8 +13,8 @@ import torch
 from stable_baselines3 import SAC
 from torch import Tensor
 
-from rlctl.train.mlp import Mlp, is_mlp, share_gradients
-from rlctl.train.squashed_actor import Sample, SquashedActor
+from rlctl.train.updates.mlp import Mlp, is_mlp, share_gradients
+from rlctl.train.updates.squashed_actor import Sample, SquashedActor
 
 
 class SacUpdate:

@@ -12,7 +12,7 @@ import torch
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution, StateDependentNoiseDistribution
 from torch import Tensor
 
-from rlctl.train.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
+from rlctl.train.updates.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
 
 _LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE
 

@@ -12,7 +12,7 @@ import torch
 from sb3_contrib import TQC
 from torch import Tensor
 
-from rlctl.train.sac_update import SacUpdate
+from rlctl.train.updates.sac import SacUpdate
 
 
 class TqcUpdate(SacUpdate):
