@@ -13,8 +13,8 @@ from rlctl.deploy import messages
 from rlctl.deploy.measurements import read_memory
 from tests.deploy.serving import OBSERVATION, RunningServer, write_policy
 
-# Without the phase of targets, for which hypothesis loads a module amid a test: Python 3.11 can fail to compile one while
-# it collects garbage ("AST constructor recursion depth mismatch").
+# Without the phase of targets, for which hypothesis loads a module amid a test: Python 3.11 can fail to compile one
+# while it collects garbage ("AST constructor recursion depth mismatch").
 REPEATABLE = settings(
     deadline=None,
     derandomize=True,

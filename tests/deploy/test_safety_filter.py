@@ -15,8 +15,8 @@ from rlctl.run.env_info import EnvInfo, space_to_json
 from tests.deploy.conftest import make_arm, make_filter, observe_at, run_filter
 
 REST = observe_at(0.0, 0.0)
-# Without the phase of targets, for which hypothesis loads a module amid a test: Python 3.11 can fail to compile one while
-# it collects garbage ("AST constructor recursion depth mismatch").
+# Without the phase of targets, for which hypothesis loads a module amid a test: Python 3.11 can fail to compile one
+# while it collects garbage ("AST constructor recursion depth mismatch").
 REPEATABLE = settings(
     deadline=None,
     derandomize=True,
