@@ -13,8 +13,6 @@ from rlctl.run.network import DETERMINISTIC
 from rlctl.run.recipe import Recipe
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, to_network_layout
-from rlctl.train.updates.sac import SacUpdate
-from rlctl.train.updates.tqc import TqcUpdate
 from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
 
 _LONGEST = 1000
@@ -35,8 +33,6 @@ class OffPolicyRollouts(Rollouts):
         # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
         self.overlap = recipe.overlap and recipe.her is None
         default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # else they would not explore at all
-        kinds = [update for update in (SacUpdate, TqcUpdate) if update.supports(model)]
-        self._learner: Any = kinds[0](model) if kinds else model
         self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
 
     def start(self) -> None:

@@ -15,11 +15,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from rlctl.dict_spaces import join, split, split_space
 from rlctl.run.acting import Exploration
-from rlctl.run.recipe import Recipe
-from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, Statistics, to_network_layout
-from rlctl.train.updates.ppo import PpoUpdate
-from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
+from rlctl.train.vec_env import PlayedSegment
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -31,10 +28,6 @@ class OnPolicyRollouts(Rollouts):
     """Plays `n_steps` steps of each environment into the rollout buffer."""
 
     _statistics: Statistics
-
-    def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
-        super().__init__(model, env, recipe, progress)
-        self._learner: Any = PpoUpdate(model) if PpoUpdate.supports(model) else model
 
     def start(self) -> None:
         model = self.model

@@ -17,6 +17,7 @@ from rlctl.run.policy import PolicyInfo
 from rlctl.run.recipe import Recipe
 from rlctl.train.pack import observation_statistics, pack
 from rlctl.train.progress import Progress
+from rlctl.train.updates import choose_learner
 from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
 
 Check = Callable[[], None]
@@ -38,6 +39,7 @@ class Rollouts(abc.ABC):
         self.env = env
         self._algo = recipe.algo
         self._progress = progress
+        self._learner = choose_learner(model)
         self._policy_info: PolicyInfo | None = None
 
     def begin(self, total_timesteps: int) -> None:

@@ -24,8 +24,9 @@ def policy_slow(run: History) -> str | None:
 def environments_slow(run: History) -> str | None:
     """Most of the time goes into slow environments."""
     shares = _read_shares(run)
-    slow = shares is not None and shares.environments >= 0.5 and shares.learner <= 0.2 and shares.steps_per_s <= 300
-    return shares.describe() if shares and slow else None
+    if shares is None or shares.environments < 0.5 or shares.learner > 0.2 or shares.steps_per_s > 300:
+        return None
+    return shares.describe()
 
 
 @dataclasses.dataclass(frozen=True)
