@@ -1,13 +1,23 @@
-"""Environments, as policies describe them, and limits for them."""
+"""Environments, as policies describe them, limits for them, and how examples are generated."""
 
 import numpy as np
 import pytest
 from gymnasium import spaces
+from hypothesis import HealthCheck, Phase, settings
 
 from rlctl.deploy import Limits, SafetyFilter
 from rlctl.run.env_info import EnvInfo, space_to_json
 
 JOINTS = ["shoulder", "elbow"]
+# Without the phase of targets, for which hypothesis loads a module amid a test: Python 3.11 can fail to compile one
+# while it collects garbage ("AST constructor recursion depth mismatch").
+REPEATABLE = settings(
+    deadline=None,
+    derandomize=True,
+    phases=(Phase.generate, Phase.shrink),
+    suppress_health_check=[HealthCheck.too_slow],
+)
+"""The same examples each time, however slow the machine is."""
 
 
 @pytest.fixture

@@ -7,21 +7,12 @@ import threading
 
 import hypothesis.strategies as st
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import given, settings
 
 from rlctl.deploy import messages
 from rlctl.deploy.measurements import read_memory
+from tests.deploy.conftest import REPEATABLE
 from tests.deploy.serving import OBSERVATION, RunningServer, write_policy
-
-# Without the phase of targets, for which hypothesis loads a module amid a test: Python 3.11 can fail to compile one
-# while it collects garbage ("AST constructor recursion depth mismatch").
-REPEATABLE = settings(
-    deadline=None,
-    derandomize=True,
-    phases=(Phase.generate, Phase.shrink),
-    suppress_health_check=[HealthCheck.too_slow],
-)
-"""The same examples each time, however slow the machine is."""
 
 
 @pytest.fixture(scope="module")

@@ -7,23 +7,14 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import given, settings
 
 from rlctl.deploy import Limits, SafetyFilter
 from rlctl.errors import UsageError
 from rlctl.run.env_info import EnvInfo, space_to_json
-from tests.deploy.conftest import make_arm, make_filter, observe_at, run_filter
+from tests.deploy.conftest import REPEATABLE, make_arm, make_filter, observe_at, run_filter
 
 REST = observe_at(0.0, 0.0)
-# Without the phase of targets, for which hypothesis loads a module amid a test: Python 3.11 can fail to compile one
-# while it collects garbage ("AST constructor recursion depth mismatch").
-REPEATABLE = settings(
-    deadline=None,
-    derandomize=True,
-    phases=(Phase.generate, Phase.shrink),
-    suppress_health_check=[HealthCheck.too_slow],
-)
-"""The same examples each time, however slow the machine is."""
 
 
 def test_speed_by_hand(arm):
