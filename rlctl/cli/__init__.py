@@ -64,7 +64,7 @@ def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name)
         else:
-            app.command(name)(command)
+            app.command(name, cls=replay.ReplayCommand if name == "replay" else None)(command)
     return app
 
 

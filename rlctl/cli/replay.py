@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
+import itertools
+import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from rlctl import completion
 from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Set, choose_checkpoint, claim_stdout, parse_changes
 
 if TYPE_CHECKING:
     from rlctl.replay.choice import Choice
+
+_BY_OUTCOME = ("--worst", "--best", "--failures")
+
+
+class ReplayCommand(TyperCommand):
+    """Reads `--best RUN` as `--best 1 RUN`, and so for the other options that choose episodes by outcome."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, list(_fill_counts(args)))
+
+
+def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
+    for argument, following in itertools.pairwise([*arguments, ""]):
+        yield argument
+        # Only a number is the option's own: anything else after it may be the run.
+        if argument in _BY_OUTCOME and not re.fullmatch(r"[-+]?\d[\d.]*", following):
+            yield "1"
 
 
 def replay(
@@ -31,14 +52,19 @@ def replay(
         ),
     ] = None,
     worst: Annotated[
-        int | None, typer.Option(metavar="N", help="The N worst of --episodes.", min=1, show_default=False)
+        int | None, typer.Option(metavar="[N]", help="The N (1) worst of --episodes.", min=1, show_default=False)
     ] = None,
     best: Annotated[
-        int | None, typer.Option(metavar="N", help="The N best of --episodes.", min=1, show_default=False)
+        int | None, typer.Option(metavar="[N]", help="The N (1) best of --episodes.", min=1, show_default=False)
     ] = None,
     failures: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Up to N that failed of --episodes, worst first.", min=1, show_default=False),
+        typer.Option(
+            metavar="[N]",
+            help="Up to N (1) that failed of --episodes, worst first.",
+            min=1,
+            show_default=False,
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
     checkpoint: Checkpoint = "best",

@@ -1,7 +1,9 @@
 """`rlctl replay --worst`, `--best`, `--failures`: episodes by outcome."""
 
 import pytest
+import typer
 
+from rlctl.cli import build_app
 from rlctl.errors import UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.replay.choice import Choice, select
@@ -45,6 +47,34 @@ def test_no_failures_is_an_answer(replay, run, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "no failure among 2 episodes (seed 0): nothing to replay" in done.stdout
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "source", "counts"),
+    [
+        (["--best", "reach"], "reach", {"best": 1}),
+        (["--best", "2", "reach"], "reach", {"best": 2}),
+        (["--failures=3", "reach"], "reach", {"failures": 3}),
+        (["reach", "--worst"], "reach", {"worst": 1}),
+        (["--worst", "--episodes", "5"], None, {"worst": 1}),
+        (["--best", "x"], "x", {"best": 1}),
+        (["--best", "--", "7"], "7", {"best": 1}),
+        (["--checkpoint", "last", "7"], "7", {}),
+    ],
+)
+def test_only_a_number_after_an_option_is_its_own(arguments, source, counts):
+    command = typer.main.get_command(build_app(["replay"])).commands["replay"]
+    parameters = command.make_context("replay", list(arguments)).params
+    assert parameters["source"] == source
+    assert {name: n for name in ("worst", "best", "failures") if (n := parameters[name]) is not None} == counts
+
+
+@pytest.mark.parametrize(("value", "problem"), [("0", "greater than or equal to 1"), ("-2", "greater"), ("1.5", "int")])
+def test_a_number_below_1_or_not_whole_is_refused(rlctl, value, problem):
+    done = rlctl("replay", "--best", value)
+    assert done.returncode == 2
+    assert "Invalid value for '--best'" in done.stderr
+    assert problem in done.stderr
 
 
 @pytest.mark.parametrize(
