@@ -1,4 +1,4 @@
-"""A policy as C99: a header and a source file without dependencies, from the same graph as its ONNX file."""
+"""A policy as C99: a header and a source file without dependencies."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ import dataclasses
 import math
 import re
 
-import numpy as np
-import onnx
 from gymnasium import spaces
 
 import rlctl
 from rlctl.dict_spaces import SINGLE, split_space
 from rlctl.errors import UsageError
-from rlctl.export.c_expressions import Value, c_type, literal, name_array
-from rlctl.export.c_translation import Translation, count_weights
+from rlctl.export.c_layers import CWriter
 from rlctl.run.c_policy import action_type, observation_type
-from rlctl.run.onnx_policy import ACTION, SINGLE_INPUT, STATE_INPUTS, STATE_OUTPUTS
+from rlctl.run.layers import ScaleImage
+from rlctl.run.network import Network, Tensors, select_actor_tensors
 from rlctl.run.policy import PolicyInfo
 
 LARGEST = 3_000_000
 """Weights that a C file may have: some 40 MB of text, which a compiler takes a minute for."""
+_NUMBERS = {"float32": "float", "float64": "double"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,45 +62,38 @@ void rlctl_repeat(const void *observation, void *state, void *action, long count
 """
 
 
-def write_c(info: PolicyInfo, model: onnx.ModelProto, file_name: str) -> CSource:
-    """Write a policy's graph as C; functions are called after the file, `reach.c` -> `reach_act`.
+def write_c(info: PolicyInfo, tensors: Tensors, file_name: str) -> CSource:
+    """Write a policy as C; functions are called after the file, `reach.c` -> `reach_act`.
 
     Raises `UsageError` for what has no translation: images, and networks of more than `LARGEST` weights.
     """
-    graph = model.graph
-    if (weights := count_weights(graph)) > LARGEST:
+    if (weights := sum(each.size for each in select_actor_tensors(info, tensors).values())) > LARGEST:
         raise UsageError(
             f"export --c: {weights:,} weights are too many for a C file (at most {LARGEST:,}); rlctl export --onnx"
         )
-    name = _make_identifier(file_name)
-    layout = _Layout(info)
-    state = _find_state_sizes(graph)
-    translation = Translation(graph, {**layout.inputs(), **_find_state_values(state)})
-    translation.assign("action", translation[ACTION])
-    for member, output in zip(("hidden", "cell"), STATE_OUTPUTS if state else (), strict=False):
-        translation.assign(f"state->{member}", translation[output])
-    members = layout.state_members() + [f"float {member}[{size}];" for member, size in state.items()]
+    name, layout, network = _make_identifier(file_name), _Layout(info), Network(info, tensors)
+    has_images = any(isinstance(layer, ScaleImage) for part in network.parts.values() for layer in part)
+    if has_images or (layout.frames > 1 and [len(part.shape or ()) for part in layout.parts.values()] != [1]):
+        raise UsageError("export --c: images cannot be written as C; rlctl export --onnx can")
+    if isinstance(layout.action_space, spaces.Box) and layout.action_space.dtype.kind != "f":
+        raise UsageError(f"export --c: an action of type {layout.action_space.dtype} cannot be written as C")
+    writer = CWriter()
+    writer.statements += _stack_frames(layout)
+    value, size = writer.write(network, layout.sizes, "state->frames" if layout.frames > 1 else "observation")
+    writer.write_action(network, value, size, layout.action_space, layout.action_type)
+    members = layout.list_state() if layout.frames > 1 else []
+    if network.lstm is not None:
+        members += [f"float {member}[{network.lstm.state[0].size}];" for member in ("hidden", "cell")]
     state_argument = f"{name}_state *state, " if members else ""
     prototype = f"void {name}_act(const {layout.type} *observation, {state_argument}{layout.action_type} *action)"
     header = _write_header(name, info, layout, members, prototype)
-    source = _write_source(name, info, layout, translation, prototype)
+    source = _write_source(name, info, writer, prototype)
     return CSource(name, header, source, prototype, bool(members))
 
 
 def _make_identifier(text: str) -> str:
     plain = re.sub(r"\W", "_", text, flags=re.ASCII)
     return plain if re.match(r"[A-Za-z]", plain) else f"policy{plain if plain.startswith('_') else f'_{plain}'}"
-
-
-def _find_state_sizes(graph: onnx.GraphProto) -> dict[str, int]:
-    shapes = {each.name: [size.dim_value for size in each.type.tensor_type.shape.dim] for each in graph.input}
-    found = [shapes[name] for name in STATE_INPUTS if name in shapes]
-    return {member: shape[0] * shape[2] for member, shape in zip(("hidden", "cell"), found, strict=False)}
-
-
-def _find_state_values(state: dict[str, int]) -> dict[str, Value]:
-    inputs = zip(STATE_INPUTS, state.items(), strict=False)
-    return {name: name_array(f"state->{member}", np.float32, size) for name, (member, size) in inputs}
 
 
 class _Layout:
@@ -112,34 +104,14 @@ class _Layout:
         space, self.action_space = info.env.spaces()
         self.frames = info.spec.frame_stack
         self.parts = split_space(space)
-        if self.frames > 1 and len(space.shape or ()) != 1:
-            raise UsageError("export --c: images cannot be written as C; rlctl export --onnx can")
         self.sizes = {key: math.prod(part.shape or ()) for key, part in self.parts.items()}
         self.size = sum(self.sizes.values()) // self.frames
-        self.type = c_type(observation_type(info))
-        self.action_type = c_type(action_type(info))
+        self.type = _NUMBERS[observation_type(info).name]
+        self.action_type = _NUMBERS.get(action_type(info).name, "int")
         self.action_size = math.prod(self.action_space.shape or ())
 
-    def inputs(self) -> dict[str, Value]:
-        """Return the graph's inputs, as parts of the observation or of the stacked frames."""
-        source = "state->frames" if self.frames > 1 else "observation"
-        found, offset = {}, 0
-        for key, part in self.parts.items():
-            array = name_array(source, observation_type(self.info), self.sizes[key], offset)
-            found[key or SINGLE_INPUT] = self._read(array, part)
-            offset += self.sizes[key]
-        return found
-
-    def _read(self, array: Value, part: spaces.Space[object]) -> Value:
-        dtype = np.dtype(part.dtype)
-        if c_type(dtype) == array.type:
-            return Value(array.element, dtype, array.size, array.name)
-        return Value(lambda i: f"({c_type(dtype)}){array.element(i)}", dtype, array.size)
-
-    def state_members(self) -> list[str]:
+    def list_state(self) -> list[str]:
         """Return the part of the state that remembers earlier observations."""
-        if self.frames == 1:
-            return []
         return [f"{self.type} frames[{self.frames * self.size}]; /* oldest first */", "int begun;"]
 
     def list_elements(self) -> list[str]:
@@ -196,7 +168,7 @@ def _write_header(name: str, info: PolicyInfo, layout: _Layout, members: list[st
         declarations = [f"typedef struct {{\n{fields}\n}} {name}_state;", reset, *declarations]
     sizes = [f"#define {upper}_OBSERVATION_SIZE {layout.size}", f"#define {upper}_ACTION_SIZE {layout.action_size}"]
     if control_dt is not None:
-        sizes.append(f"#define {upper}_CONTROL_DT {literal(control_dt, np.float64)} /* [s] */")
+        sizes.append(f"#define {upper}_CONTROL_DT {control_dt!r} /* [s] */")
     blocks = [
         f"#ifndef {upper}_H\n#define {upper}_H",
         "\n".join(sizes),
@@ -215,7 +187,7 @@ def _write_comment(lines: list[str]) -> str:
     return "/* " + "\n".join(f" * {line}".rstrip() for line in safe)[3:] + "\n */"
 
 
-def _write_source(name: str, info: PolicyInfo, layout: _Layout, translation: Translation, prototype: str) -> str:
+def _write_source(name: str, info: PolicyInfo, writer: CWriter, prototype: str) -> str:
     reset = f"""void {name}_reset({name}_state *state)
 {{
     static const {name}_state zeros;
@@ -223,13 +195,12 @@ def _write_source(name: str, info: PolicyInfo, layout: _Layout, translation: Tra
 }}
 
 """
-    statements = [*_stack_frames(layout), *translation.statements]
-    body = "\n".join(f"    {line}" for line in statements)
+    body = "\n".join(f"    {line}" for line in writer.statements)
     parts = [
         f"{_write_comment([f'{info.algo} policy for {info.spec.task}; see the header.'])}\n",
         f'#include <math.h>\n\n#include "{name}.h"\n',
-        *translation.constants,
-        *translation.find_helpers(),
+        *writer.constants,
+        *writer.find_functions(),
         f"{reset if '*state' in prototype else ''}{prototype}\n{{\n{body}\n}}\n",
     ]
     return "\n".join(parts)

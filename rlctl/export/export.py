@@ -119,7 +119,7 @@ def _export_onnx(job: _Export, target: Path) -> ExportReport:
 def _write_source(job: _Export, target: Path) -> CSource:
     from rlctl.export.c_source import write_c
 
-    return write_c(job.info, job.model, target.stem)
+    return write_c(job.info, job.tensors, target.stem)
 
 
 def _export_c(job: _Export, target: Path, code: CSource) -> ExportReport:

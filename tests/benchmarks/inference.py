@@ -48,7 +48,6 @@ def onnx_runtime(repeat: int) -> Row:
 
 def c_function(repeat: int) -> Row:
     """Time C for one observation, called through ctypes, beside onnxruntime's own `session.run`; both from Python."""
-    from rlctl.export.actor import build
     from rlctl.export.c_library import build_library, find_compiler
     from rlctl.export.c_source import write_c
     from rlctl.run.c_policy import CPolicy
@@ -60,7 +59,7 @@ def c_function(repeat: int) -> Row:
     info, tensors = read_policy(run / "policies" / "best.safetensors")
     compiler = find_compiler()
     assert compiler is not None, "no C compiler"
-    code = write_c(info, build(info, tensors), "policy")
+    code = write_c(info, tensors, "policy")
     with tempfile.TemporaryDirectory() as folder:
         policy = CPolicy.load(build_library(code, info, Path(folder), compiler))
     observation = np.zeros(exported.observation_space.shape, np.float32)

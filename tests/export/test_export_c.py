@@ -9,7 +9,6 @@ from gymnasium import spaces
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.export.actor import build
 from rlctl.export.c_library import FLAGS, build_library, find_compiler
 from rlctl.export.c_source import write_c
 from rlctl.export.export import export_policy
@@ -24,7 +23,7 @@ STEPS = 30
 
 def write_source(path, name="policy"):
     info, tensors = read_policy(path)
-    return info, write_c(info, build(info, tensors), name)
+    return info, write_c(info, tensors, name)
 
 
 @pytest.fixture
@@ -162,7 +161,7 @@ def test_names_of_a_stranger_stay_in_their_comments(small, train, write, tmp_pat
     evil = '*/ #error "out"\n#error "line" /* \\'
     env = info.env.model_copy(update={"action_meaning": evil, "robot": evil, "observation_sizes": {evil: 3}})
     info = info.model_copy(update={"env": env})
-    code = write_c(info, build(info, tensors), "int")
+    code = write_c(info, tensors, "int")
     assert code.name == "int"
     build_library(code, info, tmp_path, [*find_compiler(), "-Werror"])
 
