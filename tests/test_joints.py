@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.export.metadata import metadata
+from rlctl.export.actor import metadata
 from rlctl.joints import Joints
 from rlctl.run.env_info import EnvInfo, describe
 from rlctl.run.policy import PolicyInfo

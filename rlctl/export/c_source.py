@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
 
 from gymnasium import spaces
 
 import rlctl
 from rlctl.dict_spaces import SINGLE, split_space
-from rlctl.errors import UsageError
+from rlctl.errors import AnswerIsNo, UsageError, short_repr
 from rlctl.export.c_layers import CWriter
-from rlctl.run.c_policy import action_type, observation_type
+from rlctl.run.c_policy import LIBRARY_SUFFIX, action_type, observation_type
 from rlctl.run.layers import ScaleImage
 from rlctl.run.network import Network, Tensors, select_actor_tensors
 from rlctl.run.policy import PolicyInfo
 
 LARGEST = 3_000_000
 """Weights that a C file may have: some 40 MB of text, which a compiler takes a minute for."""
+FLAGS = ("-std=c99", "-O3", "-Wall", "-Wextra", "-pedantic")
+_TIMEOUT_S = 300.0  # of a compiler
 _NUMBERS = {"float32": "float", "float64": "double"}
 
 
@@ -217,3 +224,26 @@ def _stack_frames(layout: _Layout) -> list[str]:
         "}",
         "state->begun = 1;",
     ]
+
+
+def find_compiler() -> list[str] | None:
+    """Return the command of the C compiler, `$CC` or `cc`; None if there is none."""
+    command = shlex.split(os.environ.get("CC", "")) or ["cc"]
+    return command if shutil.which(command[0]) else None
+
+
+def build_library(code: CSource, info: PolicyInfo, folder: Path, compiler: list[str]) -> Path:
+    """Compile a policy in `folder` and return the library; raises `AnswerIsNo` if the compiler does not take it."""
+    (folder / f"{code.name}.h").write_text(code.header)
+    (folder / f"{code.name}.c").write_text(code.source)
+    (folder / "harness.c").write_text(code.harness)
+    library = folder / f"{code.name}{LIBRARY_SUFFIX}"
+    library.with_suffix(".json").write_text(info.model_dump_json())
+    command = [*compiler, *FLAGS, "-fPIC", "-shared", "-o", str(library), f"{code.name}.c", "harness.c", "-lm"]
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise AnswerIsNo(f"{compiler[0]} cannot compile the policy: {short_repr(str(error))}") from None
+    if done.returncode != 0:
+        raise AnswerIsNo(f"{compiler[0]} cannot compile the policy: {short_repr(done.stderr, 300)}")
+    return library

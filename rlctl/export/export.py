@@ -14,6 +14,7 @@ from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import files, lookup, onnx_file
 from rlctl.run.acting import check_playable
 from rlctl.run.lookup import FoundPolicy
+from rlctl.run.network import Tensors
 from rlctl.run.policy import Policy, PolicyInfo, read_policy
 from rlctl.run.shipped import PRETRAINED
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
     from rlctl.export.c_source import CSource
     from rlctl.export.verify import Verification
+    from rlctl.run.torch_policy import TorchPolicy
 
 Format = Literal["onnx", "c"]
 C_OBSERVATIONS = 2000
@@ -32,10 +34,8 @@ class _Export(NamedTuple):
     # What the exports of one policy share.
     file: Path
     info: PolicyInfo
-    tensors: dict[str, Any]
-    policy: Any
-    """A `TorchPolicy`."""
-    model: onnx.ModelProto
+    tensors: Tensors
+    policy: TorchPolicy
     workers: Workers
 
 
@@ -69,16 +69,15 @@ def _export(found: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
     # The environments are built while torch is imported.
     with Workers(found.locate(info.spec), available_cores()) as workers:
         from rlctl.export.actor import build
+        from rlctl.export.c_source import write_c
         from rlctl.run.torch_policy import TorchPolicy, pin_threads
 
         pin_threads()
-        job = _Export(found.file, info, tensors, TorchPolicy.load(found.file), build(info, tensors), workers)
-        sources = {target: _write_source(job, target) for target in targets if target.suffix == ".c"}
+        models = [(target, build(info, tensors)) for target in targets if target.suffix == ".onnx"]
+        sources = [(target, write_c(info, tensors, target.stem)) for target in targets if target.suffix == ".c"]
+        job = _Export(found.file, info, tensors, TorchPolicy.load(found.file), workers)
         _check_environment(found.file, info, workers)
-        return [
-            _export_c(job, target, sources[target]) if target in sources else _export_onnx(job, target)
-            for target in targets
-        ]
+        return [*(_export_onnx(job, *each) for each in models), *(_export_c(job, *each) for each in sources)]
 
 
 def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) -> None:
@@ -94,19 +93,19 @@ def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) ->
         )
 
 
-def _export_onnx(job: _Export, target: Path) -> ExportReport:
+def _export_onnx(job: _Export, target: Path, model: onnx.ModelProto) -> ExportReport:
     from rlctl.run.onnx_policy import OnnxPolicy
 
     reports: list[ExportReport] = []
 
     def write(part: Path) -> None:
-        part.write_bytes(onnx_file.encode(job.model))
+        part.write_bytes(onnx_file.encode(model))
         exported = OnnxPolicy.load(part)
         reports.append(
             OnnxReport(
                 **_verify(job, target, exported, part, "the ONNX file", 1000),
                 size=part.stat().st_size,
-                opset=job.model.opset_import[0].version,
+                opset=model.opset_import[0].version,
                 inputs=_list_ports(exported.session.get_inputs()),
                 outputs=_list_ports(exported.session.get_outputs()),
             )
@@ -116,14 +115,8 @@ def _export_onnx(job: _Export, target: Path) -> ExportReport:
     return reports[0]
 
 
-def _write_source(job: _Export, target: Path) -> CSource:
-    from rlctl.export.c_source import write_c
-
-    return write_c(job.info, job.tensors, target.stem)
-
-
 def _export_c(job: _Export, target: Path, code: CSource) -> ExportReport:
-    from rlctl.export.c_library import build_library, find_compiler
+    from rlctl.export.c_source import build_library, find_compiler
     from rlctl.run.c_policy import CPolicy
 
     compiler = find_compiler()
@@ -156,17 +149,16 @@ def _verify(
     job: _Export, target: Path, exported: Policy, file: Path, what: str, min_observations: int
 ) -> dict[str, Any]:
     """Return what a report says of a verified file."""
-    from rlctl.export.latency import measure
-    from rlctl.export.verify import PolicyFiles, verify
+    from rlctl.export.verify import measure_latency, verify
 
-    seen = verify(job.policy, exported, PolicyFiles(job.tensors, file), job.workers, min_observations)
+    seen = verify(job.policy, exported, job.tensors, file, job.workers, min_observations)
     if not seen.passed:
         raise AnswerIsNo(_explain_failure(job, target, what, seen))
     return {
         **_describe(job, target),
         "agreement": seen.agreement,
         "closed_loop": seen.closed_loop,
-        "latency": measure(job.policy, exported),
+        "latency": measure_latency(job.policy, exported),
     }
 
 

@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import output
-from rlctl.export.agreement import MAX_DIFFERENCE, Agreement
-from rlctl.export.latency import Latency
-from rlctl.export.verify import ClosedLoop
+from rlctl.export.verify import MAX_DIFFERENCE, Agreement, ClosedLoop, Latency
 
 
 @dataclasses.dataclass(frozen=True)

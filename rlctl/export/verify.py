@@ -1,30 +1,120 @@
-"""Is the exported file the policy? Compared on real rollouts, observation by observation and in closed loop."""
+"""Is the exported file the policy? Compared on real rollouts, observation by observation and in closed loop; timed."""
 
 from __future__ import annotations
 
 import dataclasses
 import operator
-from collections.abc import Sequence
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.dict_spaces import map_parts, stack, take_row
-from rlctl.export.agreement import Agreement, Comparison
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
+from rlctl.run.c_policy import CPolicy
 from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import Policy
-from rlctl.run.torch_policy import TorchPolicy
 
+if TYPE_CHECKING:
+    from rlctl.run.torch_policy import TorchPolicy
+
+MAX_DIFFERENCE = 1e-5
+"""Largest |difference| of an action element; relative to the element where that is larger than 1."""
 MAX_RETURN_DIFFERENCE = 1e-3
 """Largest difference of an episode's return, relative."""
 MIN_OBSERVATIONS = 1000
 EPISODES = 20
 """Episodes played in closed loop by each of the two policies."""
+_REPETITIONS = 300
+_WARM_UP = 30
+_CALLS = 10  # of a C function within one measurement
+
+
+@dataclasses.dataclass(frozen=True)
+class Agreement:
+    """How close two policies came on the same observations."""
+
+    observations: int
+    max_difference: float
+    """Largest |difference| of an action element, in the action's own units."""
+    beyond_limit: int
+    """Actions that differ by more than the limit; for discrete actions, that differ at all."""
+    near_ties: int
+    """Discrete actions that differ because their logits agree within the limit: either choice is right."""
+    batch_sizes: tuple[int, ...]
+    """How many observations the exported policy was given at once."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether no action differs by more than the limit."""
+        return self.beyond_limit == 0
+
+
+class Comparison:
+    """Collects how far apart actions are. `add` right after the torch policy has acted: its logits are looked at."""
+
+    def __init__(self, torch_policy: TorchPolicy) -> None:
+        self.observations = 0
+        self.batch_sizes = {1}
+        self._space = torch_policy.action_space
+        self._max_difference = 0.0
+        self._beyond_limit = 0
+        self._near_ties = 0
+        self._logits: NDArray[np.float32]
+        if not isinstance(self._space, spaces.Box):
+            network: Any = torch_policy.network
+            head = network.q_net.q_net[-1] if torch_policy.info.algo == "dqn" else network.action_net
+            self._hook = head.register_forward_hook(self._keep_logits)
+
+    def _keep_logits(self, module: Any, inputs: Any, output: Any) -> None:
+        self._logits = output.detach().cpu().numpy()
+
+    def add(self, expected: NDArray[Any], actions: NDArray[Any]) -> None:
+        """Compare two arrays of actions, shape (rows, ...)."""
+        difference = np.abs(expected.astype(np.float64) - actions).reshape(len(expected), -1)
+        # Written so that NaN is beyond the limit.
+        limit = MAX_DIFFERENCE * np.maximum(1.0, np.abs(expected)).reshape(difference.shape)
+        differs = ~(difference <= limit).all(axis=1)
+        if not isinstance(self._space, spaces.Box):
+            for row in np.flatnonzero(differs).tolist():
+                if self._is_near_tie(row, expected[row], actions[row]):
+                    self._near_ties += 1
+                    differs[row], difference[row] = False, 0.0
+        self._max_difference = max(self._max_difference, float(difference.max()))
+        self._beyond_limit += int(differs.sum())
+
+    def _is_near_tie(self, row: int, expected: NDArray[Any], action: NDArray[Any]) -> bool:
+        return all(
+            margin <= MAX_DIFFERENCE * max(1.0, size)
+            for margin, size in _list_margins(self._space, self._logits[row], expected, action)
+        )
+
+    def result(self) -> Agreement:
+        """Return what was seen, and stop looking."""
+        if not isinstance(self._space, spaces.Box):
+            self._hook.remove()
+        batch_sizes = tuple(sorted(self.batch_sizes))
+        return Agreement(self.observations, self._max_difference, self._beyond_limit, self._near_ties, batch_sizes)
+
+
+def _list_margins(
+    space: spaces.Space[Any], logits: NDArray[np.float32], expected: NDArray[Any], action: NDArray[Any]
+) -> list[tuple[float, float]]:
+    """By how much, per choice, the logit of the expected one is ahead, and the size of that logit."""
+    if isinstance(space, spaces.MultiBinary):  # against a logit of zero, which is a probability of one half
+        wrong = np.flatnonzero(expected != action)
+        return [(abs(float(logits[index])), 0.0) for index in wrong]
+    sizes = space.nvec if isinstance(space, spaces.MultiDiscrete) else [len(logits)]
+    groups = np.split(logits, np.cumsum(sizes)[:-1])
+    choices = zip(groups, np.atleast_1d(expected), np.atleast_1d(action), strict=True)
+    return [(float(group[ours] - group[theirs]), abs(float(group[ours]))) for group, ours, theirs in choices]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +137,21 @@ class ClosedLoop:
 
 
 @dataclasses.dataclass(frozen=True)
+class Latency:
+    """Median time for one observation [us]."""
+
+    exported_us: float
+    """With everything: normalisation, network, bounds. An ONNX file on onnxruntime, called from Python; C alone."""
+    sb3_us: float
+    """SB3's `policy.predict` of an observation that is normalised already."""
+
+    @property
+    def speedup(self) -> float:
+        """How many times as fast as SB3 the file is."""
+        return self.sb3_us / self.exported_us
+
+
+@dataclasses.dataclass(frozen=True)
 class Verification:
     """The result of comparing two policies."""
 
@@ -61,17 +166,19 @@ class Verification:
 def verify(
     torch_policy: TorchPolicy,
     exported: Policy,
-    files: PolicyFiles,
+    tensors: Mapping[str, NDArray[Any]],
+    file: Path,
     workers: Workers,
     min_observations: int = MIN_OBSERVATIONS,
 ) -> Verification:
-    """Play the same episodes with both files; on every observation of either, ask torch and the exported policy.
+    """Play the same episodes with both; on every observation of either, ask torch and the exported policy.
 
+    `tensors` are the policy file's; `file` is the exported one, an ONNX file or a compiled library.
     Rollouts go on until `min_observations` were compared. Raises `TaskError` if the environment fails.
     """
     comparison = Comparison(torch_policy)
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
-    workers.set_policy(torch_policy.info, files.tensors)
+    workers.set_policy(torch_policy.info, dict(tensors))
     expected = play_episodes(workers, seeds, record=True)
     _compare_actions(torch_policy, exported, expected, comparison)
     if isinstance(exported, OnnxPolicy):
@@ -83,21 +190,12 @@ def verify(
         more = play_episodes(workers, episode_seeds(0, Stream.VERIFY, total)[played:], record=True)
         _compare_actions(torch_policy, exported, more, comparison)
         played = total
-    workers.set_other_policy(str(files.exported.resolve()))
+    workers.set_other_policy(str(file.resolve()))
     done = play_episodes(workers, seeds, record=True)
     compared = comparison.observations
     _compare_actions(torch_policy, exported, done, comparison)
     comparison.observations = compared  # those of one policy's rollouts are counted
     return Verification(comparison.result(), compare_episodes(expected, done))
-
-
-@dataclasses.dataclass(frozen=True)
-class PolicyFiles:
-    """What the workers play: a policy file's tensors, and the exported file."""
-
-    tensors: dict[str, NDArray[Any]]
-    exported: Path
-    """An ONNX file, or a compiled library."""
 
 
 def _compare_actions(
@@ -143,3 +241,33 @@ def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> Cl
         mean_return=float(returns[:, 0].mean()),
         mean_return_exported=float(returns[:, 1].mean()),
     )
+
+
+def measure_latency(torch_policy: TorchPolicy, exported: Policy) -> Latency:
+    """Time both policies on one observation."""
+    space = torch_policy.observation_space
+    space.seed(0)
+    observation = space.sample()
+    normalized: Any = torch_policy.normalize(observation)
+    exported.reset()
+    return Latency(
+        exported_us=_measure_exported(exported, observation),
+        sb3_us=_measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True)),
+    )
+
+
+def _measure_exported(exported: Policy, observation: Any) -> float:
+    if isinstance(exported, CPolicy):
+        return _measure_median_us(lambda: exported.repeat(observation, _CALLS)) / _CALLS
+    return _measure_median_us(lambda: exported.predict(observation))
+
+
+def _measure_median_us(call: Callable[[], Any]) -> float:
+    for _ in range(_WARM_UP):
+        call()
+    times = []
+    for _ in range(_REPETITIONS):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times) * 1e6

@@ -32,7 +32,7 @@ def action_type(info: PolicyInfo) -> np.dtype[Any]:
 
 
 class CPolicy(Policy):
-    """A policy in a shared library that `rlctl.export.c_library` has compiled. Deterministic."""
+    """A policy in a shared library that `rlctl.export.c_source` has compiled. Deterministic."""
 
     def __init__(self, info: PolicyInfo, library: ctypes.CDLL) -> None:
         super().__init__(info)

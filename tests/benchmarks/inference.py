@@ -48,8 +48,7 @@ def onnx_runtime(repeat: int) -> Row:
 
 def c_function(repeat: int) -> Row:
     """Time C for one observation, called through ctypes, beside onnxruntime's own `session.run`; both from Python."""
-    from rlctl.export.c_library import build_library, find_compiler
-    from rlctl.export.c_source import write_c
+    from rlctl.export.c_source import build_library, find_compiler, write_c
     from rlctl.run.c_policy import CPolicy
     from rlctl.run.policy import read_policy
 

@@ -9,10 +9,9 @@ import pytest
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.export.agreement import Comparison
 from rlctl.export.export import export_policy
 from rlctl.export.report import show
-from rlctl.export.verify import PolicyFiles, compare_episodes, verify
+from rlctl.export.verify import Comparison, compare_episodes, verify
 from rlctl.rollout.collect import Episode
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.workers import Workers
@@ -116,8 +115,8 @@ def test_other_weights_are_noticed(small, train, write, tmp_path):
     model.policy.action_net.bias.data[0] += 0.001
     exported = export(write(model, "ppo", small(), name="other")).path
     with Workers(small(), 10) as workers:
-        files = PolicyFiles(read_policy(original)[1], exported)
-        seen = verify(TorchPolicy.load(original), OnnxPolicy.load(exported), files, workers)
+        tensors = read_policy(original)[1]
+        seen = verify(TorchPolicy.load(original), OnnxPolicy.load(exported), tensors, exported, workers)
     assert not seen.passed
     assert seen.agreement.max_difference == pytest.approx(0.001, rel=0.01)
     assert seen.agreement.beyond_limit > 1000

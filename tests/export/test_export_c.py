@@ -9,8 +9,7 @@ from gymnasium import spaces
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.export.c_library import FLAGS, build_library, find_compiler
-from rlctl.export.c_source import write_c
+from rlctl.export.c_source import FLAGS, build_library, find_compiler, write_c
 from rlctl.export.export import export_policy
 from rlctl.run.c_policy import CPolicy
 from rlctl.run.policy import read_policy
