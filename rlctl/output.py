@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from rich.console import Console, JustifyMethod
     from rich.text import Text
 
 _PIPED_WIDTH = 1000  # nothing folds: a line stays a line for grep
@@ -85,7 +85,7 @@ def print_table(
 ) -> None:
     """Print a table of results, its columns aligned right but for those in `left`. What is in a cell is no markup.
 
-    Where the terminal is too narrow, cells are folded.
+    Where the terminal is too narrow, cells are folded; if that suffices, only those of texts after the first column.
     """
     from rich.table import Table
     from rich.text import Text
@@ -95,8 +95,12 @@ def print_table(
     widths = [max(cell.cell_len for cell in column) for column in itertools.zip_longest(*table, fillvalue=Text())]
     if sum(widths) + len(gap) * len(widths) > out().width:
         folded = Table(box=None, pad_edge=False, padding=(0, len(gap) // 2), show_header=False)
-        for name in columns:
-            folded.add_column(justify="left" if name in left else "right", overflow="fold")
+        texts = [name in left and name != columns[0] for name in columns]
+        rigid = sum(width for width, text in zip(widths, texts, strict=True) if not text) + len(gap) * len(widths)
+        fits = rigid + 8 * sum(texts) <= out().width
+        for name, text in zip(columns, texts, strict=True):
+            justify: JustifyMethod = "left" if name in left else "right"
+            folded.add_column(justify=justify, overflow="fold", no_wrap=fits and not text)
         for row in table:
             folded.add_row(*row)
         out().print(folded)
