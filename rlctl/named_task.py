@@ -111,20 +111,6 @@ def _may_be_called(task: str, constructor: Any) -> bool:
         file = Path(inspect.getfile(constructor))
     except (TypeError, OSError):
         return False
-    own = file.is_file() and not _is_installed(file) and not _is_of_python(file)
-    return (
-        own and constructor.__module__ == _find_module(task) and bool(re.search("gymnasium|rlctl", _read_source(file)))
-    )
-
-
-def _find_module(task: str) -> str | None:
-    """Return the name of the module that a task's own file is loaded as."""
-    file = registry.find_source_file(task)
-    if file is None:
-        return None
-    wanted = str(file.expanduser().resolve())
-    for name, module in list(sys.modules.items()):
-        found = getattr(module, "__file__", None)
-        if found is not None and name != "__main__" and str(Path(found).resolve()) == wanted:
-            return name
-    return None
+    source = registry.find_source_file(task)
+    own = source is not None and source.expanduser().resolve() == file.resolve() and not _is_installed(file)
+    return own and not _is_of_python(file) and bool(re.search("gymnasium|rlctl", _read_source(file)))

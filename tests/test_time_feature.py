@@ -15,7 +15,7 @@ from rlctl.replay.replay import ReplayRequest, run_replay
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.run import recipe
 from rlctl.run.env_info import describe
-from rlctl.runs.import_model import ImportRequest, import_model
+from rlctl.runs.import_model import import_model
 from tests.eval.conftest import ENVS
 
 BLOCK = f"{ENVS}:Block"
@@ -91,10 +91,8 @@ def zoo_agent(tmp_path_factory):
     model.save(folder / "model.zip")
     env.save(str(folder / "vecnormalize.pkl"))
     env.training = False
-    request = ImportRequest(
-        folder / "model.zip", BLOCK, folder / "vecnormalize.pkl", output=folder / "policy.safetensors"
-    )
-    yield model, env, import_model(request)
+    statistics, output = folder / "vecnormalize.pkl", folder / "policy.safetensors"
+    yield model, env, import_model(folder / "model.zip", BLOCK, normalization=statistics, output=output)
     env.close()
 
 
@@ -131,4 +129,4 @@ def test_one_number_more_that_is_not_the_time_is_refused(tmp_path):
     model = PPO("MlpPolicy", DummyVecEnv([lambda: Wider(EnvSpec(BLOCK).make())]), device="cpu")
     model.save(tmp_path / "model.zip")
     with pytest.raises(ArtifactError, match=r"it observes Box\(4,\), .* gives Box\(3,\)"):
-        import_model(ImportRequest(tmp_path / "model.zip", BLOCK, output=tmp_path / "policy.safetensors"))
+        import_model(tmp_path / "model.zip", BLOCK, output=tmp_path / "policy.safetensors")

@@ -13,13 +13,7 @@ if TYPE_CHECKING:
 
 TASK_FORMS = "Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id."
 OptionalTask = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="TASK",
-        help=TASK_FORMS,
-        show_default=False,
-        autocompletion=completion.complete_task,
-    ),
+    str | None, typer.Argument(metavar="TASK", help=TASK_FORMS, autocompletion=completion.complete_task)
 ]
 Run = Annotated[
     str | None,
@@ -30,21 +24,12 @@ Run = Annotated[
     ),
 ]
 Set = Annotated[
-    list[str],
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Set a key, e.g. task.tolerance=0.02, randomize=true.",
-        show_default=False,
-    ),
+    list[str], typer.Option("--set", metavar="KEY=VALUE", help="Set a key, e.g. task.tolerance=0.02, randomize=true.")
 ]
-Json = Annotated[
-    str | None,
-    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - for stdout.", show_default=False),
-]
+Json = Annotated[str | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON; - for stdout.")]
 Seed = Annotated[int | None, typer.Option(help="Seed.", min=0)]
 EnvTimeout = Annotated[float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1)]
-NEnvs = Annotated[int | None, typer.Option(help="Environments stepped side by side.", min=1, show_default=False)]
+NEnvs = Annotated[int | None, typer.Option(help="Environments stepped side by side.", min=1)]
 Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]
 
 Pretrained = Annotated[bool, typer.Option("--pretrained", help="The policy that ships with the task.")]

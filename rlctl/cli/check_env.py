@@ -13,28 +13,21 @@ from rlctl.errors import UsageError
 def check_env(
     task: OptionalTask = None,
     settings: Set = [],
-    select: Annotated[
-        list[str],
-        typer.Option(metavar="RULES", help="Judge only these: RL3,RL501.", show_default=False),
-    ] = [],
-    ignore: Annotated[
-        list[str], typer.Option(metavar="RULES", help="Leave these out: RL106.", show_default=False)
-    ] = [],
+    select: Annotated[list[str], typer.Option(metavar="RULES", help="Judge only these: RL3,RL501.")] = [],
+    ignore: Annotated[list[str], typer.Option(metavar="RULES", help="Leave these out: RL106.")] = [],
     strict: Annotated[bool, typer.Option("--strict", help="Exit 1 for warnings too.")] = False,
     form: Annotated[
         str | None,
         typer.Option("--format", metavar="text|json|sarif|github", help="Form of the report.", show_default="text"),
     ] = None,
     output: Annotated[
-        str | None,
-        typer.Option("--output", "-o", metavar="FILE", help="Where the report goes.", show_default="stdout"),
+        str | None, typer.Option("--output", "-o", metavar="FILE", help="Where the report goes.", show_default="stdout")
     ] = None,
     json: Json = None,
     env_timeout: EnvTimeout = 10.0,
     list_rules: Annotated[bool, typer.Option("--list", help="List all rules, and do nothing else.")] = False,
     explain: Annotated[
-        str | None,
-        typer.Option(metavar="RULE", help="Say what a rule means, and do nothing else.", show_default=False),
+        str | None, typer.Option(metavar="RULE", help="Say what a rule means, and do nothing else.")
     ] = None,
 ) -> None:
     """Find what is wrong with an environment before hours of training do."""

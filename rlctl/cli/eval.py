@@ -25,8 +25,7 @@ from rlctl.errors import UsageError
 def evaluate(
     run: Run = None,
     task: Annotated[
-        str | None,
-        typer.Option(help="Evaluate on this task instead of the one it was trained on.", show_default=False),
+        str | None, typer.Option(help="Evaluate on this task instead of the one it was trained on.")
     ] = None,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
@@ -35,10 +34,9 @@ def evaluate(
         typer.Option(
             metavar="zero|random|FUNCTION|ws://HOST:PORT",
             help="Play on a TASK: zero, random, MODULE:FUNCTION, PATH.py:FUNCTION, or a policy server.",
-            show_default=False,
         ),
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", help="Episodes, each with its own seed.", min=1)] = 100,
+    episodes: Annotated[int, typer.Option(help="Episodes, each with its own seed.", min=1)] = 100,
     seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
     stage: Annotated[
         str | None,
@@ -50,29 +48,23 @@ def evaluate(
     ] = False,
     n_envs: NEnvs = None,
     min_success: Annotated[
-        float | None,
-        typer.Option(metavar="RATE", help="Gate: exit 1 below this success rate.", show_default=False),
+        float | None, typer.Option(metavar="RATE", help="Gate: exit 1 below this success rate.")
     ] = None,
     min_success_lower: Annotated[
-        float | None,
-        typer.Option(metavar="RATE", help="Gate on the lower bound of the 95 % interval.", show_default=False),
+        float | None, typer.Option(metavar="RATE", help="Gate on the lower bound of the 95 % interval.")
     ] = None,
     min_return: Annotated[
-        float | None,
-        typer.Option(metavar="RETURN", help="Gate: exit 1 below this mean return.", show_default=False),
+        float | None, typer.Option(metavar="RETURN", help="Gate: exit 1 below this mean return.")
     ] = None,
     limits: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Say what these safety limits (YAML) cost, and how often they act.", show_default=False
-        ),
+        typer.Option(metavar="FILE", help="Say what these safety limits (YAML) cost, and how often they act."),
     ] = None,
     vary: Annotated[
         list[str],
         typer.Option(
             metavar="NAME=LOW:HIGH:COUNT|all",
             help="Map over an event or parameter of the task, e.g. mass=0.6:1.4:9; twice for two together.",
-            show_default=False,
         ),
     ] = [],
     push: Annotated[bool, typer.Option("--push", help="Find from which push on it fails.")] = False,
@@ -107,9 +99,9 @@ def evaluate(
             given = "--limits" if policy is None else "--policy"
             raise UsageError(f"{given} plays a task as it is: leave out --vary and --push")
         from rlctl.eval.robustness_report import show
-        from rlctl.eval.vary import RobustnessRequest, check_gates, measure_robustness
+        from rlctl.eval.vary import check_gates, measure_robustness
 
-        robustness = measure_robustness(request, RobustnessRequest(vary, push, yes), gates)
+        robustness = measure_robustness(request, vary, push=push, yes=yes, gates=gates)
         show(robustness, json)
         return check_gates(robustness, gates)
     if run is not None and policy is None and is_group(Path(run)):

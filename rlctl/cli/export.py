@@ -18,22 +18,14 @@ def export(
     policy: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE",
-            help="Write the actor with its measured score instead, as plugins ship it (.safetensors).",
-            show_default=False,
+            metavar="FILE", help="Write the actor with its measured score instead, as plugins ship it (.safetensors)."
         ),
     ] = None,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE",
-            help="Default: exports/policy.onnx, or .c, of the run.",
-            show_default=False,
-        ),
+        typer.Option("--output", "-o", metavar="FILE", help="Default: exports/policy.onnx, or .c, of the run."),
     ] = None,
     json: Json = None,
 ) -> None:

@@ -16,16 +16,11 @@ def identify(
     log: Annotated[
         Path | None,
         typer.Option(
-            "--log",
             metavar="FILE",
             help="CSV of the robot: time, action_..., position_JOINT, velocity_JOINT; a row per action.",
-            show_default=False,
         ),
     ] = None,
-    excite: Annotated[
-        Path | None,
-        typer.Option("--excite", metavar="FILE", help="Write a safe trajectory to log instead.", show_default=False),
-    ] = None,
+    excite: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a safe trajectory to log instead.")] = None,
     events: Annotated[
         list[str],
         typer.Option("--event", metavar="NAME", help="Find the values of this event only; repeat it for more."),

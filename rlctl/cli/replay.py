@@ -51,48 +51,27 @@ def replay(
             "--episodes", help="Episodes to roll out, or to choose from.", min=1, show_default="1; 100 to choose from"
         ),
     ] = None,
-    worst: Annotated[
-        int | None, typer.Option(metavar="[N]", help="The N (1) worst of --episodes.", min=1, show_default=False)
-    ] = None,
-    best: Annotated[
-        int | None, typer.Option(metavar="[N]", help="The N (1) best of --episodes.", min=1, show_default=False)
-    ] = None,
+    worst: Annotated[int | None, typer.Option(metavar="[N]", help="The N (1) worst of --episodes.", min=1)] = None,
+    best: Annotated[int | None, typer.Option(metavar="[N]", help="The N (1) best of --episodes.", min=1)] = None,
     failures: Annotated[
-        int | None,
-        typer.Option(
-            metavar="[N]",
-            help="Up to N (1) that failed of --episodes, worst first.",
-            min=1,
-            show_default=False,
-        ),
+        int | None, typer.Option(metavar="[N]", help="Up to N (1) that failed of --episodes, worst first.", min=1)
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
     task: Annotated[
-        str | None,
-        typer.Option(help="Roll out on this task instead of the one it was trained on.", show_default=False),
+        str | None, typer.Option(help="Roll out on this task instead of the one it was trained on.")
     ] = None,
     settings: Set = [],
     verify: Annotated[
-        Path | None,
-        typer.Option(metavar="EPISODE", help="Replay a recorded episode; exit 1 unless identical.", show_default=False),
+        Path | None, typer.Option(metavar="EPISODE", help="Replay a recorded episode; exit 1 unless identical.")
     ] = None,
     gui: Annotated[bool, typer.Option("--gui", help="Show it in PyBullet's window instead of recording.")] = False,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="PATH",
-            help="An .rrd file or a folder. Default: episodes/ of the run.",
-            show_default=False,
-        ),
+        typer.Option("--output", "-o", metavar="PATH", help="An .rrd file or a folder. Default: episodes/ of the run."),
     ] = None,
-    video: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write a film instead, .mp4 or .gif.", show_default=False),
-    ] = None,
+    video: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a film instead, .mp4 or .gif.")] = None,
     json: Json = None,
 ) -> None:
     """Show what a policy does: rollouts as Rerun recordings, without a display."""

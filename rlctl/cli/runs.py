@@ -26,10 +26,7 @@ app = typer.Typer(cls=_RunsGroup, help="List runs, show one, report and compare 
 
 @app.command("list")
 def list_runs(
-    task: Annotated[
-        str | None,
-        typer.Argument(metavar="[TASK]", help="Only the runs of this task.", show_default=False),
-    ] = None,
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only the runs of this task.")] = None,
     sort: Annotated[str, typer.Option(metavar="newest|score|steps|minutes", help="Order.")] = "newest",
     json: Json = None,
 ) -> None:
@@ -52,14 +49,10 @@ def show_run(run: Run = None, json: Json = None) -> None:
 @app.command("report")
 def report_runs(
     runs: Annotated[
-        list[str],
-        typer.Argument(metavar="RUN|GROUP...", help="Runs, globs or folders of runs, all of one task."),
+        list[str], typer.Argument(metavar="RUN|GROUP...", help="Runs, globs or folders of runs, all of one task.")
     ],
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", metavar="FILE", help="Default: report.html; md goes to stdout.", show_default=False
-        ),
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Default: report.html; md goes to stdout.")
     ] = None,
     format: Annotated[
         str, typer.Option("--format", metavar="html|md", help="A page, or text for pull requests.")
@@ -71,31 +64,25 @@ def report_runs(
     """Write what came of runs as one file: result, curves, evaluations, diagnosis, pictures, how to reproduce it."""
     claim_stdout()
     from rlctl import output as streams
-    from rlctl.runs.report.write import ReportRequest, write_report
+    from rlctl.runs.report.write import write_report
 
-    if (path := write_report(ReportRequest(runs, format, output, pictures))) is not None:
+    if (path := write_report(runs, format, output, pictures=pictures)) is not None:
         streams.out().print(f"report: {path}", markup=False)
 
 
 @app.command("compare")
 def compare_runs(
     runs: Annotated[
-        list[str],
-        typer.Argument(metavar="A B...", help="Runs, globs or folders of runs; the first is the baseline."),
+        list[str], typer.Argument(metavar="A B...", help="Runs, globs or folders of runs; the first is the baseline.")
     ],
-    episodes: Annotated[int, typer.Option("--episodes", help="Episodes that each run plays.", min=2)] = 100,
+    episodes: Annotated[int, typer.Option(help="Episodes that each run plays.", min=2)] = 100,
     seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
-    task: Annotated[
-        str | None,
-        typer.Option(help="Evaluate all on this task.", show_default=False),
-    ] = None,
+    task: Annotated[str | None, typer.Option(help="Evaluate all on this task.")] = None,
     threshold: Annotated[
-        float | None,
-        typer.Option(help="Success rate (or return) to be reached soon; 0.9 where success is known."),
+        float | None, typer.Option(help="Success rate (or return) to be reached soon; 0.9 where success is known.")
     ] = None,
     gate: Annotated[
-        str | None,
-        typer.Option(metavar="not-worse", help="Exit 1 if one is worse than the first.", show_default=False),
+        str | None, typer.Option(metavar="not-worse", help="Exit 1 if one is worse than the first.")
     ] = None,
     json: Json = None,
 ) -> None:
@@ -103,10 +90,11 @@ def compare_runs(
     claim_stdout()
     if gate not in (None, "not-worse"):
         raise UsageError(f"--gate {gate}: the only gate is not-worse")
-    from rlctl.runs.comparison import CompareRequest, compare
+    from rlctl.eval.evaluate import EvalRequest
+    from rlctl.runs.comparison import compare
     from rlctl.runs.comparison_report import show
 
-    result = compare(CompareRequest(runs, episodes, seed, task, threshold))
+    result = compare(runs, EvalRequest(None, task=task, episodes=episodes, seed=seed), threshold)
     show(result, json)
     if gate:
         result.check()
@@ -117,13 +105,9 @@ def import_run(
     model: Annotated[Path, typer.Argument(metavar="MODEL.zip", help="Model of Stable-Baselines3 or rl-zoo3.")],
     task: Annotated[str, typer.Option(metavar="TASK", help=f"What it was trained on. {TASK_FORMS}")],
     vecnormalize: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.pkl", help="Its normalisation, if it has one.", show_default=False),
+        Path | None, typer.Option(metavar="FILE.pkl", help="Its normalisation, if it has one.")
     ] = None,
-    algo: Annotated[
-        str | None,
-        typer.Option(help="Its algorithm, where the file does not say it.", show_default=False),
-    ] = None,
+    algo: Annotated[str | None, typer.Option(help="Its algorithm, where the file does not say it.")] = None,
     settings: Set = [],
     output: Annotated[
         Path | None,
@@ -133,18 +117,15 @@ def import_run(
 ) -> None:
     """Turn a model of Stable-Baselines3 into a policy file. Nothing in the model is unpickled."""
     claim_stdout()
-    from rlctl.runs.import_model import ImportRequest, import_model, show
+    from rlctl.runs.import_model import import_model, show
 
-    request = ImportRequest(model, task, vecnormalize, algo, output, parse_changes(settings))
-    show(import_model(request), json)
+    changes = parse_changes(settings)
+    show(import_model(model, task, normalization=vecnormalize, algo=algo, output=output, changes=changes), json)
 
 
 @app.command("rm")
 def remove_runs(
-    runs: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="RUN...", help="Folders of runs.", show_default=False),
-    ] = None,
+    runs: Annotated[list[str] | None, typer.Argument(metavar="RUN...", help="Folders of runs.")] = None,
     keep_best: Annotated[
         int | None,
         typer.Option(metavar="N", help="Remove all finished or failed runs but the N best of each task.", min=0),

@@ -16,27 +16,22 @@ def serve(
     pretrained: Pretrained = False,
     host: Annotated[str, typer.Option(help="Address to listen on; others than loopback need a key.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; 0: any that is free.", min=0, max=65535)] = 8000,
-    limits: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Safety limits (YAML).", show_default=False)
-    ] = None,
+    limits: Annotated[Path | None, typer.Option(metavar="FILE", help="Safety limits (YAML).")] = None,
     log: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Log of events, as JSON lines, rotated at 10 MB.", show_default=False),
+        Path | None, typer.Option(metavar="FILE", help="Log of events, as JSON lines, rotated at 10 MB.")
     ] = None,
     rerun: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Record actions and observations for Rerun (.rrd).", show_default=False),
+        Path | None, typer.Option(metavar="FILE", help="Record actions and observations for Rerun (.rrd).")
     ] = None,
     key_file: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Key that clients must send; or RLCTL_API_KEY.", show_default=False),
+        Path | None, typer.Option(metavar="FILE", help="Key that clients must send; or RLCTL_API_KEY.")
     ] = None,
     max_clients: Annotated[int, typer.Option(help="Clients that may be connected at once.", min=1)] = 64,
     self_test: Annotated[
         bool,
         typer.Option("--self-test", help="Play the task through the server in simulation, and say how good it is."),
     ] = False,
-    episodes: Annotated[int, typer.Option("--episodes", help="Episodes of the self-test.", min=1)] = 100,
+    episodes: Annotated[int, typer.Option(help="Episodes of the self-test.", min=1)] = 100,
     json: Json = None,
 ) -> None:
     """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""

@@ -31,10 +31,7 @@ def tasks(
 
 @app.command("show")
 def show_task(
-    task: Annotated[
-        str,
-        typer.Argument(metavar="TASK", help=TASK_FORMS, show_default=False, autocompletion=completion.complete_task),
-    ],
+    task: Annotated[str, typer.Argument(metavar="TASK", help=TASK_FORMS, autocompletion=completion.complete_task)],
     json: Json = None,
 ) -> None:
     """Show what a task observes, does and rewards, what can be set, and how it is trained."""

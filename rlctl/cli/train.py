@@ -19,7 +19,6 @@ def train(
         typer.Option(
             metavar="RUN",
             help="Go on with a run instead: a folder, also of a group, a task's name, or latest.",
-            show_default=False,
             autocompletion=completion.complete_run,
         ),
     ] = None,
@@ -29,46 +28,35 @@ def train(
             "--from",
             metavar="POLICY",
             help="Begin with a policy: a run, a .safetensors file, or the name of a task that ships one.",
-            show_default=False,
             autocompletion=completion.complete_run,
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Go on with a run even if its task has changed.")] = False,
     config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Recipe that goes over the task's own, or presets/NAME.", show_default=False),
+        Path | None, typer.Option(metavar="FILE", help="Recipe that goes over the task's own, or presets/NAME.")
     ] = None,
     settings: Set = [],
     algo: Annotated[
         str | None,
         typer.Option(
             help="ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.",
-            show_default=False,
             autocompletion=completion.complete_algorithm,
         ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of everything random.", show_default=False)] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
     seeds: Annotated[
-        str | None,
-        typer.Option(metavar="0-4", help="Train these seeds, each an ordinary run, as a group.", show_default=False),
+        str | None, typer.Option(metavar="0-4", help="Train these seeds, each an ordinary run, as a group.")
     ] = None,
     jobs: Annotated[
-        int | None,
-        typer.Option(help="How many seeds train at a time.", min=1, show_default="half as many as cores"),
+        int | None, typer.Option(help="How many seeds train at a time.", min=1, show_default="half as many as cores")
     ] = None,
     total_timesteps: Annotated[
-        str | None,
-        typer.Option(
-            "--total-timesteps", "-n", metavar="STEPS", help="Environment steps; 1e6 is fine.", show_default=False
-        ),
+        str | None, typer.Option("--total-timesteps", "-n", metavar="STEPS", help="Environment steps; 1e6 is fine.")
     ] = None,
     n_envs: NEnvs = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, or auto.")] = "cpu",
     stop_success: Annotated[
-        float | None,
-        typer.Option(
-            metavar="RATE", help="Stop after two evaluations in a row at this success rate.", show_default=False
-        ),
+        float | None, typer.Option(metavar="RATE", help="Stop after two evaluations in a row at this success rate.")
     ] = None,
     record: Annotated[int, typer.Option(metavar="N", help="Write the last N evaluation episodes as .rrd.", min=0)] = 0,
     no_check: Annotated[bool, typer.Option("--no-check", help="Train without checking the environment first.")] = False,

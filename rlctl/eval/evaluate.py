@@ -120,13 +120,16 @@ class Gates:
         return missed
 
 
-def run_evaluation(request: EvalRequest, gates: Gates) -> Evaluation:
+NO_GATES = Gates()
+
+
+def run_evaluation(request: EvalRequest, gates: Gates = NO_GATES) -> Evaluation:
     """Find the policy, play its episodes, and return their statistics."""
     (evaluation,) = run_evaluations(request, gates)
     return evaluation
 
 
-def run_evaluations(request: EvalRequest, gates: Gates) -> list[Evaluation]:
+def run_evaluations(request: EvalRequest, gates: Gates = NO_GATES) -> list[Evaluation]:
     """Find the policy and evaluate it as `run_evaluation` does, in every stage that was asked for, with equal seeds."""
     if request.baseline is not None:
         return [_evaluate(load_baseline(request), choose_task(request), request, gates)]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.eval.statistics import summarize
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.robustness import Interval, Outcome, PushLevel, PushTest
 
@@ -78,8 +79,6 @@ def find_pushed(spec: EnvSpec) -> PushedBody:
 
 def measure_push(player: CellPlayer, spec: EnvSpec, unpushed: Sequence[EpisodeResult]) -> PushTest:
     """Push with twice the impulse until half of the episodes fail, then bisect, always with the same episodes."""
-    from rlctl.eval.vary import summarize
-
     pushed = find_pushed(spec)
     has_success = any(result.success is not None for result in unpushed)
     max_steps = player.workers.info.max_steps or 0

@@ -14,6 +14,7 @@ import numpy as np
 
 from rlctl.rollout.collect import Episode
 from rlctl.rollout.messages import EpisodeResult
+from rlctl.run.robustness import Outcome
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +64,16 @@ def success_interval(results: Sequence[EpisodeResult]) -> tuple[float, float] | 
 def mean_return(results: Sequence[EpisodeResult]) -> float:
     """Return the mean of the episodes' sums of rewards."""
     return float(np.mean([result.total_reward for result in results]))
+
+
+def summarize(results: Sequence[EpisodeResult]) -> Outcome:
+    """Return the success rate and the mean return of episodes, with their intervals."""
+    return Outcome(
+        success_rate=success_rate(results),
+        success_interval=success_interval(results),
+        mean_return=mean_return(results),
+        return_interval=mean_interval([result.total_reward for result in results]),
+    )
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:

@@ -15,8 +15,9 @@ from rlctl import output
 from rlctl.env_spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval import axes as axes_of
-from rlctl.eval.evaluate import EvalRequest, Gates, LoadedPolicy, choose_specs, load_player, start_workers
-from rlctl.eval.statistics import mean_interval, mean_return, success_interval, success_rate
+from rlctl.eval.evaluate import NO_GATES, EvalRequest, Gates, LoadedPolicy, choose_specs, load_player, start_workers
+from rlctl.eval.push import measure_push
+from rlctl.eval.statistics import summarize
 from rlctl.registry import is_task
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
@@ -25,21 +26,10 @@ from rlctl.rollout.workers import Workers
 from rlctl.run import lookup, robustness
 from rlctl.run.acting import Exploration
 from rlctl.run.policy import collect_versions
-from rlctl.run.robustness import Axis, Cell, Outcome, PushTest, Robustness, RobustnessMap
+from rlctl.run.robustness import Axis, Cell, Robustness, RobustnessMap
 
 ASK_ABOVE_S = 600.0
 """A measurement that takes longer than this [s] is begun only after asking."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RobustnessRequest:
-    """What the command line asks for, beside what every evaluation has."""
-
-    vary: Sequence[str] = ()
-    """`NAME=LOWEST:HIGHEST:VALUES`, one or two; or `all`."""
-    push: bool = False
-    yes: bool = False
-    """Do not ask before a long measurement."""
 
 
 class CellPlayer:
@@ -63,9 +53,12 @@ class CellPlayer:
         return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration)]
 
 
-def measure_robustness(request: EvalRequest, wanted: RobustnessRequest, gates: Gates) -> Robustness:
-    """Measure a policy in every cell of the maps that are asked for, and keep the result with its run.
+def measure_robustness(
+    request: EvalRequest, vary: Sequence[str] = (), *, push: bool = False, yes: bool = False, gates: Gates = NO_GATES
+) -> Robustness:
+    """Measure a policy in every cell of the maps that `vary` asks for, and with pushes, and keep the result in its run.
 
+    `vary` is `NAME=LOWEST:HIGHEST:VALUES`, one or two, or `all`; `yes` begins a long measurement without asking.
     Random changes that the policy was trained with do not act, unless the request's own changes say so.
     """
     if request.stage == "all":
@@ -76,11 +69,18 @@ def measure_robustness(request: EvalRequest, wanted: RobustnessRequest, gates: G
     output.print_notes(found.notes)
     policy = load_player(found.file, request.deterministic)
     (spec,) = [found.locate(each) for each in choose_specs(policy.info, request)]
-    maps = axes_of.read_axes(wanted.vary, spec) if wanted.vary else []
-    axes_of.count_cells(maps)
+    maps = axes_of.read_axes(vary, spec) if vary else []
+    axes_of.count_cells(maps)  # which are too many to be played?
     with start_workers(spec, request) as workers:
         policy.give_to(workers)
-        nominal, measured, push = _measure(CellPlayer(workers, policy, request), spec, maps, wanted, gates)
+        player = CellPlayer(workers, policy, request)
+        start = time.monotonic()
+        episodes = player.play(spec)
+        nominal = summarize(episodes)
+        gates.check_possible(nominal.success_rate is not None)
+        _ask(axes_of.count_cells(maps), time.monotonic() - start, yes)
+        measured = _play_maps(player, spec, maps)
+        pushed = measure_push(player, spec, episodes) if push else None
     result = Robustness(
         task=spec.task,
         parameters=dict(spec.parameters),
@@ -92,7 +92,7 @@ def measure_robustness(request: EvalRequest, wanted: RobustnessRequest, gates: G
         deterministic=request.deterministic,
         nominal=nominal,
         maps=measured,
-        push=push,
+        push=pushed,
         command=shlex.join(["rlctl", *sys.argv[1:]]),
         versions=collect_versions(),
     )
@@ -101,22 +101,9 @@ def measure_robustness(request: EvalRequest, wanted: RobustnessRequest, gates: G
     return result
 
 
-def _measure(
-    player: CellPlayer, spec: EnvSpec, maps: Sequence[Sequence[Axis]], wanted: RobustnessRequest, gates: Gates
-) -> tuple[Outcome, list[RobustnessMap], PushTest | None]:
-    from rlctl.eval.push import measure_push
-
-    start = time.monotonic()
-    episodes = player.play(spec)
-    nominal = summarize(episodes)
-    gates.check_possible(nominal.success_rate is not None)
-    _ask(axes_of.count_cells(maps), time.monotonic() - start, wanted.yes)
-    measured = []
+def _play_maps(player: CellPlayer, spec: EnvSpec, maps: Sequence[Sequence[Axis]]) -> list[RobustnessMap]:
     with _show_progress(axes_of.count_cells(maps)) as progress:
-        for axes in maps:
-            measured.append(RobustnessMap(axes=list(axes), cells=_play_cells(player, spec, axes, progress)))
-    push = measure_push(player, spec, episodes) if wanted.push else None
-    return nominal, measured, push
+        return [RobustnessMap(axes=list(axes), cells=_play_cells(player, spec, axes, progress)) for axes in maps]
 
 
 def _play_cells(player: CellPlayer, spec: EnvSpec, axes: Sequence[Axis], on_cell: Callable[[], None]) -> list[Cell]:
@@ -145,16 +132,6 @@ def _combine(axes: Sequence[Axis], values: Sequence[float]) -> EnvChanges:
 def _is_nominal(axes: Sequence[Axis], values: Sequence[float]) -> bool:
     pairs = zip(axes, values, strict=True)
     return all(axis.nominal is not None and abs(axis.nominal - value) < 1e-9 for axis, value in pairs)
-
-
-def summarize(results: Sequence[EpisodeResult]) -> Outcome:
-    """Return the numbers of a cell's episodes, by the functions of every evaluation."""
-    return Outcome(
-        success_rate=success_rate(results),
-        success_interval=success_interval(results),
-        mean_return=mean_return(results),
-        return_interval=mean_interval([result.total_reward for result in results]),
-    )
 
 
 def _ask(cells: int, seconds: float, yes: bool) -> None:

@@ -18,7 +18,7 @@ from rlctl.errors import ArtifactError, DivergedError, UsageError, short_repr
 from rlctl.run.c_policy import LIBRARY_SUFFIX, CPolicy
 from rlctl.run.layers import Array, apply
 from rlctl.run.network import DETERMINISTIC, Network, Tensors, select_actor_tensors
-from rlctl.run.policy import Policy, PolicyInfo, read_policy
+from rlctl.run.policy import Policy, PolicyInfo, load_policy, read_policy
 
 _BLOCK = 64
 """Steps whose random numbers are drawn together."""
@@ -276,13 +276,7 @@ class ExportedPlayer(Player):
     """Plays an exported policy, an ONNX file or compiled C: its deterministic action."""
 
     def __init__(self, path: str) -> None:
-        self._policy: Policy
-        if path.endswith(LIBRARY_SUFFIX):
-            self._policy = CPolicy.load(Path(path))
-            return
-        from rlctl.run.onnx_policy import OnnxPolicy  # only here: it imports onnxruntime
-
-        self._policy = OnnxPolicy.load(Path(path))
+        self._policy = CPolicy.load(Path(path)) if path.endswith(LIBRARY_SUFFIX) else load_policy(path)
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
         if step == 0:

@@ -25,61 +25,44 @@ _DIGITS = 18  # of a training step
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 
 
+class _Place:
+    """A file or folder below a run's own."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, run: RunDirectory, owner: type[RunDirectory]) -> Path:
+        return run.path / self._name
+
+
 class RunDirectory:
     """What a training wrote, and where."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    @property
-    def recipe_file(self) -> Path:
-        """The resolved recipe."""
-        return self.path / "recipe.yaml"
-
-    @property
-    def status_file(self) -> Path:
-        """Status, versions, command line, times."""
-        return self.path / "run.json"
-
-    @property
-    def metrics_file(self) -> Path:
-        """A row per update."""
-        return self.path / "metrics.csv"
-
-    @property
-    def evals_file(self) -> Path:
-        """A row per evaluation."""
-        return self.path / "evals.csv"
-
-    @property
-    def robustness_file(self) -> Path:
-        """What `rlctl eval --vary` or `--push` measured last; see `rlctl.run.robustness`."""
-        return self.path / "robustness.json"
-
-    @property
-    def best_policy(self) -> Path:
-        """The policy of the best evaluation."""
-        return self.path / "policies" / "best.safetensors"
-
-    @property
-    def last_policy(self) -> Path:
-        """The policy at the end, or at the last checkpoint."""
-        return self.path / "policies" / "last.safetensors"
-
-    @property
-    def episodes(self) -> Path:
-        """The folder of recorded episodes and recordings."""
-        return self.path / "episodes"
-
-    @property
-    def tensorboard(self) -> Path:
-        """The folder of TensorBoard files."""
-        return self.path / "tensorboard"
-
-    @property
-    def onnx_file(self) -> Path:
-        """Where an export goes by default."""
-        return self.path / "exports" / "policy.onnx"
+    recipe_file = _Place("recipe.yaml")
+    """The resolved recipe."""
+    status_file = _Place("run.json")
+    """Status, versions, command line, times."""
+    metrics_file = _Place("metrics.csv")
+    """A row per update."""
+    evals_file = _Place("evals.csv")
+    """A row per evaluation."""
+    robustness_file = _Place("robustness.json")
+    """What `rlctl eval --vary` or `--push` measured last; see `rlctl.run.robustness`."""
+    best_policy = _Place("policies/best.safetensors")
+    """The policy of the best evaluation."""
+    last_policy = _Place("policies/last.safetensors")
+    """The policy at the end, or at the last checkpoint."""
+    episodes = _Place("episodes")
+    """The folder of recorded episodes and recordings."""
+    tensorboard = _Place("tensorboard")
+    """The folder of TensorBoard files."""
+    onnx_file = _Place("exports/policy.onnx")
+    """Where an export goes by default."""
+    replay_segments = _Place("checkpoints/replay")
+    """The folder of the replay buffer that checkpoints share."""
 
     def checkpoint(self, steps: int) -> Path:
         """Return the folder of the checkpoint at a training step."""
@@ -91,11 +74,6 @@ class RunDirectory:
         if not folder.is_dir():
             return []
         return sorted(each for each in folder.iterdir() if each.name.isdecimal())
-
-    @property
-    def replay_segments(self) -> Path:
-        """The folder of the replay buffer that checkpoints share."""
-        return self.path / "checkpoints" / "replay"
 
     def episode_file(self, number: int) -> Path:
         """Return the file of a recorded episode."""

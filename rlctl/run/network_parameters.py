@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -13,6 +13,11 @@ _Width = Annotated[Whole, Field(ge=1, le=65_536)]
 _Few = Annotated[Whole, Field(ge=1, le=100)]
 _Layers = Annotated[list[_Width], Field(max_length=100)]
 _PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
+
+
+def _widths(default: str, *examples: str) -> Any:
+    """Return the field of `net_arch`, whose default SB3 chooses."""
+    return Field(None, examples=list(examples) or None, json_schema_extra={"default_text": default})
 
 
 class _FeaturesExtractor(Parameters):
@@ -54,17 +59,15 @@ class _Network(Parameters):
 class QNetwork(_Network):
     """The network of DQN."""
 
-    net_arch: _Layers | None = Field(None, json_schema_extra={"default_text": "[64, 64]; [] for images"})
+    net_arch: _Layers | None = _widths("[64, 64]; [] for images")
     """Widths of the hidden layers."""
 
 
 class ActorCritic(_Network):
     """The networks of PPO and A2C."""
 
-    net_arch: _Layers | _ActorAndValue | None = Field(
-        None,
-        examples=["[64, 64]", "{pi: [64, 64], vf: [64, 64]}"],
-        json_schema_extra={"default_text": "[64, 64]; [] for images"},
+    net_arch: _Layers | _ActorAndValue | None = _widths(
+        "[64, 64]; [] for images", "[64, 64]", "{pi: [64, 64], vf: [64, 64]}"
     )
     """Widths of the hidden layers, of the actor (`pi`) and the value function (`vf`)."""
     activation_fn: Activation = "tanh"
@@ -100,10 +103,8 @@ class RecurrentActorCritic(ActorCritic):
 class TwinCritics(_Network):
     """The networks of TD3 and DDPG."""
 
-    net_arch: _Layers | _ActorAndCritic | None = Field(
-        None,
-        examples=["[256, 256]", "{pi: [256, 256], qf: [256, 256]}"],
-        json_schema_extra={"default_text": "[400, 300]; [256, 256] for images"},
+    net_arch: _Layers | _ActorAndCritic | None = _widths(
+        "[400, 300]; [256, 256] for images", "[256, 256]", "{pi: [256, 256], qf: [256, 256]}"
     )
     """Widths of the hidden layers, of the actor (`pi`) and the critics (`qf`)."""
     n_critics: _Few = 2
@@ -121,11 +122,7 @@ class DdpgNetwork(TwinCritics):
 class SquashedActor(TwinCritics):
     """The networks of SAC."""
 
-    net_arch: _Layers | _ActorAndCritic | None = Field(
-        None,
-        examples=["[256, 256]", "{pi: [256, 256], qf: [256, 256]}"],
-        json_schema_extra={"default_text": "[256, 256]"},
-    )
+    net_arch: _Layers | _ActorAndCritic | None = _widths("[256, 256]", "[256, 256]", "{pi: [256, 256], qf: [256, 256]}")
     log_std_init: Annotated[Number, Field(ge=-20, le=10)] = -3.0
     """With gSDE: logarithm of the actions' first standard deviation."""
     use_expln: Switch = False
@@ -144,10 +141,8 @@ class QuantileCritics(SquashedActor):
 class BatchNormCritics(SquashedActor):
     """The networks of CrossQ."""
 
-    net_arch: _Layers | _ActorAndCritic | None = Field(
-        None,
-        examples=["[256, 256]", "{pi: [256, 256], qf: [1024, 1024]}"],
-        json_schema_extra={"default_text": "{pi: [256, 256], qf: [1024, 1024]}"},
+    net_arch: _Layers | _ActorAndCritic | None = _widths(
+        "{pi: [256, 256], qf: [1024, 1024]}", "[256, 256]", "{pi: [256, 256], qf: [1024, 1024]}"
     )
     batch_norm: Switch = True
     """Whether to normalise batches at all."""

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecTransposeImage
 from torch.overrides import TorchFunctionMode
 
 from rlctl.dict_spaces import Observations, join, split
-from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
+from rlctl.errors import ArtifactError, short_repr
 from rlctl.run.layers import Normalize
 from rlctl.run.network import select_actor_tensors
 from rlctl.run.policy import Policy, PolicyInfo, read_policy
@@ -77,16 +77,6 @@ def policy_name(algo: str, observation_space: spaces.Space[Any]) -> str:
     return f"{kind}{'Lstm' if algo == 'recurrent_ppo' else ''}Policy"
 
 
-def activation(name: str) -> type[torch.nn.Module]:
-    """Return the activation of a name; raises `RecipeError` with the closest one."""
-    if name not in ACTIVATIONS:
-        raise RecipeError(
-            f"policy_kwargs.activation_fn: no activation {name!r}.{did_you_mean(name, ACTIVATIONS)} "
-            f"There are: {', '.join(ACTIVATIONS)}."
-        )
-    return ACTIVATIONS[name]
-
-
 def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
     """Return the observation space as SB3's networks see it: images with channels first."""
     if isinstance(space, spaces.Dict):
@@ -135,7 +125,7 @@ def build_network(info: PolicyInfo) -> BasePolicy:
         raise ArtifactError(f"policy of an unknown kind {info.policy!r} for {info.algo}")
     kwargs = dict(info.policy_kwargs)
     if "activation_fn" in kwargs:
-        kwargs["activation_fn"] = activation(kwargs["activation_fn"])
+        kwargs["activation_fn"] = ACTIVATIONS[kwargs["activation_fn"]]
     return cls(
         network_space(observation_space),
         action_space,

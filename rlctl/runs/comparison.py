@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
+from rlctl.eval.evaluate import EvalRequest, Evaluation, run_evaluation
 from rlctl.run.directory import RunDirectory, is_group
 from rlctl.run.group import read_group
 from rlctl.run.lookup import find_run
@@ -34,20 +34,6 @@ Quantity = Literal["success", "return"]
 
 THRESHOLD = 0.9
 """Success rate whose first evaluation is looked for, where no other is asked for."""
-
-
-@dataclasses.dataclass(frozen=True)
-class CompareRequest:
-    """What the command line asks for."""
-
-    sides: Sequence[str]
-    """Runs, groups, globs, or folders of runs; the first is the baseline."""
-    episodes: int = 100
-    seed: int = 0
-    task: str | None = None
-    """Task to evaluate all on, instead of the one each was trained on."""
-    threshold: float | None = None
-    """Success rate, or return where a task has no success, whose first evaluation is looked for."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,21 +112,24 @@ class Comparison:
             raise AnswerIsNo(f"gate missed: {', '.join(worse)} worse than {self.baseline.name}")
 
 
-def compare(request: CompareRequest) -> Comparison:
-    """Evaluate every run and compare each side with the first.
+def compare(texts: Sequence[str], request: EvalRequest, threshold: float | None = None) -> Comparison:
+    """Evaluate every run as `request` says, without its `run`, and compare each side with the first.
+
+    `texts` are runs, groups, globs, or folders of runs; the first is the baseline. `threshold` is a success rate, or a
+    return where a task has no success, whose first evaluation is looked for.
 
     Raises `UsageError` for less than two sides, a run compared with itself, runs of different tasks without `task`,
     and groups beside single runs; `ArtifactError` for runs that are missing, damaged or without a policy.
     """
-    if len(request.sides) < 2:
+    if len(texts) < 2:
         raise UsageError("give two or more to compare, the baseline first: rlctl runs compare A B")
-    groups = [find_group(text) for text in request.sides]
-    _refuse_unequal(request.sides, groups)
+    groups = [find_group(text) for text in texts]
+    _refuse_unequal(texts, groups)
     task = _common_task([run for group in groups for run in group], request.task)
     recipes = [[run.recipe() for run in group] for group in groups]
     sides = [
-        Side(_name(text, group), [_evaluate(run, request) for run in group], _find_mixed(mixed))
-        for text, group, mixed in zip(request.sides, groups, recipes, strict=True)
+        Side(_name(text, group), [_evaluate(run, request, threshold) for run in group], _find_mixed(mixed))
+        for text, group, mixed in zip(texts, groups, recipes, strict=True)
     ]
     baseline, *others = sides
     of_recipes = len(groups[0]) > 1
@@ -153,7 +142,7 @@ def compare(request: CompareRequest) -> Comparison:
             for side, recipe in zip(others, recipes[1:], strict=True)
         ],
         episodes=request.episodes,
-        threshold=_threshold(request, baseline.has_success),
+        threshold=_default_threshold(threshold, baseline.has_success),
     )
 
 
@@ -207,12 +196,10 @@ def _find_mixed(recipes: list[Recipe]) -> list[str]:
     return sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})
 
 
-def _evaluate(run: RunDirectory, request: CompareRequest) -> EvaluatedRun:
-    evaluation = run_evaluation(
-        EvalRequest(run=str(run.path), task=request.task, episodes=request.episodes, seed=request.seed), Gates()
-    )
+def _evaluate(run: RunDirectory, request: EvalRequest, threshold: float | None) -> EvaluatedRun:
+    evaluation = run_evaluation(dataclasses.replace(request, run=str(run.path)))
     has_success = evaluation.success_rate is not None
-    column, threshold = "success" if has_success else "return", _threshold(request, has_success)
+    column, threshold = "success" if has_success else "return", _default_threshold(threshold, has_success)
     reached: dict[str, float | None] = {}
     if threshold is not None:
         rows = read_table(run.evals_file)
@@ -227,8 +214,8 @@ def _evaluate(run: RunDirectory, request: CompareRequest) -> EvaluatedRun:
     )
 
 
-def _threshold(request: CompareRequest, has_success: bool) -> float | None:
-    return THRESHOLD if request.threshold is None and has_success else request.threshold
+def _default_threshold(threshold: float | None, has_success: bool) -> float | None:
+    return THRESHOLD if threshold is None and has_success else threshold
 
 
 def _differences(baseline: Side, side: Side, of_recipes: bool) -> dict[Quantity, Difference]:

@@ -18,49 +18,45 @@ from rlctl.runs.sb3_model import SavedModel, SavedNormalization, read_model, rea
 
 
 @dataclasses.dataclass(frozen=True)
-class ImportRequest:
-    """What the command line asks for."""
-
-    model: Path
-    task: str
-    normalization: Path | None = None
-    algo: str | None = None
-    output: Path | None = None
-    changes: EnvChanges = UNCHANGED
-
-
-@dataclasses.dataclass(frozen=True)
 class ImportedPolicy:
     """The policy file that was written."""
 
     file: Path
     info: PolicyInfo
-    normalizes: bool
 
 
-def import_model(request: ImportRequest) -> ImportedPolicy:
-    """Read a model and write it as a policy of a task, once it acts.
+def import_model(
+    file: Path,
+    task: str,
+    *,
+    normalization: Path | None = None,
+    algo: str | None = None,
+    output: Path | None = None,
+    changes: EnvChanges = UNCHANGED,
+) -> ImportedPolicy:
+    """Read a model, and a VecNormalize if it has one, and write it as a policy of a task, once it acts.
 
     Raises `ArtifactError` for a file that is not a model, or one for other spaces than the task has.
     """
     from rlctl.run.torch_policy import ALGORITHMS, build_network, describe_network, policy_name
 
-    if request.algo is not None and request.algo not in ALGORITHMS:
-        raise UsageError(f"--algo {request.algo}: no such algorithm.{did_you_mean(request.algo, ALGORITHMS)}")
-    model = read_model(request.model, request.algo)
-    normalization = read_normalization(request.normalization) if request.normalization else None
-    spec = request.changes.apply(EnvSpec(request.task))
+    if algo is not None and algo not in ALGORITHMS:
+        raise UsageError(f"--algo {algo}: no such algorithm.{did_you_mean(algo, ALGORITHMS)}")
+    model = read_model(file, algo)
+    statistics = read_normalization(normalization) if normalization else None
+    spec = changes.apply(EnvSpec(task))
     env_info = _describe_env(spec)
     if _has_time_feature(model, env_info):
         spec = dataclasses.replace(spec, time_feature=True)
         env_info = _describe_env(spec)
-    _check_spaces(request, model, *env_info.spaces())
+    if (difference := _find_difference(model, task, *env_info.spaces())) is not None:
+        raise ArtifactError(f"{file}: {difference}")
     info = PolicyInfo(
         algo=model.algo,
         policy=policy_name(model.algo, env_info.spaces()[0]),
         policy_kwargs=model.policy_kwargs,
-        clip_observation=normalization.clip if normalization else None,
-        normalized_keys=list(normalization.mean) if normalization else [],
+        clip_observation=statistics.clip if statistics else None,
+        normalized_keys=list(statistics.mean) if statistics else [],
         env=env_info,
         spec=spec,
         training_steps=model.training_steps,
@@ -70,10 +66,10 @@ def import_model(request: ImportRequest) -> ImportedPolicy:
         # As described by the network itself, with what SB3 fills in: its defaults may change.
         info = info.model_copy(update={"policy_kwargs": describe_network(build_network(info))})
     except (TypeError, ValueError, AssertionError) as error:
-        raise ArtifactError(f"{request.model}: its policy_kwargs make no network for {request.task}: {error}") from None
-    output = request.output or Path(f"{request.model.stem}.safetensors")
-    _write_checked(output, info, _collect_tensors(model, normalization))
-    return ImportedPolicy(output, info, normalization is not None)
+        raise ArtifactError(f"{file}: its policy_kwargs make no network for {task}: {error}") from None
+    target = output or Path(f"{file.stem}.safetensors")
+    _write_checked(target, info, _collect_tensors(model, statistics))
+    return ImportedPolicy(target, info)
 
 
 def _describe_env(spec: EnvSpec) -> EnvInfo:
@@ -98,41 +94,36 @@ def _flat_part(space: spaces.Space[Any]) -> spaces.Box | None:
     return part if isinstance(part, spaces.Box) and len(part.shape) == 1 else None
 
 
-def _check_spaces(
-    request: ImportRequest, model: SavedModel, observation: spaces.Space[Any], action: spaces.Space[Any]
-) -> None:
-    """Bounds of actions must agree, because a policy scales to them; those of observations are often declared anew."""
+def _find_difference(
+    model: SavedModel, task: str, observation: spaces.Space[Any], action: spaces.Space[Any]
+) -> str | None:
+    """Say how the spaces of a task differ from a model's; None if the model can act in it.
+
+    Bounds of actions must agree, because a policy scales to them; those of observations are often declared anew.
+    """
     from rlctl.run.torch_policy import network_space
 
     seen = network_space(observation)
     if _describe_shape(seen) != _describe_shape(model.observation_space):
-        raise ArtifactError(
-            f"{request.model}: it observes {_describe_shape(model.observation_space)}, "
-            f"{request.task} gives {_describe_shape(seen)}"
-        )
+        return f"it observes {_describe_shape(model.observation_space)}, {task} gives {_describe_shape(seen)}"
     same = _describe_shape(action) == _describe_shape(model.action_space)
     if same and isinstance(action, spaces.Box) and isinstance(model.action_space, spaces.Box):
         same = np.allclose(action.low, model.action_space.low) and np.allclose(action.high, model.action_space.high)
-    if not same:
-        raise ArtifactError(f"{request.model}: its actions are {model.action_space}, those of {request.task} {action}")
+    return None if same else f"its actions are {model.action_space}, those of {task} {action}"
 
 
 def _describe_shape(space: spaces.Space[Any]) -> Any:
     if isinstance(space, spaces.Dict):
         return {key: _describe_shape(each) for key, each in space.spaces.items()}
-    return (
-        str(space)
-        if isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
-        else f"{type(space).__name__}{space.shape}"
-    )
+    counts = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
+    return str(space) if counts else f"{type(space).__name__}{space.shape}"
 
 
 def _collect_tensors(model: SavedModel, normalization: SavedNormalization | None) -> dict[str, NDArray[Any]]:
     tensors = {f"policy/{name}": values for name, values in model.tensors.items()}
-    for key in normalization.mean if normalization else ():
-        assert normalization is not None
-        tensors[f"normalize/{key}/mean"] = normalization.mean[key]
-        tensors[f"normalize/{key}/var"] = normalization.var[key]
+    if normalization is not None:
+        for key, mean in normalization.mean.items():
+            tensors |= {f"normalize/{key}/mean": mean, f"normalize/{key}/var": normalization.var[key]}
     return tensors
 
 
@@ -156,19 +147,19 @@ def show(result: ImportedPolicy, json: str | None) -> None:
     """Print what was imported and what to type next, or write it as JSON."""
     from rlctl import output
 
-    info = result.info
+    info, normalizes = result.info, result.info.clip_observation is not None
     if json is not None:
         content = {
             "policy": str(result.file),
             "algo": info.algo,
             "task": info.spec.task,
-            "normalizes": result.normalizes,
+            "normalizes": normalizes,
             "time_feature": info.spec.time_feature,
         }
         output.write_result_json(json, {**content, "training_steps": info.training_steps, "versions": info.versions})
         return
     out = output.out()
-    normalization = "with" if result.normalizes else "without"
+    normalization = "with" if normalizes else "without"
     out.print(f"{result.file}: {info.algo}, step {info.training_steps:,}, {normalization} observation normalisation")
     if info.spec.time_feature:
         out.print("it also observes the part of the episode that is left, the time feature of rl-zoo3")

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from rlctl.dict_spaces import split_space
 from rlctl.errors import RecipeError, UsageError, short_repr
 from rlctl.run.recipe import Normalize, Recipe
-from rlctl.run.torch_policy import ALGORITHMS, activation, policy_name
+from rlctl.run.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.train import footprint
 from rlctl.train.hindsight import replay_arguments
 from rlctl.train.vec_env import WorkerVecEnv
@@ -128,7 +128,7 @@ def _linear(text: str) -> Callable[[float], float]:
 def _policy_kwargs(recipe: Recipe) -> dict[str, Any]:
     kwargs = dict(recipe.policy_kwargs)
     if "activation_fn" in kwargs:
-        kwargs["activation_fn"] = activation(kwargs["activation_fn"])
+        kwargs["activation_fn"] = ACTIVATIONS[kwargs["activation_fn"]]
     return kwargs
 
 

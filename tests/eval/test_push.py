@@ -7,23 +7,20 @@ import pytest
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.eval.evaluate import EvalRequest, Gates
+from rlctl.eval.evaluate import EvalRequest
 from rlctl.eval.push import find_pushed, find_threshold
-from rlctl.eval.vary import RobustnessRequest, measure_robustness
+from rlctl.eval.vary import measure_robustness
 from rlctl.run.robustness import read
 from tests.eval.conftest import ENVS, write_run
 
 
 def push(run, **request):
-    result = measure_robustness(
-        EvalRequest(str(run.path), episodes=4, **request), RobustnessRequest(push=True), Gates()
-    )
-    return result.push
+    return measure_robustness(EvalRequest(str(run.path), episodes=4, **request), push=True).push
 
 
 def test_the_threshold_by_hand_and_beside_a_map(block_run):
     request = EvalRequest(str(block_run.path), episodes=4)
-    vary = measure_robustness(request, RobustnessRequest(["mass=1:2:2"]), Gates())
+    vary = measure_robustness(request, ["mass=1:2:2"])
     found = push(block_run)
     # 0.1 kg stop after v^2 / (2 * 0.5 * 9.81 m/s^2) = 0.1 m if v = 0.99 m/s, so the push is 0.099 N s; it slides while
     # it is pushed, 0.1 s long, which takes 0.5 * 0.1 kg * 9.81 m/s^2 * 0.1 s = 0.049 N s more, and some 0.05 m less.

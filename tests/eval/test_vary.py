@@ -10,7 +10,7 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval.axes import read_axes
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.eval.statistics import mean_interval
-from rlctl.eval.vary import RobustnessRequest, check_gates, format_duration, measure_robustness
+from rlctl.eval.vary import check_gates, format_duration, measure_robustness
 from rlctl.run.robustness import read
 from tests.eval.conftest import ENVS, write_run
 
@@ -21,7 +21,7 @@ BLOCK = EnvSpec(f"{ENVS}:Block")
 def measured(block_run):
     """The block's chance to stay, over the force of pushes and its mass."""
     request = EvalRequest(str(block_run.path), episodes=5)
-    return measure_robustness(request, RobustnessRequest(["push=0:3:3", "mass=1:3:2"]), Gates())
+    return measure_robustness(request, ["push=0:3:3", "mass=1:3:2"])
 
 
 def test_a_cell_is_the_evaluation_with_its_values(block_run, measured):
@@ -64,7 +64,7 @@ def test_it_is_kept_with_the_run(block_run, measured):
 
 def test_parameters_of_the_task_are_varied_too(block_run):
     request = EvalRequest(str(block_run.path), episodes=3)
-    result = measure_robustness(request, RobustnessRequest(["push.force=0:3:2", "limit=0.1:9:2"]), Gates())
+    result = measure_robustness(request, ["push.force=0:3:2", "limit=0.1:9:2"])
     (found,) = result.maps
     assert [cell.success_rate for cell in found.cells] == [1.0, 1.0, 0.0, 1.0]
     assert [cell.nominal for cell in found.cells] == [True, False, False, False]
@@ -103,11 +103,11 @@ def test_command_line_as_json(rlctl, block_run):
 
 
 def test_a_long_measurement_is_not_begun_unasked(block_run):
-    wanted = RobustnessRequest(["push=0:3:1000", "mass=1:2:1000"])
+    vary = ["push=0:3:1000", "mass=1:2:1000"]
     with pytest.raises(
         UsageError, match=r"1,000,000 cells will take about [\d.]+ (h|days): .*begin all the same: --yes"
     ):
-        measure_robustness(EvalRequest(str(block_run.path), episodes=2), wanted, Gates())
+        measure_robustness(EvalRequest(str(block_run.path), episodes=2), vary)
     assert [format_duration(seconds) for seconds in (50, 600, 5400, 200_000)] == ["50 s", "10 min", "1.5 h", "2.3 days"]
 
 
@@ -186,9 +186,9 @@ def test_map_of_a_plain_environment(tmp_path, rlctl):
 
 
 def test_too_many_cells(block_run):
-    wanted = RobustnessRequest(["push=0:3:2000", "mass=1:2:2000"], yes=True)
+    vary = ["push=0:3:2000", "mass=1:2:2000"]
     with pytest.raises(UsageError, match="4,000,000 cells; at most 1,000,000"):
-        measure_robustness(EvalRequest(str(block_run.path), episodes=2), wanted, Gates())
+        measure_robustness(EvalRequest(str(block_run.path), episodes=2), vary, yes=True)
 
 
 def test_events_set_in_a_standing_world_act_as_in_a_new_one():

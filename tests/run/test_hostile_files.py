@@ -68,15 +68,12 @@ def test_a_pickle_in_a_member(name, episode, tmp_path):
 @pytest.mark.parametrize(
     ("members", "message"),
     [
-        ([("evil.pkl", b"")], "'evil.pkl' is not an array"),
-        ([("../../x.npy", array_file(np.zeros(3)))], "'../../x.npy' points outside the archive"),
-        ([("/tmp/x.npy", array_file(np.zeros(3)))], "'/tmp/x.npy' points outside the archive"),
-        ([("a.npy", header((10**12,)) + b"\0" * 80)], "'a.npy' is not as large as its header says"),
-        ([("a.npy", header((-8,)))], "'a.npy' is not as large as its header says"),
-        ([("a.npy", header((10**18,), "|S0"))], "'a.npy' is not as large as its header says"),
-        ([("a.npy", header((9,)) + b"\0" * 80)], "'a.npy' is not as large as its header says"),
-        ([("a.npy", b"\x93NUMPY\x09\x00" + b"\0" * 99)], "array format 9.0 is not read"),
-        ([("a.npy", b"not an array")], "the magic string is not correct"),
+        ([("evil.pkl", b"")], "'evil.pkl' is not an array, or not packed as numpy does it"),
+        ([("a.npy", header((10**12,)) + b"\0" * 80)], "x.npz: damaged, or not an .npz file: "),
+        ([("a.npy", header((-8,)))], "x.npz: damaged, or not an .npz file: "),
+        ([("a.npy", header((11,)) + b"\0" * 80)], "EOF: reading array data, expected 88 bytes got 80"),
+        ([("a.npy", b"\x93NUMPY\x09\x00" + b"\0" * 99)], "we only support format version"),
+        ([("a.npy", b"not an array")], "'a' is not an array"),
         ([(f"{n}.npy", array_file(np.zeros(0))) for n in range(1001)], "it has 1,001 members, at most 1,000 are read"),
     ],
 )
@@ -90,17 +87,16 @@ def test_members_that_are_refused(members, message, tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["x.npz"]
 
 
-@pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_a_member_that_is_there_twice(tmp_path):
-    content = array_file(np.zeros(3))
-    archive(tmp_path / "x.npz", [("a.npy", content), ("a.npy", content)])
-    with pytest.raises(ArtifactError, match=r"'a.npy' is in the archive twice$"):
-        files.read_npz(tmp_path / "x.npz")
+@pytest.mark.parametrize("name", ["../../x.npy", "/tmp/x.npy"])
+def test_a_name_that_points_outside_is_only_a_name(name, tmp_path):
+    archive(tmp_path / "x.npz", [(name, array_file(np.zeros(3)))])
+    assert [each.shape for each in files.read_npz(tmp_path / "x.npz").values()] == [(3,)]
+    assert [each.name for each in tmp_path.iterdir()] == ["x.npz"]
 
 
 def test_packing_that_lets_a_file_choose_the_memory(tmp_path):
     archive(tmp_path / "x.npz", [("a.npy", array_file(np.zeros(3)))], zipfile.ZIP_LZMA)
-    with pytest.raises(ArtifactError, match=r"'a.npy' is not compressed as numpy does it$"):
+    with pytest.raises(ArtifactError, match=r"'a.npy' is not an array, or not packed as numpy does it$"):
         files.read_npz(tmp_path / "x.npz")
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.eval.evaluate import EvalRequest
 from rlctl.run.recipe import merge
-from rlctl.runs.comparison import CompareRequest, compare
+from rlctl.runs.comparison import compare
 from rlctl.runs.comparison_report import as_json, format_needed
 from rlctl.runs.statistics import Verdict
 from rlctl.train.request import TrainRequest, run_training
@@ -27,7 +28,7 @@ def root(tmp_path_factory):
 
 def test_policies_are_compared_episode_by_episode(root):
     one, two = sorted((root / "0.9/Line").iterdir())
-    result = compare(CompareRequest([str(one), str(two)], episodes=5))
+    result = compare([str(one), str(two)], EvalRequest(None, episodes=5))
     assert not result.of_recipes
     (candidate,) = result.candidates
     difference = candidate.differences["return"]
@@ -40,7 +41,7 @@ def test_policies_are_compared_episode_by_episode(root):
 
 
 def test_recipes_are_compared_seed_by_seed(root):
-    result = compare(CompareRequest([str(root / "0.9/Line"), f"{root}/0.99/Line/*"], episodes=3))
+    result = compare([str(root / "0.9/Line"), f"{root}/0.99/Line/*"], EvalRequest(None, episodes=3))
     assert result.of_recipes
     (candidate,) = result.candidates
     assert candidate.recipe_changes == {"algo_kwargs.gamma": (0.99, 0.9)}
@@ -57,29 +58,29 @@ def test_recipes_are_compared_seed_by_seed(root):
 
 
 def test_runs_of_several_recipes_as_one_are_pointed_out(root):
-    result = compare(CompareRequest([f"{root}/0.9*/Line/*_s0", f"{root}/0.9*/Line/*_s1"], episodes=2))
+    result = compare([f"{root}/0.9*/Line/*_s0", f"{root}/0.9*/Line/*_s1"], EvalRequest(None, episodes=2))
     assert result.baseline.mixed == ["algo_kwargs.gamma"]
 
 
 def test_refusals(root, write_run):
     one, _ = sorted((root / "0.9/Line").iterdir())
     with pytest.raises(UsageError, match="two or more"):
-        compare(CompareRequest([str(one)]))
+        compare([str(one)], EvalRequest(None))
     with pytest.raises(UsageError, match="cannot be compared with itself"):
-        compare(CompareRequest([str(one), str(one)]))
+        compare([str(one), str(one)], EvalRequest(None))
     with pytest.raises(UsageError, match="one run beside a group"):
-        compare(CompareRequest([str(one), str(root / "0.99/Line")]))
+        compare([str(one), str(root / "0.99/Line")], EvalRequest(None))
     with pytest.raises(ArtifactError, match="no run matches"):
-        compare(CompareRequest([str(one), f"{root}/0.5*"]))
+        compare([str(one), f"{root}/0.5*"], EvalRequest(None))
     other = write_run("ant/2026-01-01_00-00-00_s0")
     with pytest.raises(UsageError, match=r"different tasks.*--task"):
-        compare(CompareRequest([str(one), str(other)]))
+        compare([str(one), str(other)], EvalRequest(None))
 
 
 def test_gate(root):
     one, two = sorted((root / "0.9/Line").iterdir())
-    result = compare(CompareRequest([str(one), str(two)], episodes=4))
-    swapped = compare(CompareRequest([str(two), str(one)], episodes=4))
+    result = compare([str(one), str(two)], EvalRequest(None, episodes=4))
+    swapped = compare([str(two), str(one)], EvalRequest(None, episodes=4))
     verdicts = {result.candidates[0].verdict, swapped.candidates[0].verdict}
     assert verdicts in ({Verdict.BETTER, Verdict.WORSE}, {Verdict.CANNOT_TELL})
     for each in (result, swapped):

@@ -20,7 +20,7 @@ from rlctl.errors import ArtifactError, UsageError
 from rlctl.run.policy import load_policy
 from rlctl.run.torch_policy import ALGORITHMS, policy_name
 from rlctl.runs import pickle_data
-from rlctl.runs.import_model import ImportRequest, import_model
+from rlctl.runs.import_model import import_model
 from rlctl.runs.pickle_data import NotPlainData, read_array
 from rlctl.runs.sb3_model import read_model, read_normalization, read_space
 
@@ -64,10 +64,10 @@ def save(tmp_path):
         model.save(tmp_path / "model.zip")
         env.save(str(tmp_path / "vecnormalize.pkl"))
         env.training = False
-        request = ImportRequest(
-            tmp_path / "model.zip", SMALL, tmp_path / "vecnormalize.pkl", output=tmp_path / "policy.safetensors",
-            changes=EnvChanges(parameters),
-        )  # fmt: skip
+        request = {
+            "file": tmp_path / "model.zip", "task": SMALL, "normalization": tmp_path / "vecnormalize.pkl",
+            "output": tmp_path / "policy.safetensors", "changes": EnvChanges(parameters),
+        }  # fmt: skip
         return model, env, request
 
     return saved
@@ -76,7 +76,7 @@ def save(tmp_path):
 @pytest.mark.parametrize(("algo", "observation", "action", "kwargs"), CASES, ids=lambda value: str(value)[:30])
 def test_acts_as_the_model_does(save, algo, observation, action, kwargs):
     model, env, request = save(algo, observation, action, **kwargs)
-    imported = import_model(request)
+    imported = import_model(**request)
     assert imported.info.algo == algo
     policy = load_policy(imported.file)
     rng, space = np.random.default_rng(0), policy.observation_space
@@ -108,7 +108,7 @@ def test_nothing_is_unpickled(save, monkeypatch):
     _, _, request = save("ppo", learning_rate=lambda left: 1e-3 * left)
     found = []
     sys.addaudithook(lambda event, arguments: found.append(arguments) if event == "pickle.find_class" else None)
-    import_model(request)
+    import_model(**request)
     assert found == []
 
 
@@ -141,17 +141,17 @@ def test_a_call_that_is_not_on_the_list_is_refused_and_not_made(save, tmp_path):
     proof = tmp_path / "proof"
     attack = Attack(Path.touch, proof)
     for key in ("policy_kwargs", "observation_space", "action_space", "policy_class"):
-        import_model(request)
-        original = request.model.read_bytes()
-        edit_data(request.model, **{key: serialized(attack if key != "policy_kwargs" else {"net_arch": attack})})
+        import_model(**request)
+        original = request["file"].read_bytes()
+        edit_data(request["file"], **{key: serialized(attack if key != "policy_kwargs" else {"net_arch": attack})})
         with pytest.raises(ArtifactError, match="it holds what is not read"):
-            import_model(request)
-        request.model.write_bytes(original)
-    edit_data(request.model, unknown=serialized(attack))
-    import_model(request)  # what is not needed is not looked at
-    request.normalization.write_bytes(pickle.dumps(attack))
+            import_model(**request)
+        request["file"].write_bytes(original)
+    edit_data(request["file"], unknown=serialized(attack))
+    import_model(**request)  # what is not needed is not looked at
+    request["normalization"].write_bytes(pickle.dumps(attack))
     with pytest.raises(ArtifactError, match=r"vecnormalize.pkl: it holds what is not read"):
-        import_model(request)
+        import_model(**request)
     assert not proof.exists()
 
 
@@ -160,7 +160,7 @@ def test_other_files_are_refused(save, tmp_path):
     for name, content in {
         "text.zip": b"not an archive",
         "empty.zip": b"",
-        "half.zip": request.model.read_bytes()[:500],
+        "half.zip": request["file"].read_bytes()[:500],
     }.items():
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ArtifactError, match=name):
@@ -171,7 +171,7 @@ def test_other_files_are_refused(save, tmp_path):
         read_model(tmp_path / "photos.zip")
     with pytest.raises(ArtifactError, match="no such file"):
         read_model(tmp_path / "nothing.zip")
-    (tmp_path / "half.pkl").write_bytes(request.normalization.read_bytes()[:200])
+    (tmp_path / "half.pkl").write_bytes(request["normalization"].read_bytes()[:200])
     with pytest.raises(ArtifactError, match=r"half\.pkl"):
         read_normalization(tmp_path / "half.pkl")
 
@@ -186,14 +186,13 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path):
 
 def test_other_spaces_are_refused(save):
     _, _, request = save()
-    other = ImportRequest(request.model, "reach", request.normalization)
     with pytest.raises(ArtifactError, match=r"model.zip: it observes Box\(3,\), reach gives Box"):
-        import_model(other)
-    discrete = ImportRequest(request.model, SMALL, changes=EnvChanges({"observation": "vector", "action": "discrete"}))
+        import_model(request["file"], "reach", normalization=request["normalization"])
+    discrete = EnvChanges({"observation": "vector", "action": "discrete"})
     with pytest.raises(ArtifactError, match="its actions are Box"):
-        import_model(discrete)
+        import_model(request["file"], SMALL, changes=discrete)
     with pytest.raises(UsageError, match="--algo pppo"):
-        import_model(ImportRequest(request.model, SMALL, algo="pppo"))
+        import_model(request["file"], SMALL, algo="pppo")
 
 
 @pytest.mark.parametrize("protocol", range(6))

@@ -13,7 +13,7 @@ import yaml
 
 from rlctl.run.policy import load_policy
 from rlctl.run.torch_policy import ALGORITHMS
-from rlctl.runs.import_model import ImportRequest, import_model
+from rlctl.runs.import_model import import_model
 
 pytestmark = [
     pytest.mark.slow,
@@ -49,7 +49,7 @@ def test_a_zoo_agent_acts_as_the_model_does(tmp_path, algo, env, task, settings)
     assert done.returncode == 0, done.stderr
     (file,) = tmp_path.rglob("*.zip")
     statistics = next(tmp_path.rglob("vecnormalize.pkl"), None)
-    imported = import_model(ImportRequest(file, task, statistics, output=tmp_path / "policy.safetensors"))
+    imported = import_model(file, task, normalization=statistics, output=tmp_path / "policy.safetensors")
     assert imported.info.spec.time_feature is (task == "reach")
     # Its schedules are classes of rl_zoo3, which is not installed here.
     schedules = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": 0.2}

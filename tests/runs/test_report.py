@@ -12,7 +12,7 @@ from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import robustness
 from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.runs.report import content
-from rlctl.runs.report.write import ReportRequest, write_report
+from rlctl.runs.report.write import write_report
 
 LARGEST = 2_000_000  # [bytes]
 HEADER = "steps,seconds,return,success,term/alive\n"
@@ -40,7 +40,7 @@ def group(write_run):
 
 
 def write(*runs, **options):
-    path = write_report(ReportRequest([str(run) for run in runs], **options))
+    path = write_report([str(run) for run in runs], **options)
     return None if path is None else path.read_text()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,32 +21,23 @@ _PICTURES = 6
 """Of an episode."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ReportRequest:
-    """What the command line asks for."""
-
-    runs: Sequence[str]
-    format: str = "html"
-    output: Path | None = None
-    """None: report.html; Markdown goes to stdout."""
-    pictures: bool = True
-
-
-def write_report(request: ReportRequest) -> Path | None:
-    """Write a report and return its file; None for one that was printed.
+def write_report(
+    runs: Sequence[str], form: str = "html", target: Path | None = None, *, pictures: bool = True
+) -> Path | None:
+    """Write a report and return its file, by default report.html; None for Markdown that was printed.
 
     Raises `UsageError` for an unknown format and runs of several tasks, `ArtifactError` for a damaged run or one that
     has nothing yet.
     """
-    if request.format not in FORMATS:
-        raise UsageError(f"--format {request.format}: give html or md.{did_you_mean(request.format, FORMATS)}")
-    report = content.collect(request.runs)
-    is_html = request.format == "html"
-    text = _render(f"report.{request.format}.jinja", is_html, _values(report, is_html, request.pictures))
-    if request.output is None and not is_html:
+    if form not in FORMATS:
+        raise UsageError(f"--format {form}: give html or md.{did_you_mean(form, FORMATS)}")
+    report = content.collect(runs)
+    is_html = form == "html"
+    text = _render(f"report.{form}.jinja", is_html, _values(report, is_html, pictures))
+    if target is None and not is_html:
         output.results().write(text)
         return None
-    path = request.output or DEFAULT_FILE
+    path = target or DEFAULT_FILE
     files.write_bytes(path, text.encode())
     return path
 
