@@ -106,7 +106,7 @@ def _is_out_of_memory(error: BaseException | None) -> bool:
 def _read_limit() -> str:
     import resource
 
-    from rlctl.run.memory import format_bytes
+    from rich.filesize import decimal as format_bytes
 
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     return "the system refused more" if limit == resource.RLIM_INFINITY else f"its limit is {format_bytes(limit)}"

@@ -9,9 +9,11 @@ import json
 import os
 import stat
 import sys
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
+
+from rlctl.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.console import Console, JustifyMethod
@@ -72,6 +74,36 @@ def _make_console(stream: TextIO) -> Console:
 def is_utf8() -> bool:
     """Say whether stderr, which shows progress, can show more than ASCII."""
     return (getattr(sys.stderr, "encoding", None) or "").lower().startswith("utf")
+
+
+def confirm(question: str, refusal: str) -> bool:
+    """Ask on the terminal; raises `UsageError`, with `refusal`, where nobody can be asked."""
+    if not sys.stdin.isatty():
+        raise UsageError(refusal)
+    import typer
+
+    return typer.confirm(question, err=True)
+
+
+@contextlib.contextmanager
+def show_progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show on a terminal how much of `total` is done, and when it will be; the function given takes how much."""
+    if not err().is_terminal:
+        yield lambda done: None
+        return
+    from rich.progress import Progress
+
+    with Progress(console=err(), transient=True) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda done: progress.update(task, completed=done)
+
+
+def format_duration(seconds: float) -> str:
+    """Return a time for people: `50 s`, `12 min`, `3.4 h`, `2.5 days`."""
+    for size, unit in ((86_400, "days"), (3600, "h")):
+        if seconds >= size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{seconds:.0f} s"
 
 
 def print_notes(notes: Iterable[str]) -> None:

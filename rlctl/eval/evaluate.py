@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -232,12 +231,8 @@ def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:
 def _play(workers: Workers, request: EvalRequest) -> list[Episode]:
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
     exploration = Exploration(stochastic=not request.deterministic)
-    play = functools.partial(play_episodes, workers, seeds, exploration, record=request.measure_actions)
-    console = output.err()
-    if not console.is_terminal:
-        return play()
-    with console.status("evaluating", spinner="dots" if output.is_utf8() else "line") as status:
-        return play(on_episode=lambda done: status.update(f"evaluating: {done}/{len(seeds)} episodes"))
+    with output.show_progress("evaluating", len(seeds)) as show:
+        return play_episodes(workers, seeds, exploration, record=request.measure_actions, on_episode=show)
 
 
 def _summarize(

@@ -8,7 +8,7 @@ import itertools
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rlctl import output
@@ -102,8 +102,12 @@ def measure_robustness(
 
 
 def _play_maps(player: CellPlayer, spec: EnvSpec, maps: Sequence[Sequence[Axis]]) -> list[RobustnessMap]:
-    with _show_progress(axes_of.count_cells(maps)) as progress:
-        return [RobustnessMap(axes=list(axes), cells=_play_cells(player, spec, axes, progress)) for axes in maps]
+    done = itertools.count(1)
+    with output.show_progress("varying", axes_of.count_cells(maps)) as show:
+        return [
+            RobustnessMap(axes=list(axes), cells=_play_cells(player, spec, axes, lambda: show(next(done))))
+            for axes in maps
+        ]
 
 
 def _play_cells(player: CellPlayer, spec: EnvSpec, axes: Sequence[Axis], on_cell: Callable[[], None]) -> list[Cell]:
@@ -139,39 +143,11 @@ def _ask(cells: int, seconds: float, yes: bool) -> None:
     total = cells * seconds
     if yes or total <= ASK_ABOVE_S:
         return
-    expected = f"{cells:,} cells will take about {format_duration(total)}: the nominal one took {seconds:.1f} s"
-    if not sys.stdin.isatty():
-        raise UsageError(f"--vary: {expected}; take fewer values or --episodes, or begin all the same: --yes")
-    import typer
-
-    if not typer.confirm(f"{expected}; begin?", err=True):
+    duration = output.format_duration(total)
+    expected = f"{cells:,} cells will take about {duration}: the nominal one took {seconds:.1f} s"
+    refusal = f"--vary: {expected}; take fewer values or --episodes, or begin all the same: --yes"
+    if not output.confirm(f"{expected}; begin?", refusal):
         raise UsageError("--vary: not begun")
-
-
-def format_duration(seconds: float) -> str:
-    """Return a time for people: `50 s`, `12 min`, `3.4 h`, `2.5 days`."""
-    for size, unit in ((86_400, "days"), (3600, "h")):
-        if seconds >= size:
-            return f"{seconds / size:.1f} {unit}"
-    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{seconds:.0f} s"
-
-
-@contextlib.contextmanager
-def _show_progress(cells: int) -> Iterator[Callable[[], None]]:
-    console = output.err()
-    if not console.is_terminal:
-        yield lambda: None
-        return
-    done, start = 0, time.monotonic()
-    with console.status("varying", spinner="dots" if output.is_utf8() else "line") as status:
-
-        def count() -> None:
-            nonlocal done
-            done += 1
-            left = (time.monotonic() - start) / done * (cells - done)
-            status.update(f"varying: cell {done} of {cells}, {format_duration(left)} left")
-
-        yield count
 
 
 def _keep(file: Path, result: Robustness) -> None:

@@ -6,13 +6,14 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from rich.filesize import decimal as format_bytes
+
 from rlctl import output
 from rlctl.errors import UsageError
 from rlctl.eval.evaluate import EvalRequest
 from rlctl.eval.score import describe_score, measure_score
 from rlctl.rollout.baselines import BASELINES
 from rlctl.run import lookup
-from rlctl.run.memory import format_bytes
 from rlctl.run.network import select_actor_tensors
 from rlctl.run.policy import PolicyInfo, read_policy, save_policy
 from rlctl.run.shipped import Provenance

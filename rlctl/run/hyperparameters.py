@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import Field
 
-from rlctl.run.quantities import Number, NumberAfter, Switch, Whole
+from rlctl.run.quantities import Number, NumberAfter, Section, Switch, Whole
 
 ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
 
@@ -34,10 +34,8 @@ def decide_by(rule: str) -> dict[str, Any]:
     return {"default_text": f"{rule} *rlctl*"}
 
 
-class Parameters(pydantic.BaseModel):
+class Parameters(Section):
     """Parameters by SB3's names; those that a recipe leaves out are not passed on."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class _OnPolicy(Parameters):

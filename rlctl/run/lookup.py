@@ -14,6 +14,7 @@ from pathlib import Path
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.output import format_duration
 from rlctl.run.directory import ROOT, RunDirectory, is_group, point_latest_to
 from rlctl.run.policy import PolicyInfo, read_info
 from rlctl.run.shipped import PRETRAINED, find_shipped_policy
@@ -143,7 +144,8 @@ def _describe_choice(
         info = read_info(file)
     except ArtifactError:  # loading it reports the same
         return ()
-    notes = [f"run {run.path}: policy of step {info.training_steps:,}, saved {_describe_age(file)} ago"]
+    age = format_duration(max(time.time() - file.stat().st_mtime, 0.0))
+    notes = [f"run {run.path}: policy of step {info.training_steps:,}, saved {age} ago"]
     if passed_over:
         notes.append(f"passed over, without such a policy: {', '.join(str(each.path) for each in passed_over)}")
     if (better := _find_better(info, older)) is not None:
@@ -170,14 +172,6 @@ def _find_better(info: PolicyInfo, older: Sequence[RunDirectory]) -> str | None:
         return None
     _, run, scores = max(found, key=lambda each: each[0])
     return f"an older run was better in its evaluations: {run.path} ({scores})"
-
-
-def _describe_age(file: Path) -> str:
-    seconds = max(time.time() - file.stat().st_mtime, 0.0)
-    for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"
 
 
 def _read_latest(root: Path) -> RunDirectory | None:

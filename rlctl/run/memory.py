@@ -17,15 +17,6 @@ def available() -> int | None:
     return max(min(found), 0) if found else None
 
 
-def format_bytes(size: float) -> str:
-    """Return a number of bytes for people: `512 MB`, `1,024 GB`."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size >= factor:
-            amount = size / factor
-            return f"{amount:,.0f} {unit}" if amount >= 10 else f"{amount:.1f} {unit}"
-    return f"{size:.0f} bytes"
-
-
 def _read_machine() -> int | None:
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()

@@ -8,6 +8,13 @@ from typing import Annotated, Any
 import pydantic
 from pydantic_core import PydanticCustomError, core_schema
 
+
+class Section(pydantic.BaseModel):
+    """A mapping in a recipe: no other keys than these, each described by the text below it."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
 _WRONG = PydanticCustomError("wrong_type", "wrong type")
 """The type's description says what would be right; see `rlctl.run.schema_text`."""
 

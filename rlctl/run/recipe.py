@@ -17,7 +17,7 @@ from rlctl.run import schema_text, yaml_text
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.run.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.run.network_parameters import NETWORK_PARAMETERS
-from rlctl.run.quantities import Number, Switch, Whole
+from rlctl.run.quantities import Number, Section, Switch, Whole
 from rlctl.run.stages import Stage, check_promotions
 
 Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
@@ -31,11 +31,7 @@ _MOST_STEPS = 10**12
 _MOST_ENVS = 10_000
 
 
-class _Section(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
-
-
-class Normalize(_Section):
+class Normalize(Section):
     """Running normalisation, as SB3's VecNormalize does it."""
 
     observation: Switch = True
@@ -48,7 +44,7 @@ class Normalize(_Section):
     """Bound of normalised rewards."""
 
 
-class Evaluation(_Section):
+class Evaluation(Section):
     """Evaluation while training; steps are environment steps, all environments together."""
 
     every_steps: Whole | None = Field(
@@ -61,7 +57,7 @@ class Evaluation(_Section):
     """Whether to take the mean action, and not a sample."""
 
 
-class Hindsight(_Section):
+class Hindsight(Section):
     """Hindsight experience replay, by the names of SB3's `HerReplayBuffer`; see `rlctl.train.hindsight`."""
 
     n_sampled_goal: Whole = Field(4, ge=1, le=1000)
@@ -70,14 +66,14 @@ class Hindsight(_Section):
     """Which of the goals that an episode reached are taken."""
 
 
-class Checkpoints(_Section):
+class Checkpoints(Section):
     """Which checkpoints are kept."""
 
     keep: Whole = Field(3, ge=1, le=1_000_000)
     """How many of the newest are kept."""
 
 
-class Recipe(_Section):
+class Recipe(Section):
     """How to train a task. `algo_kwargs` and `policy_kwargs` are SB3's own names."""
 
     task: dict[str, Any] = {}

@@ -33,8 +33,8 @@ total_timesteps: 200_000
 eval: {every_steps: 20_000, episodes: 50}
 ```
 
-YAML 1.2: `3e-4` is a number, `1e6` is a whole number where one is expected, `on` is text. Anchors and aliases are not
-supported. `--set` takes a key with dots: `--set algo_kwargs.gamma=0.98`. `check-env`, `eval` and `replay` take
+YAML 1.2: `3e-4` is a number, `1e6` is a whole number where one is expected, `on` is text. Anchors, aliases and tags are
+not supported. `--set` takes a key with dots: `--set algo_kwargs.gamma=0.98`. `check-env`, `eval` and `replay` take
 those of `task`, `reward_weights`, `randomize` and `events`; `--set randomize=false` also leaves out the events that a
 policy was trained with.
 

@@ -8,15 +8,11 @@ from typing import Any
 import pydantic
 from pydantic import Field
 
-from rlctl.run.quantities import Number, Whole
-
-_STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+from rlctl.run.quantities import Number, Section, Whole
 
 
-class Promotion(pydantic.BaseModel):
+class Promotion(Section):
     """When training goes on to the next stage: by the success rate or the mean return of its last episodes."""
-
-    model_config = _STRICT
 
     success: Number | None = Field(None, gt=0, le=1)
     """Success rate to reach."""
@@ -39,13 +35,11 @@ class Promotion(pydantic.BaseModel):
         return self.success if self.success is not None else self.mean_return or 0.0
 
 
-class Stage(pydantic.BaseModel):
+class Stage(Section):
     """What a stage changes in the recipe's own `task`, `reward_weights` and `events`, and when it ends.
 
     Each stage changes the recipe, not the stage before it: `{}` is the task as the recipe has it.
     """
-
-    model_config = _STRICT
 
     task: dict[str, Any] = {}
     """Changes of the recipe's `task`."""

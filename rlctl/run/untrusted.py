@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+from rich.filesize import decimal as format_bytes
+
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.run import memory
 
@@ -49,9 +51,7 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if limit is not None and size > limit:
-            raise ArtifactError(
-                f"{path}: too large: {memory.format_bytes(size)}, at most {memory.format_bytes(limit)} are read"
-            )
+            raise ArtifactError(f"{path}: too large: {format_bytes(size)}, at most {format_bytes(limit)} are read")
         if (problem := explain_size(size)) is not None:
             raise ArtifactError(f"{path}: too large: {problem}")
         try:
@@ -65,7 +65,7 @@ def explain_size(size: int) -> str | None:
     # To ask costs as much as to read a small file, of which `rlctl runs` reads thousands.
     if size <= _ALWAYS_READ or (there := memory.available()) is None or size <= there // 2:
         return None
-    return f"it needs {memory.format_bytes(size)} of memory, and {memory.format_bytes(there)} are free"
+    return f"it needs {format_bytes(size)} of memory, and {format_bytes(there)} are free"
 
 
 def check_safetensors(path: Path) -> None:
@@ -75,7 +75,7 @@ def check_safetensors(path: Path) -> None:
             raise ArtifactError(f"{path}: too large: {problem}")
         header = int.from_bytes(file.read(8), "little")  # the format: a length, and as much JSON
     if header > JSON_LIMIT:
-        sizes = f"{memory.format_bytes(header)}, at most {memory.format_bytes(JSON_LIMIT)} are read"
+        sizes = f"{format_bytes(header)}, at most {format_bytes(JSON_LIMIT)} are read"
         raise ArtifactError(f"{path}: damaged, or not a .safetensors file: header too large: {sizes}")
 
 

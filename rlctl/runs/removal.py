@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from rich.filesize import decimal as format_bytes
+
+from rlctl import output
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run.directory import ROOT, RunDirectory, is_being_written
-from rlctl.run.memory import format_bytes
 from rlctl.runs.listing import list_runs
 from rlctl.runs.summary import RunSummary
 
@@ -21,11 +22,6 @@ class Removal:
 
     paths: list[Path]
     bytes: int
-
-    @property
-    def count(self) -> str:
-        """`1 folder`, `3 folders`."""
-        return f"{len(self.paths)} folder{'' if len(self.paths) == 1 else 's'}"
 
 
 def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Path = ROOT) -> Removal:
@@ -79,37 +75,30 @@ def _measured(paths: list[Path]) -> Removal:
 
 
 def remove_with_report(removal: Removal, *, yes: bool) -> None:
-    """List what is to go and its size, ask, remove, and say what came free."""
-    from rlctl import output
+    """List what is to go and its size, ask, remove, and say what came free.
 
+    Raises `UsageError` where nobody can be asked and `yes` is not set.
+    """
     out = output.out()
     for path in removal.paths:
         out.print(str(path), markup=False)
     if not removal.paths:
         out.print("nothing to remove")
-    elif remove(removal, yes=yes):
-        out.print(f"removed {removal.count}: {format_bytes(removal.bytes)} came free")
+        return
+    what = f"{len(removal.paths)} folder{'' if len(removal.paths) == 1 else 's'}"
+    refusal = "nothing was removed: there is no terminal to ask on; --yes removes without asking"
+    if not yes and not output.confirm(f"remove {what}, {format_bytes(removal.bytes)}?", refusal):
+        return
+    remove(removal)
+    out.print(f"removed {what}: {format_bytes(removal.bytes)} came free")
 
 
-def remove(removal: Removal, *, yes: bool) -> bool:
-    """Remove the folders after asking on the terminal; False if the answer was no.
-
-    Raises `UsageError` where nobody can be asked and `yes` is not set.
-    """
-    if not removal.paths:
-        return False
-    if not yes:
-        if not sys.stdin.isatty():
-            raise UsageError("nothing was removed: there is no terminal to ask on; --yes removes without asking")
-        import typer
-
-        if not typer.confirm(f"remove {removal.count}, {format_bytes(removal.bytes)}?", err=True):
-            return False
+def remove(removal: Removal) -> None:
+    """Remove the folders; raises `UsageError` for a run that is being trained by now."""
     for path in removal.paths:
         if is_being_written(path if (path / ".lock").exists() else path.parent):
             raise UsageError(f"{path}: this run is being trained; it was not removed")
         _remove_folder(path)
-    return True
 
 
 def _remove_folder(path: Path) -> None:

@@ -7,11 +7,12 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rich.filesize import decimal as format_bytes
+
 from rlctl import output
 from rlctl.errors import ArtifactError
 from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
-from rlctl.run.memory import format_bytes
 from rlctl.run.robustness import Robustness
 from rlctl.runs.diagnosis import Finding, diagnose
 from rlctl.runs.diagnosis import show as diagnosis

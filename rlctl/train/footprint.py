@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from rich.filesize import decimal as format_bytes
 
 from rlctl.dict_spaces import split_space
 from rlctl.errors import RecipeError
@@ -43,8 +44,8 @@ def check(recipe: Recipe, observation_space: spaces.Space[Any], action_space: sp
     for name, size in needs.items():
         if size > _USABLE_SHARE * there:
             raise RecipeError(
-                f"{name}: {_value(recipe, name)} needs {memory.format_bytes(size)} of memory, and "
-                f"{memory.format_bytes(there)} are free; give less"
+                f"{name}: {_value(recipe, name)} needs {format_bytes(size)} of memory, and "
+                f"{format_bytes(there)} are free; give less"
             )
 
 

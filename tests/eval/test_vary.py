@@ -10,7 +10,8 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval.axes import read_axes
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.eval.statistics import mean_interval
-from rlctl.eval.vary import check_gates, format_duration, measure_robustness
+from rlctl.eval.vary import check_gates, measure_robustness
+from rlctl.output import format_duration
 from rlctl.run.robustness import read
 from tests.eval.conftest import ENVS, write_run
 

@@ -8,7 +8,7 @@ def test_removes_what_is_named(write_run):
     gone, stays = write_run("reach/2026-01-01_00-00-00_s0"), write_run("reach/2026-01-01_00-00-01_s1")
     removal = plan_removal(["reach/2026-01-01_00-00-00_s0"])
     assert removal.bytes > 5000
-    assert remove(removal, yes=True)
+    remove(removal)
     assert not gone.exists()
     assert stays.exists()
     assert list(gone.parent.iterdir()) == [stays]
@@ -20,7 +20,7 @@ def test_keeps_the_best_of_each_task(write_run):
     third = write_run("reach/2026-01-01_00-00-02_s0", evals=((1, 0.7, 99.0),))
     other = write_run("ant/2026-01-01_00-00-00_s0", evals=((1, None, 1.0),))
     stopped = write_run("reach/2026-01-01_00-00-03_s0", "interrupted", evals=())
-    assert remove(plan_removal([], keep_best=2), yes=True)
+    remove(plan_removal([], keep_best=2))
     assert [path.exists() for path in (best, second, third, other, stopped)] == [True, True, False, True, True]
 
 
@@ -34,7 +34,7 @@ def test_never_removes_a_run_that_is_being_trained(write_run, hold_lock):
     removal = plan_removal([str(finished)])
     hold_lock(finished)  # resumed between the question and the answer
     with pytest.raises(UsageError, match="being trained"):
-        remove(removal, yes=True)
+        remove(removal)
     assert finished.exists()
 
 
@@ -63,7 +63,7 @@ def test_prune_frees_checkpoints_of_finished_runs_only(write_run):
     done, stopped = write_run("reach/2026-01-01_00-00-00_s0"), write_run("reach/2026-01-01_00-00-01_s0", "interrupted")
     removal = plan_prune()
     assert removal.bytes == 5000
-    assert remove(removal, yes=True)
+    remove(removal)
     assert not (done / "checkpoints").exists()
     assert (done / "run.json").exists()
     assert (stopped / "checkpoints").exists()

@@ -120,7 +120,7 @@ def test_run_in_progress_is_reported_as_such(group, hold_lock):
 
 def test_what_cannot_be_reported(group, write_run):
     with pytest.raises(UsageError, match=r"--format pdf: give html or md"):
-        write(group[0], format="pdf")
+        write(group[0], form="pdf")
     other = write_run("ant/2026-11-21_10-00-00_s0")
     with pytest.raises(UsageError, match="runs of several tasks, ant, reach"):
         write(group[0], other)
@@ -154,7 +154,7 @@ def test_trained_run_has_pictures_of_its_best_and_worst_episode(rlctl, tmp_path)
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 @pytest.mark.parametrize("width", [360, 1200])
 def test_browser_shows_it(group, tmp_path, width):
-    write(group[0].parent, output=tmp_path / "all.html")
+    write(group[0].parent, target=tmp_path / "all.html")
     command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
     page = tmp_path / "all.html"
     measure = "<script>document.title = document.documentElement.scrollWidth + ' of ' + window.innerWidth</script>"

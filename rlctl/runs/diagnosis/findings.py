@@ -77,13 +77,6 @@ def list_signs() -> dict[str, signs.Sign]:
     }
 
 
-def find_signs(run: RunDirectory) -> dict[str, str]:
-    """Return the evidence of every sign that a run has, whether it makes a finding or not."""
-    history = History(run)
-    found = {name: function(history) for name, function in list_signs().items()}
-    return {name: evidence for name, evidence in found.items() if evidence is not None}
-
-
 def diagnose(run: RunDirectory) -> list[Finding]:
     """Return what a run's records show, warnings first; never raises for what is in the folder."""
     history = History(run)

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from rlctl.errors import ArtifactError, RlctlError, UsageError
-from rlctl.run.episode import RecordedEpisode, load_episode
+from rlctl.run.episode import RecordedEpisode
 from rlctl.run.recipe import find_difference
 from rlctl.runs.comparison import find_group
 from rlctl.runs.diagnosis import Finding
+from rlctl.runs.diagnosis.history import History
 from rlctl.runs.show import RunDescription, describe
 from rlctl.runs.summary import Rows, list_points
 
@@ -132,14 +133,9 @@ def list_commands(report: Report) -> list[str]:
 def choose_episodes(report: Report) -> list[tuple[str, RecordedEpisode]]:
     """Return the best and the worst recorded episode of the best evaluation there are episodes of, with their names."""
     run = max(report.runs, key=lambda each: each.summary.score).run
-    episodes: list[RecordedEpisode] = []
-    for file in sorted(run.episodes.glob("*.npz")):
-        try:
-            episodes.append(load_episode(file))
-        except ArtifactError:
-            continue
+    episodes = History(run).episodes
     steps = max((_trained_steps(each) for each in episodes), default=-1)
-    last = [each for each in episodes if _trained_steps(each) == steps and not each.info.failure]
+    last = [each for each in episodes if _trained_steps(each) == steps]
     if not last:
         return []
     ordered = sorted(last, key=lambda each: (each.info.success is True, each.info.total_reward))
