@@ -102,7 +102,7 @@ def format_duration(seconds: float) -> str:
     """Return a time for people: `50 s`, `12 min`, `3.4 h`, `2.5 days`."""
     for size, unit in ((86_400, "days"), (3600, "h")):
         if seconds >= size:
-            return f"{seconds / size:.1f} {unit}"
+            return f"{round(seconds / size, 1):g} {unit}"
     return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{seconds:.0f} s"
 
 

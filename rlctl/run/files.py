@@ -20,17 +20,31 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file beside its place, flush it to the disk, and rename it into place."""
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Give a path beside `path`; what was written there takes its place when the block ends well."""
     os.makedirs(path.parent, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # keeps the suffix: some writers look at it
     try:
-        write_new(beside, content)
+        yield beside
         os.replace(beside, path)
     except BaseException:
         _remove(beside)
         raise
     _sync_folder(path.parent)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file beside its place, flush it to the disk, and rename it into place."""
+    with _replacing(path) as beside:
+        write_new(beside, content)
+
+
+def write_with(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` make a file beside its place, flush it to the disk, and rename it into place."""
+    with _replacing(path) as beside:
+        write(beside)
+        sync(beside)
 
 
 def write_new(path: Path, content: bytes) -> None:
@@ -162,20 +176,6 @@ def truncate(path: Path, size: int) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def write_with(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` make a file under a temporary name in the same folder, then rename it into place."""
-    os.makedirs(path.parent, exist_ok=True)
-    beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # keeps the suffix: some writers look at it
-    try:
-        write(beside)
-        sync(beside)
-        os.replace(beside, path)
-    except BaseException:
-        _remove(beside)
-        raise
-    _sync_folder(path.parent)
 
 
 def _write_all(descriptor: int, content: bytes) -> None:

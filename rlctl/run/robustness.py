@@ -9,10 +9,9 @@ import pydantic
 
 from rlctl.errors import ArtifactError
 from rlctl.run import files, untrusted
+from rlctl.run.shipped import Interval
 
 FORMAT = 1
-
-Interval = tuple[float, float]
 
 
 class _Content(pydantic.BaseModel):

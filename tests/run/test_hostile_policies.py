@@ -127,7 +127,7 @@ def test_critics_and_layers_without_number(changed, described):
         ({"type": "Dict", "spaces": []}, "not a space: "),
         ({"type": ["Box"]}, "not a space: "),
         (nested(30), "its tensors do not fit its description: "),
-        (nested(400), "its rlctl metadata is damaged: nested too deeply"),
+        (nested(400), "its tensors do not fit its description: "),
     ],
 )
 def test_a_space_that_cannot_be(space, message, changed, described):
@@ -198,7 +198,7 @@ def written(path, head, rest=b""):
 def test_a_header_that_lies(tmp_path, good):
     path, lie = tmp_path / "x.safetensors", "damaged, or not a .safetensors file: "
     path.write_bytes(struct.pack("<Q", 2**63) + good.read_bytes()[8:])
-    assert f"{lie}header too large: 9.2 EB, at most 16.8 MB are read" in refused(path)
+    assert f"{lie}Error while deserializing header: header too large" in refused(path)
     tensor = {"a": {"dtype": "F32", "shape": [10**12], "data_offsets": [0, 4 * 10**12]}}
     assert lie in refused(written(path, json.dumps(tensor).encode()))
     overlap = {name: {"dtype": "F32", "shape": [4], "data_offsets": [0, 16]} for name in "ab"}
@@ -208,10 +208,10 @@ def test_a_header_that_lies(tmp_path, good):
 
 def test_a_header_of_a_hundred_megabytes(tmp_path):
     path = tmp_path / "x.safetensors"
-    path.write_bytes(struct.pack("<Q", 10**8))
+    path.write_bytes(struct.pack("<Q", 10**8 + 1))
     with path.open("r+b") as file:
-        file.truncate(10**8 + 8)  # takes no space on the disk
-    assert "header too large: 100.0 MB, at most 16.8 MB are read" in refused(path)
+        file.truncate(10**8 + 9)  # takes no space on the disk
+    assert "header too large" in refused(path)
 
 
 def test_a_file_larger_than_memory(tmp_path):

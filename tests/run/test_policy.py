@@ -159,7 +159,7 @@ def test_a_missing_file(tmp_path):
     [
         ({"policy_kwargs": {"net_arch": [32]}}, "its tensors do not fit its description: Error"),
         ({"policy_kwargs": {"net_arch": "wide"}}, "its tensors do not fit its description: "),
-        ({"policy_kwargs": {"activation_fn": "sinus"}}, "its tensors do not fit its description: policy_kwargs."),
+        ({"policy_kwargs": {"activation_fn": "sinus"}}, "its tensors do not fit its description: 'sinus'"),
         ({"normalized_keys": ["x"]}, "its tensors do not fit its description: 'normalize/x/mean'"),
         ({"algo": "alphago"}, "policy for an unknown algorithm 'alphago'"),
         ({"policy": "TransformerPolicy"}, "policy of an unknown kind 'TransformerPolicy' for ppo"),
