@@ -147,9 +147,9 @@ def test_a_plugins_traceback_stands_above_the_error(installed_rlctl, write_modul
     assert any("broken.py" in line for line in above)
 
 
-def test_json_to_a_file(rlctl, tmp_path):
+def test_json_goes_to_a_file_besides(rlctl, tmp_path):
     result = rlctl("tasks", "--json", "deep/tasks.json")
-    assert (result.returncode, result.stdout) == (0, "")
+    assert (result.returncode, result.stdout) == (0, rlctl("tasks").stdout)
     content = json.loads((tmp_path / "deep/tasks.json").read_text())
     (reach,) = [task for task in content["tasks"] if task["name"] == "reach"]
     assert reach == {

@@ -16,12 +16,13 @@ from rlctl.run.policy import collect_versions
 
 
 def show_all(results: Sequence[Evaluation], json: str | None) -> None:
-    """Print the numbers, or write them as JSON; those of several stages as a table."""
+    """Print the numbers, or JSON alone for `-`; those of several stages as a table."""
     if len(results) == 1:
         show(results[0], json)
-    elif json is not None:
+        return
+    if json is not None:
         output.write_result_json(json, {"stages": [as_json(result) for result in results]})
-    else:
+    if json != "-":
         _show_stages(results)
 
 
@@ -56,9 +57,10 @@ def _describe_changes(spec: EnvSpec, specs: Sequence[EnvSpec]) -> str:
 
 
 def show(result: Evaluation, json: str | None) -> None:
-    """Print the numbers, or write them as JSON."""
+    """Print the numbers, or JSON alone for `-`."""
     if json is not None:
         output.write_result_json(json, as_json(result))
+    if json == "-":
         return
     out = output.out()
     _show_head(result)

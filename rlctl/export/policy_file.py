@@ -59,9 +59,10 @@ def export_actor(run: str | None, *, checkpoint: str, target: Path, episodes: in
 
 
 def show(report: PolicyFileReport, json: str | None) -> None:
-    """Print a report, or write it as JSON."""
+    """Print a report, or JSON alone for `-`."""
     if json is not None:
         output.write_result_json(json, as_json(report))
+    if json == "-":
         return
     out, info, provenance = output.out(), report.info, report.provenance
     out.print(f"exported {report.path} ({format_bytes(report.size)}): the actor of {provenance.run}", markup=False)

@@ -12,9 +12,10 @@ from rlctl.runs.statistics import ALPHA, Difference, SeedDifference, Verdict, in
 
 
 def show(result: Comparison, json: str | None) -> None:
-    """Print which question is answered, the scores, the differences and the verdicts; or write all as JSON."""
+    """Print which question is answered, the scores, the differences and the verdicts; or JSON alone for `-`."""
     if json is not None:
         output.write_result_json(json, as_json(result))
+    if json == "-":
         return
     out = output.out()
     if result.of_recipes:

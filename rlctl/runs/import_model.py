@@ -144,7 +144,7 @@ def _write_checked(output: Path, info: PolicyInfo, tensors: dict[str, NDArray[An
 
 
 def show(result: ImportedPolicy, json: str | None) -> None:
-    """Print what was imported and what to type next, or write it as JSON."""
+    """Print what was imported and what to type next, or JSON alone for `-`."""
     from rlctl import output
 
     info, normalizes = result.info, result.info.clip_observation is not None
@@ -157,6 +157,7 @@ def show(result: ImportedPolicy, json: str | None) -> None:
             "time_feature": info.spec.time_feature,
         }
         output.write_result_json(json, {**content, "training_steps": info.training_steps, "versions": info.versions})
+    if json == "-":
         return
     out = output.out()
     normalization = "with" if normalizes else "without"

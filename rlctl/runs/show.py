@@ -91,7 +91,7 @@ def _measure_sizes(run: RunDirectory) -> dict[str, int]:
 
 
 def show(run: RunDescription, json: str | None) -> None:
-    """Print the description, or write it as JSON."""
+    """Print the description, or JSON alone for `-`."""
     out, summary, sizes = output.out(), run.summary, _measure_sizes(run.run)
     source = run.run.status().get("from")
     if json is not None:
@@ -99,6 +99,7 @@ def show(run: RunDescription, json: str | None) -> None:
         found = {"warnings": run.warnings, "findings": diagnosis.as_json(run.findings)}
         measured = None if run.robustness is None else run.robustness.model_dump(mode="json")
         output.write_result_json(json, {**content, **found, "robustness": measured, "bytes": sizes})
+    if json == "-":
         return
     out.print(f"[bold]{summary.name}[/bold]: {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}")
     out.print(f"{summary.steps or 0:,} steps in {(summary.seconds or 0) / 60:.1f} minutes, started {summary.started}")

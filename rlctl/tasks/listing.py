@@ -51,11 +51,12 @@ def _read_algorithm(entry: registry.TaskEntry) -> str | None:
 
 
 def show(listed: list[ListedTask], json: str | None) -> None:
-    """Print the table, or write it as JSON."""
+    """Print the table, or JSON alone for `-`."""
     from rlctl import output
 
     if json is not None:
         output.write_result_json(json, {"tasks": [_to_json(each) for each in listed]})
+    if json == "-":
         return
     out = output.out()
     if not listed:

@@ -62,13 +62,14 @@ def create(name: str) -> NewPlugin:
 
 
 def show(plugin: NewPlugin, json: str | None) -> None:
-    """Print what was written and what to type next, or write it as JSON."""
+    """Print what was written and what to type next, or JSON alone for `-`."""
     from rlctl import output
 
     if json is not None:
         files = [str(plugin.folder / file) for file in plugin.files]
         content = {"name": plugin.name, "folder": str(plugin.folder), "target": plugin.target, "files": files}
         output.write_result_json(json, content)
+    if json == "-":
         return
     out = output.out()
     for file in plugin.files:

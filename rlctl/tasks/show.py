@@ -23,9 +23,10 @@ _LONGEST_SPACE = 100  # [characters]; JSON has all of it
 
 
 def show(description: Description, json: str | None) -> None:
-    """Print a description, or write it as JSON."""
+    """Print a description, or JSON alone for `-`."""
     if json is not None:
         output.write_result_json(json, as_json(description))
+    if json == "-":
         return
     from rich.text import Text
 
