@@ -151,7 +151,10 @@ def print_table(
 
 
 def write_result_json(target: str, content: Any) -> None:
-    """Write a result as JSON to a file, or to stdout for `-`."""
+    """Write a result, of plain data, dataclasses and paths, as JSON to a file, or to stdout for `-`."""
+    from pydantic_core import to_jsonable_python
+
+    content = to_jsonable_python(content)
     if target == "-":
         results().write(json.dumps(content, indent=2, allow_nan=False) + "\n")
         results().flush()

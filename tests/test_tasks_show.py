@@ -5,7 +5,6 @@ import json
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.tasks import show as page
 from rlctl.tasks.description import describe
 
 EVERYTHING = '''
@@ -134,21 +133,21 @@ def test_an_observation_in_a_dict_space(write_module, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     layout = 'robot = "no robot"\n        observation_layout = "dict"'
     write_module("in_a_dict.py", EVERYTHING.replace('robot = "no robot"', layout))
-    angle, place = describe("in_a_dict.py:Everything").observations
-    assert (angle.name, angle.unit, angle.low) == ("angle", "rad", -3.5)
-    assert (place.name, place.shape, place.low) == ("place", [3], None)
+    angle, place = describe("in_a_dict.py:Everything").content["observations"]
+    assert (angle["name"], angle["unit"], angle["low"]) == ("angle", "rad", -3.5)
+    assert (place["name"], place["shape"], place["low"]) == ("place", [3], None)
 
 
 def test_a_gymnasium_id():
-    description = describe("Pendulum-v1")
-    assert description.target == "gymnasium.envs.classic_control.pendulum:PendulumEnv"
-    assert description.distribution == "gymnasium"
-    assert description.max_steps == 200
-    assert [each.name for each in description.parameters] == ["g"]  # render_mode is not the user's to set
-    assert description.definition is None
-    (action,) = description.actions
-    assert (action.low, action.high) == (-2.0, 2.0)
-    json.dumps(page.as_json(description), allow_nan=False)
+    content = describe("Pendulum-v1").content
+    assert content["target"] == "gymnasium.envs.classic_control.pendulum:PendulumEnv"
+    assert content["distribution"] == "gymnasium"
+    assert content["max_steps"] == 200
+    assert [each["name"] for each in content["parameters"]] == ["g"]  # render_mode is not the user's to set
+    assert content["definition"] is None
+    (action,) = content["actions"]
+    assert (action["low"], action["high"]) == (-2.0, 2.0)
+    json.dumps(content, allow_nan=False)
 
 
 def test_a_plain_environment(rlctl, write_module):

@@ -14,20 +14,6 @@ from rlctl.run import schema_text, yaml_text
 from rlctl.run.quantities import Number
 
 _NUMBER_WITH_UNIT = re.compile(r"^\s*[-+]?\d[\d.eE+-]*\s*[^\d\s.]")
-_UNITS = {
-    "position": "rad or m",
-    "speed": "rad/s or m/s",
-    "acceleration": "rad/s^2 or m/s^2",
-    "torque": "N m or N",
-    "rate": "1/s",
-    "offset": "rad, m, N m or their like",
-    "scale": "rad, m, N m or their like per 1 of the action",
-    "lowpass_hz": "Hz",
-    "control_dt": "s",
-    "blend_in_s": "s",
-    "frozen_s": "s",
-}
-
 Positive = Annotated[Number, Field(gt=0)]
 
 
@@ -56,7 +42,7 @@ class JointLimits(_Section):
     torque: Positive | None = None
     """Highest torque or force [N m or N]; for commands of torque."""
     rate: Positive | None = None
-    """Largest change of the command per second; for commands of torque and action."""
+    """Largest change of the command per second [1/s]; for commands of torque and action."""
     action: Bounds | None = None
     """Lowest and highest value of the action itself, whatever it commands."""
 
@@ -122,30 +108,19 @@ def read_limits(path: Path) -> Limits:
     try:
         return Limits.model_validate(content)
     except pydantic.ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        schema = Limits.model_json_schema()
-        unknown = problem["type"] == "extra_forbidden"
-        loc = problem["loc"]
-        place = loc if unknown else loc[: schema_text.find_depth(schema, loc)]
+        problem, schema = error.errors(include_url=False)[0], Limits.model_json_schema()
+        place = schema_text.locate(problem, schema)
         line = yaml_text.find_line(text, place)
         raise RecipeError(f"{path}:{line}: {_explain(problem, place, schema, content)}") from None
 
 
 def _explain(problem: Any, place: tuple[str | int, ...], schema: schema_text.Schema, content: Any) -> str:
-    key = ".".join(str(part) for part in place)
-    if problem["type"] == "extra_forbidden":
-        keys = schema_text.list_keys(schema, schema_text.find_schema(schema, place[:-1]))
-        return f"no key {key!r}.{did_you_mean(str(place[-1]), keys)} Keys here: {', '.join(keys)}."
-    if problem["type"] == "value_error":
-        return f"{key}: {problem['ctx']['error']}"
-    given = content
-    for part in place:
-        given = given[part]
-    unit = _UNITS.get(str(place[-1]), "")
+    key, given = ".".join(str(part) for part in place), problem["input"]
+    found = re.search(r"\[(.+?)\]", schema_text.find_schema(schema, place).get("description", ""))
+    unit = found[1] if found else ""
     if isinstance(given, str) and unit and _NUMBER_WITH_UNIT.match(given):
         return f"{key}: write the number alone, in {unit}, got {short_repr(given)!r}"
-    expected = schema_text.describe_value(schema, schema_text.find_schema(schema, place)).removesuffix(" or null")
-    return f"{key}: expected {expected}{f' [{unit}]' if unit else ''}, got {short_repr(given)}"
+    return schema_text.explain(problem, place, schema, content, key=key, unit=unit)
 
 
 def check_names(kind: str, given: Any, known: Any, where: str = "", hint: str = "") -> None:

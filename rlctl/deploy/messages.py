@@ -8,6 +8,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
+from pydantic_core import to_jsonable_python
 
 from rlctl.errors import short_repr
 
@@ -97,10 +98,4 @@ def _join(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
 
 def as_json(value: Any) -> Any:
     """Return plain data in which arrays are lists, and numbers that are not finite None."""
-    if isinstance(value, dict):
-        return {key: as_json(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [as_json(each) for each in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return as_json(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=lambda array: array.tolist())

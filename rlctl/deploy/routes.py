@@ -11,7 +11,7 @@ from typing import Any
 from aiohttp import web
 
 from rlctl.deploy import messages
-from rlctl.deploy.access import Access
+from rlctl.deploy.access import make_access_check
 from rlctl.deploy.server import PolicyServer
 from rlctl.errors import RlctlError
 
@@ -31,8 +31,9 @@ class _Routes:
         self.page = (Path(__file__).parent / "page.html").read_text("utf-8")
 
     def make_app(self) -> web.Application:
-        access = Access(self.server.settings.host, self.server.settings.api_key, self._note_refused)
-        app = web.Application(middlewares=[access.check], client_max_size=_LARGEST_POLICY)
+        settings = self.server.settings
+        check = make_access_check(settings.host, settings.api_key, self._note_refused)
+        app = web.Application(middlewares=[check], client_max_size=_LARGEST_POLICY)
         app.add_routes(
             [
                 web.get("/", self._serve_root),

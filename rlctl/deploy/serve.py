@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import errno
 import gc
 import os
@@ -38,6 +37,8 @@ def make_server(
 ) -> PolicyServer:
     """Load a policy and make its server; raises `RlctlError` for whatever would be wrong with it."""
     try:
+        import uvloop  # noqa: F401
+
         from rlctl.deploy.server import PolicyServer, ServerSettings
     except ModuleNotFoundError as error:
         raise UsageError(f"rlctl serve needs {error.name}: pip install 'rlctl[serve]'") from None
@@ -73,11 +74,9 @@ def run_server(server: PolicyServer, on_start: Callable[[str], None]) -> None:
 
 
 def make_loop() -> asyncio.AbstractEventLoop:
-    """Return a loop for a server: uvloop's, which answers a quarter faster than asyncio's own, where there is one."""
-    try:
-        import uvloop
-    except ModuleNotFoundError:  # on Windows
-        return asyncio.new_event_loop()
+    """Return a loop for a server: uvloop's, which answers a quarter faster than asyncio's own."""
+    import uvloop
+
     loop: asyncio.AbstractEventLoop = uvloop.new_event_loop()
     return loop
 
@@ -95,7 +94,14 @@ async def serve_until(
     settings = server.settings
     try:
         site = web.TCPSite(runner, settings.host, settings.port)
-        await _listen(site, settings.host, settings.port)
+        try:
+            await site.start()
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                hint = "give another one, or --port 0 for any that is free"
+                raise UsageError(f"port {settings.port} is in use; {hint}") from None
+            place = f"--host {settings.host} --port {settings.port}"
+            raise UsageError(f"{place}: {error.strerror or error}") from None
         if handle_signals:
             _handle_signals(server, end)
         gc.collect()
@@ -106,17 +112,6 @@ async def serve_until(
         await end.wait()
     finally:
         await runner.cleanup()
-
-
-async def _listen(site: object, host: str, port: int) -> None:
-    try:
-        await site.start()  # type: ignore[attr-defined]
-    except OverflowError:
-        raise UsageError(f"--port {port}: ports are 0 to 65535") from None
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            raise UsageError(f"port {port} is in use; give another one, or --port 0 for any that is free") from None
-        raise UsageError(f"--host {host} --port {port}: {error.strerror or error}") from None
 
 
 def _handle_signals(server: PolicyServer, end: asyncio.Event) -> None:
@@ -131,8 +126,7 @@ def _handle_signals(server: PolicyServer, end: asyncio.Event) -> None:
         reloads.add(task)
         task.add_done_callback(reloads.discard)
 
-    with contextlib.suppress(AttributeError, ValueError):
-        loop.add_signal_handler(signal.SIGHUP, reload)
+    loop.add_signal_handler(signal.SIGHUP, reload)
 
 
 async def _reload(server: PolicyServer, file: Path) -> None:

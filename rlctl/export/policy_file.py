@@ -75,10 +75,10 @@ def show(report: PolicyFileReport, json: str | None) -> None:
 def as_json(report: PolicyFileReport) -> dict[str, Any]:
     """Return a report as plain data."""
     return {
-        "path": str(report.path),
+        "path": report.path,
         "bytes": report.size,
         "task": report.info.spec.task,
         "algo": report.info.algo,
         "training_steps": report.info.training_steps,
-        **report.provenance.model_dump(mode="json"),
+        **report.provenance.model_dump(),
     }

@@ -40,16 +40,11 @@ class ExportReport:
     """Why it was not verified; empty if it was."""
 
     def as_json(self) -> dict[str, Any]:
-        """Return plain data."""
-        result = {
-            key: str(value) if isinstance(value, Path) else value for key, value in dataclasses.asdict(self).items()
-        }
-        result["verified"] = not self.not_verified
-        if self.agreement:
-            result["max_difference"] = self.agreement.max_difference
-            result["observations"] = self.agreement.observations
-        if self.latency:
-            result["latency"] = {**dataclasses.asdict(self.latency), "speedup": self.latency.speedup}
+        """Return what is written as JSON."""
+        result = {**dataclasses.asdict(self), "verified": not self.not_verified}
+        if self.agreement and self.latency:
+            result |= {name: getattr(self.agreement, name) for name in ("max_difference", "observations")}
+            result["latency"]["speedup"] = self.latency.speedup
         return result
 
     def list_rows(self) -> list[tuple[str, str]]:

@@ -126,7 +126,7 @@ def open_command(result: ReplayResult) -> str | None:
 
 
 def as_json(result: ReplayResult) -> dict[str, Any]:
-    """Return the result as plain data."""
+    """Return what is written as JSON."""
     content: dict[str, Any] = {
         "task": result.task,
         "policy": result.policy,
@@ -137,13 +137,13 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
     if result.choice:
         content["choice"] = result.choice
     if result.film is not None:
-        content["film"] = {**dataclasses.asdict(result.film), "file": str(result.film.file)}
+        content["film"] = result.film
     if (verification := result.verification) is not None:
-        difference, versions = verification.difference, verification.other_versions.items()
+        versions = verification.other_versions.items()
         content["verification"] = {
-            "episode": str(verification.episode),
-            "identical": difference is None,
-            "difference": dataclasses.asdict(difference) if difference else None,
+            "episode": verification.episode,
+            "identical": verification.difference is None,
+            "difference": verification.difference,
             "other_versions": {name: {"recorded": recorded, "now": now} for name, (recorded, now) in versions},
         }
     return content
@@ -151,12 +151,12 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
 
 def _episode_json(episode: ReplayedEpisode) -> dict[str, Any]:
     return {
-        "file": str(episode.recording) if episode.recording else None,
-        "episode": str(episode.episode) if episode.episode else None,
+        "file": episode.recording,
+        "episode": episode.episode,
         "seed": episode.seed,
         "length": episode.length,
         "return": episode.total_reward,
         "success": episode.success,
         "randomized": any(episode.events.values()),
-        "events": dict(episode.events),
+        "events": episode.events,
     }

@@ -12,7 +12,7 @@ import pydantic
 from pydantic import Field
 
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import RecipeError, did_you_mean, short_repr
+from rlctl.errors import RecipeError, short_repr
 from rlctl.run import schema_text, yaml_text
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.run.hyperparameters import ON_POLICY as ON_POLICY
@@ -227,9 +227,7 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
     except pydantic.ValidationError as error:
         problem = error.errors()[0]
         schema = build_schema(values.get("algo", "ppo"))
-        loc = problem["loc"]
-        depth = schema_text.find_depth(schema, loc) if problem["type"] != "extra_forbidden" else len(loc)
-        path = loc[:depth]
+        path = schema_text.locate(problem, schema)
         places = (each if isinstance(each, str) else each.find(path) for each in sources)
         where = next((place for place in places if place), "recipe")
         raise RecipeError(f"{where}: {_explain(problem, path, schema, values)}") from None
@@ -256,22 +254,8 @@ def _explain(problem: Any, path: Sequence[str | int], schema: schema_text.Schema
     if len(path) > 1 and path[0] == "stages":
         where, shown = f"stage {int(path[1]) + 1}: ", path[2:]
     key = ".".join(short_repr(str(part)) for part in shown)
-    if problem["type"] == "extra_forbidden":
-        keys = schema_text.list_keys(schema, schema_text.find_schema(schema, path[:-1]))
-        algo = f" for {values.get('algo', 'ppo')}" if path[0] in ("algo_kwargs", "policy_kwargs") else ""
-        return f"{where}no key {key!r}{algo}.{did_you_mean(str(path[-1]), keys)} Keys here: {', '.join(keys)}."
-    label = f"{where}{key}{': ' if key else ''}"
-    if problem["type"] == "value_error":  # of a check of ours that needs more than a type
-        return f"{label}{problem['ctx']['error']}"
-    part = schema_text.find_schema(schema, path)
-    given: Any = values
-    for each in path:
-        given = given[each]
-    examples = f", such as {' or '.join(part['examples'])}" if "examples" in part else ""
-    close = did_you_mean(given, part.get("enum", ())) if isinstance(given, str) else ""
-    given = repr(short_repr(given)) if isinstance(given, str) else short_repr(given)
-    expected = f"expected {schema_text.describe_value(schema, part)}{examples}"
-    return f"{label}{expected}, got {given}{close and f'.{close}'}"
+    of = f" for {values.get('algo', 'ppo')}" if path and path[0] in ("algo_kwargs", "policy_kwargs") else ""
+    return where + schema_text.explain(problem, path, schema, values, key=key, of=of)
 
 
 def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from rlctl.errors import did_you_mean, short_repr
 from rlctl.run import yaml_text
 
 Schema = dict[str, Any]
@@ -15,12 +16,8 @@ def find_schema(root: Schema, path: Sequence[str | int]) -> Schema:
     return _descend(root, path)[0]
 
 
-def find_depth(root: Schema, path: Sequence[str | int]) -> int:
-    """Return how many parts of `path` a schema has; what comes after are names that pydantic has for types."""
-    return _descend(root, path)[1]
-
-
 def _descend(root: Schema, path: Sequence[str | int]) -> tuple[Schema, int]:
+    # How many parts of `path` a schema has comes with it: what comes after are names that pydantic has for types.
     node = root
     for depth, part in enumerate(path):
         inner = next((each for each in (_find_part(one, part) for one in _list_alternatives(root, node)) if each), None)
@@ -46,6 +43,34 @@ def list_keys(root: Schema, node: Schema) -> list[str]:
 def describe_value(root: Schema, node: Schema) -> str:
     """Return what a value must be: `a number in (0, 1]`, `a whole number in [1, 1e9] or -1`."""
     return " or ".join(dict.fromkeys(_describe(root, each) for each in _list_alternatives(root, node)))
+
+
+def locate(problem: Any, root: Schema) -> tuple[str | int, ...]:
+    """Return the path of the value that an error of pydantic is about."""
+    path: tuple[str | int, ...] = problem["loc"]
+    return path if problem["type"] == "extra_forbidden" else path[: _descend(root, path)[1]]
+
+
+def explain(
+    problem: Any, path: Sequence[str | int], root: Schema, values: Any, *, key: str, of: str = "", unit: str = ""
+) -> str:
+    """Say what is wrong with the value at `path`, which is called `key`: what was expected, and the closest name."""
+    if problem["type"] == "extra_forbidden":
+        keys = list_keys(root, find_schema(root, path[:-1]))
+        return f"no key {key!r}{of}.{did_you_mean(str(path[-1]), keys)} Keys here: {', '.join(keys)}."
+    label = f"{key}: " if key else ""
+    if problem["type"] == "value_error":  # of a check of ours that needs more than a type
+        return f"{label}{problem['ctx']['error']}"
+    part, given = find_schema(root, path), values
+    for each in path:
+        given = given[each]
+    expected = describe_value(root, part)
+    if unit:
+        expected = f"{expected.removesuffix(' or null')} [{unit}]"
+    examples = f", such as {' or '.join(part['examples'])}" if "examples" in part else ""
+    close = did_you_mean(given, part.get("enum", ())) if isinstance(given, str) else ""
+    got = repr(short_repr(given)) if isinstance(given, str) else short_repr(given)
+    return f"{label}expected {expected}{examples}, got {got}{close and f'.{close}'}"
 
 
 def _list_alternatives(root: Schema, node: Schema) -> Iterator[Schema]:

@@ -6,8 +6,13 @@ import contextlib
 import dataclasses
 import importlib.metadata
 import inspect
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic_core import to_jsonable_python
 
 from rlctl import registry
 from rlctl.check_env.leaves import Leaf, find_leaves
@@ -16,59 +21,23 @@ from rlctl.plugin_code import call_plugin
 from rlctl.run import recipe as recipes
 from rlctl.run import recipe_sources
 from rlctl.run.policy import PolicyInfo, read_info
-from rlctl.tasks import parameters
-from rlctl.tasks.definition import Definition, describe_definition
-from rlctl.tasks.parameters import Parameter
-from rlctl.tasks.plain_data import highest, lowest
 
 if TYPE_CHECKING:
     import gymnasium
 
     from rlctl.task.env import TaskEnv
-
-
-@dataclasses.dataclass(frozen=True)
-class Quantity:
-    """A named part of an observation, or an action."""
-
-    name: str
-    kind: str
-    """`Box`, `Discrete`, ..., or the name of a space that is not known here."""
-    shape: list[int]
-    dtype: str
-    low: float | None
-    """The lowest bound of all elements, in `unit`; None where one is unbounded or nothing is known."""
-    high: float | None
-    unit: str | None = None
+    from rlctl.task.events import Event
 
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """Everything that is known of a task; plain data but for the recipe and the shipped policy."""
+    """Everything that is known of a task."""
 
-    task: str
-    """As it was asked for."""
-    target: str
-    """`package.module:Class`."""
-    summary: str
-    """The first line of the class's docstring that is not a heading."""
-    distribution: str | None
-    version: str | None
-    file: str | None
-    observation_space: str
-    observations: list[Quantity]
-    action_space: str
-    actions: list[Quantity]
-    parameters: list[Parameter]
-    max_steps: int | None
-    """Steps until the time limit."""
-    definition: Definition | None
-    """What only a `Task` says; None for a plain Gymnasium environment."""
+    content: dict[str, Any]
+    """What is written as JSON: plain data."""
     recipe: recipes.Recipe
-    recipe_file: str | None
-    policy_file: str | None
-    """The policy that ships with it."""
     policy: PolicyInfo | None
+    """Of the policy that ships with it."""
 
 
 def describe(task: str) -> Description:
@@ -83,52 +52,121 @@ def describe(task: str) -> Description:
     env = spec.make()
     # Guarded: attributes of an environment are a plugin's code too.
     try:
-        description: Description = call_plugin(task, lambda: _describe(task, constructor, recipe, env))
+        about = call_plugin(task, lambda: _describe_env(task, constructor, env))
     except TaskError:
         with contextlib.suppress(TaskError):
             call_plugin(task, lambda: env.close())
         raise
     call_plugin(task, lambda: env.close())
-    return description
+    recipe_file, entry = registry.find_recipe_file(task), registry.find(task)
+    policy_file = entry.policy_file if entry else None
+    policy = read_info(policy_file) if policy_file else None
+    content = {
+        **about,
+        "recipe": recipe.model_dump(by_alias=True),
+        "recipe_file": recipe_file,
+        "policy_file": policy_file,
+        "policy": policy and policy.model_dump(mode="json", include={"algo", "training_steps", "provenance"}),
+    }
+    return Description(to_jsonable_python(content, inf_nan_mode="null", fallback=_convert), recipe, policy)
 
 
-def _describe(task: str, constructor: Any, recipe: recipes.Recipe, env: gymnasium.Env[Any, Any]) -> Description:
+def _convert(value: Any) -> Any:
+    """Return what stands for a value that JSON does not have: an array's numbers, a function's name."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else getattr(value, "__name__", repr(value))
+
+
+def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     from rlctl.task.env import TaskEnv
 
     built = env.unwrapped
-    cls = type(built.task if isinstance(built, TaskEnv) else built)
+    task_env = built if isinstance(built, TaskEnv) else None
+    cls = type(task_env.task if task_env else built)
     target = f"{cls.__module__}:{cls.__qualname__}"
     distribution, version = _find_origin(task, target)
-    recipe_file = registry.find_recipe_file(task)
-    entry = registry.find(task)
-    policy_file = entry.policy_file if entry else None
-    max_steps: int | None
-    if isinstance(built, TaskEnv):
-        observations, accepted, max_steps = _list_observations(built), parameters.list_of_task(cls), built.max_steps
-    else:
-        observations = _list_quantities(env.observation_space)
-        # Gymnasium's constructor of an id takes anything; the class behind it does not.
-        accepted = parameters.list_of_call(cls if hasattr(constructor, "gymnasium_id") else constructor)
-        max_steps = env.spec.max_episode_steps if env.spec else None
-    return Description(
-        task=task,
-        target=target,
-        summary=_find_summary(cls),
-        distribution=distribution,
-        version=version,
-        file=_find_file(cls),
-        observation_space=_format_space(env.observation_space),
-        observations=observations,
-        action_space=_format_space(env.action_space),
-        actions=_list_quantities(env.action_space),
-        parameters=accepted,
-        max_steps=max_steps,
-        definition=describe_definition(built) if isinstance(built, TaskEnv) else None,
-        recipe=recipe,
-        recipe_file=str(recipe_file) if recipe_file else None,
-        policy_file=str(policy_file) if policy_file else None,
-        policy=read_info(policy_file) if policy_file else None,
-    )
+    # Gymnasium's constructor of an id takes anything; the class behind it does not.
+    called = cls if task_env or hasattr(constructor, "gymnasium_id") else constructor
+    steps = env.spec.max_episode_steps if env.spec else None
+    return {
+        "task": task,
+        "target": target,
+        "summary": _find_summary(cls),
+        "distribution": distribution,
+        "version": version,
+        "file": _find_file(cls),
+        "observation_space": _format_space(env.observation_space),
+        "observations": _list_observations(task_env) if task_env else _list_quantities(env.observation_space),
+        "action_space": _format_space(env.action_space),
+        "actions": _list_quantities(env.action_space),
+        "parameters": [] if task_env and not dataclasses.is_dataclass(cls) else _list_parameters(called),
+        "max_steps": task_env.max_steps if task_env else steps,
+        "definition": _describe_definition(task_env) if task_env else None,
+    }
+
+
+def _describe_definition(env: TaskEnv) -> dict[str, Any]:
+    """Return what only a `Task` says of itself."""
+    from rlctl.task.inertia import find_inertia_faults
+
+    task = env.task
+    return {
+        "robot": task.robot,
+        "control_dt": task.control_dt,
+        "substeps": task.substeps,
+        "episode_s": task.episode_s,
+        "has_success": env.has_success,
+        "action_meaning": task.action_meaning,
+        "observation_layout": task.observation_layout,
+        "rewards": [
+            {"name": name, "weight": weight, "default": float(task.reward_weights[name])}
+            for name, weight in env.reward_weights.items()
+        ],
+        "events": [
+            _describe_event(name, event, env.events[name].event if name in env.events else None)
+            for name, event in task.events.items()
+        ],
+        "model_faults": [fault for body in env.sim.bodies.values() for fault in find_inertia_faults(body)],
+    }
+
+
+def _describe_event(name: str, offered: Event, acting: Event | None) -> dict[str, Any]:
+    event = acting or offered  # with the parameters of the recipe, where it acts
+    settings: dict[str, Any] = {"every_s": event.every_s} if event.when == "interval" else {}
+    if event.when == "observation" and event.of:
+        settings = {"of": event.of}
+    return {
+        "name": name,
+        "when": event.when,
+        "function": event.function,
+        "parameters": {**event.parameters, **settings},
+        "enabled": offered.enabled,
+        "acts": acting is not None,
+    }
+
+
+def _list_parameters(constructor: Callable[..., Any]) -> list[dict[str, Any]]:
+    """Return the parameters that make a task or an environment, where Python can tell.
+
+    Without `render_mode`, which is not the user's to set.
+    """
+    try:
+        found = inspect.signature(constructor).parameters.values()
+    except (TypeError, ValueError):  # written in C
+        return []
+    fields = getattr(constructor, "__dataclass_fields__", {})
+    parameters = []
+    for p in found:
+        if p.kind not in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) or p.name == "render_mode":
+            continue
+        kind = p.annotation if isinstance(p.annotation, str) else inspect.formatannotation(p.annotation)
+        default = None if p.default is p.empty else p.default
+        if p.name in fields and (make := fields[p.name].default_factory) is not dataclasses.MISSING:
+            default = make()
+        if isinstance(default, float) and not math.isfinite(default):
+            default = str(default)
+        kind = "" if p.annotation is p.empty else kind
+        parameters.append({"name": p.name, "type": kind, "default": default, "required": p.default is p.empty})
+    return parameters
 
 
 def _find_origin(task: str, target: str) -> tuple[str | None, str | None]:
@@ -142,9 +180,9 @@ def _find_origin(task: str, target: str) -> tuple[str | None, str | None]:
 
 
 def _find_summary(cls: type) -> str:
-    # Of the class itself, not inherited; a dataclass without a docstring gets its signature for one.
+    """Return the first line of a class's own docstring that is not a heading."""
     text = (cls.__dict__.get("__doc__") or "").strip()
-    if text.startswith(f"{cls.__name__}("):
+    if text.startswith(f"{cls.__name__}("):  # a dataclass without a docstring gets its signature for one
         return ""
     return next((line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
 
@@ -160,7 +198,7 @@ def _format_space(space: Any) -> str:
     return " ".join(str(space).split())
 
 
-def _list_observations(env: TaskEnv) -> list[Quantity]:
+def _list_observations(env: TaskEnv) -> list[dict[str, Any]]:
     """Return the parts of a task's observation by the names that the task gives them."""
     units = env.task.observation_units
     parts = _list_quantities(env.observation_space)
@@ -168,17 +206,24 @@ def _list_observations(env: TaskEnv) -> list[Quantity]:
         (whole,) = find_leaves(env.observation_space)
         parts, start = [], 0
         for name, size in env.observation_sizes.items():
-            end = start + size
-            parts.append(_describe_part(name, whole, [size], slice(start, end)))
-            start = end
-    return [dataclasses.replace(part, unit=units.get(part.name)) for part in parts]
+            parts.append(_describe_part(name, whole, [size], slice(start, start := start + size)))
+    return [{**part, "unit": units.get(part["name"])} for part in parts]
 
 
-def _list_quantities(space: Any) -> list[Quantity]:
+def _list_quantities(space: Any) -> list[dict[str, Any]]:
     return [_describe_part(".".join(map(str, leaf.path)), leaf, list(leaf.shape)) for leaf in find_leaves(space)]
 
 
-def _describe_part(name: str, leaf: Leaf, shape: list[int], part: Any = ...) -> Quantity:
-    low = lowest(leaf.low[part]) if leaf.low is not None else None
-    high = highest(leaf.high[part]) if leaf.high is not None else None
-    return Quantity(name, leaf.kind, shape, leaf.dtype, low, high)
+def _describe_part(name: str, leaf: Leaf, shape: list[int], part: Any = ...) -> dict[str, Any]:
+    """Return a named part of an observation, or an action, with its lowest and highest bound."""
+    low = None if leaf.low is None or 0 in shape else float(np.min(leaf.low[part]))
+    high = None if leaf.high is None or 0 in shape else float(np.max(leaf.high[part]))
+    return {
+        "name": name,
+        "kind": leaf.kind,
+        "shape": shape,
+        "dtype": leaf.dtype,
+        "low": low,
+        "high": high,
+        "unit": None,
+    }

@@ -58,24 +58,18 @@ def show(listed: list[ListedTask], json: str | None) -> None:
         output.write_result_json(json, {"tasks": [_to_json(each) for each in listed]})
     if json == "-":
         return
-    out = output.out()
     if not listed:
-        out.print("no tasks are installed")
+        output.out().print("no tasks are installed")
         return
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, pad_edge=False)
-    for column in ("task", "origin", "algorithm", "problem"):
-        if column != "problem" or any(each.problem for each in listed):
-            table.add_column(column, header_style="bold", overflow="fold")
+    columns = ["task", "origin", "algorithm", *(["problem"] if any(each.problem for each in listed) else [])]
+    rows: list[list[str | Text]] = []
     for each in listed:
         origin = f"{each.entry.distribution} {each.entry.version}"
-        row: list[Any] = [each.entry.name, origin, each.algo or "ppo (default)"]
-        if each.problem:
-            row.append(Text(each.problem, style="red"))
-        table.add_row(*row)
-    out.print(table)
+        problem = Text(each.problem or "", style="red")
+        rows.append([each.entry.name, origin, each.algo or "ppo (default)", problem][: len(columns)])
+    output.print_table(columns, rows, left=columns)
 
 
 def _to_json(each: ListedTask) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -10,69 +9,46 @@ from rlctl import output
 from rlctl.eval.score import describe_score
 from rlctl.run.policy import PolicyInfo
 from rlctl.run.stages import Stage
-from rlctl.tasks.definition import Definition, OfferedEvent
-from rlctl.tasks.description import Description, Quantity
-from rlctl.tasks.plain_data import to_plain
+from rlctl.tasks.description import Description
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 Row = tuple[str, ...]
+Json = Mapping[str, Any]
 
 _LONGEST_SPACE = 100  # [characters]; JSON has all of it
 
 
 def show(description: Description, json: str | None) -> None:
     """Print a description, or JSON alone for `-`."""
+    content = description.content
     if json is not None:
-        output.write_result_json(json, as_json(description))
+        output.write_result_json(json, content)
     if json == "-":
         return
     from rich.text import Text
 
-    out = output.out()
-    out.print(Text.assemble((description.task, "bold"), f"  {description.summary}".rstrip()))
-    _print_rows(out, _list_facts(description), indent=0)
-    definition = description.definition
-    _print_section(
-        out, f"observation  {_shorten(description.observation_space)}", _list_quantities(description.observations)
-    )
-    _print_section(out, f"action  {_shorten(description.action_space)}", _list_actions(description))
-    _print_section(out, "parameters  --set task.NAME=VALUE", _list_parameters(description), none="none")
+    out, recipe = output.out(), description.recipe
+    out.print(Text.assemble((content["task"], "bold"), f"  {content['summary']}".rstrip()))
+    _print_rows(out, _list_facts(content), indent=0)
+    definition = content["definition"]
+    parts = _list_quantities(content["observations"])
+    _print_section(out, f"observation  {_shorten(content['observation_space'])}", parts)
+    _print_section(out, f"action  {_shorten(content['action_space'])}", _list_actions(content))
+    parameters = _list_parameters(content["parameters"], recipe.task)
+    _print_section(out, "parameters  --set task.NAME=VALUE", parameters, none="none")
     if definition is not None:
-        _print_section(out, "reward terms", _list_rewards(definition))
-        _print_section(out, "events", [_format_event(each) for each in definition.events], none="none")
-        if definition.model_faults:
-            _print_section(out, "model files", [(fault,) for fault in definition.model_faults])
-    if description.recipe.stages:
-        _print_section(
-            out, "stages", [_format_stage(number, each) for number, each in enumerate(description.recipe.stages, 1)]
-        )
-    _print_section(out, f"recipe  {description.recipe_file or 'none packaged; the defaults'}", ())
-    for line in description.recipe.to_yaml().splitlines():
+        _print_section(out, "reward terms", _list_rewards(definition["rewards"]))
+        _print_section(out, "events", [_format_event(each) for each in definition["events"]], none="none")
+        if definition["model_faults"]:
+            _print_section(out, "model files", [(fault,) for fault in definition["model_faults"]])
+    if recipe.stages:
+        _print_section(out, "stages", [_format_stage(number, each) for number, each in enumerate(recipe.stages, 1)])
+    _print_section(out, f"recipe  {content['recipe_file'] or 'none packaged; the defaults'}", ())
+    for line in recipe.to_yaml().splitlines():
         out.print(Text(f"  {line}"))
-    _print_section(out, f"shipped policy  {description.policy_file or 'none'}", _list_scores(description.policy))
-
-
-def as_json(description: Description) -> dict[str, Any]:
-    """Return a description as plain data."""
-    content: dict[str, Any] = to_plain(
-        {
-            **dataclasses.asdict(dataclasses.replace(description, policy=None)),
-            "recipe": description.recipe.model_dump(by_alias=True),
-            "policy": None if (info := description.policy) is None else _summarize_policy(info),
-        }
-    )
-    return content
-
-
-def _summarize_policy(info: PolicyInfo) -> dict[str, Any]:
-    provenance = info.provenance
-    return {
-        "algo": info.algo,
-        "training_steps": info.training_steps,
-        "provenance": None if provenance is None else provenance.model_dump(mode="json"),
-    }
+    _print_section(out, f"shipped policy  {content['policy_file'] or 'none'}", _list_scores(description.policy))
 
 
 def _list_scores(info: PolicyInfo | None) -> list[Row]:
@@ -115,23 +91,24 @@ def _print_rows(out: Console, rows: list[Row], indent: int) -> None:
         out.print(Padding(table, (0, 0, 0, indent)))
 
 
-def _list_facts(description: Description) -> list[Row]:
-    facts = [("class", description.target)]
-    if description.distribution:
-        facts.append(("origin", f"{description.distribution} {description.version}"))
-    if description.file:
-        facts.append(("file", description.file))
-    definition, steps = description.definition, description.max_steps
+def _list_facts(content: Json) -> list[Row]:
+    facts = [("class", content["target"])]
+    if content["distribution"]:
+        facts.append(("origin", f"{content['distribution']} {content['version']}"))
+    if content["file"]:
+        facts.append(("file", content["file"]))
+    definition, steps = content["definition"], content["max_steps"]
     if definition is None:
         limit = f"truncated after {steps:,} steps" if steps else "no time limit that Gymnasium knows of"
         return [*facts, ("episode", limit)]
-    if definition.robot:
-        facts.append(("robot", definition.robot))
+    if definition["robot"]:
+        facts.append(("robot", definition["robot"]))
+    control_dt, substeps = _format_value(definition["control_dt"]), definition["substeps"]
     return [
         *facts,
-        ("control", f"{_format_number(definition.control_dt)} s per action, {definition.substeps} physics steps each"),
-        ("episode", f"{_format_number(definition.episode_s)} s, {steps:,} steps"),
-        ("success", "is_success, at the end of an episode" if definition.has_success else "not defined"),
+        ("control", f"{control_dt} s per action, {substeps} physics steps each"),
+        ("episode", f"{_format_value(definition['episode_s'])} s, {steps:,} steps"),
+        ("success", "is_success, at the end of an episode" if definition["has_success"] else "not defined"),
     ]
 
 
@@ -140,62 +117,59 @@ def _shorten(space: str) -> str:
     return space if len(space) <= _LONGEST_SPACE else f"{space.partition('(')[0]}(...)"
 
 
-def _list_quantities(quantities: list[Quantity]) -> list[Row]:
+def _list_quantities(quantities: list[Json]) -> list[Row]:
     return [
-        (each.name, _format_size(each), each.unit or "", _format_bounds(each))
+        (each["name"], _format_size(each), each["unit"] or "", _format_bounds(each["low"], each["high"]))
         for each in quantities
-        if each.name  # without one it is the whole space, which the title has
+        if each["name"]  # without one it is the whole space, which the title has
     ]
 
 
-def _format_size(quantity: Quantity) -> str:
-    return "x".join(map(str, quantity.shape)) if quantity.kind == "Box" else quantity.kind
+def _format_size(quantity: Json) -> str:
+    return "x".join(map(str, quantity["shape"])) if quantity["kind"] == "Box" else str(quantity["kind"])
 
 
-def _format_bounds(quantity: Quantity) -> str:
-    if quantity.low is None and quantity.high is None:
+def _format_bounds(low: float | None, high: float | None) -> str:
+    if low is None and high is None:
         return "unbounded"
-    low, high = ("-inf" if quantity.low is None else _format_number(quantity.low)), quantity.high
-    return f"{low} to {'inf' if high is None else _format_number(high)}"
+    return f"{'-inf' if low is None else _format_value(low)} to {'inf' if high is None else _format_value(high)}"
 
 
-def _list_actions(description: Description) -> list[Row]:
-    meaning = description.definition.action_meaning if description.definition else ""
-    return [(meaning,)] if meaning else _list_quantities(description.actions)
+def _list_actions(content: Json) -> list[Row]:
+    meaning = content["definition"]["action_meaning"] if content["definition"] else ""
+    return [(meaning,)] if meaning else _list_quantities(content["actions"])
 
 
-def _list_parameters(description: Description) -> list[Row]:
-    trained = description.recipe.task
+def _list_parameters(parameters: list[Json], trained: Mapping[str, Any]) -> list[Row]:
     return [
         (
-            each.name,
-            each.type,
-            "required" if each.required else _format_value(each.default),
-            f"{_format_value(trained[each.name])} in the recipe" if each.name in trained else "",
+            (name := each["name"]),
+            each["type"],
+            "required" if each["required"] else _format_value(each["default"]),
+            f"{_format_value(trained[name])} in the recipe" if name in trained else "",
         )
-        for each in description.parameters
+        for each in parameters
     ]
 
 
-def _list_rewards(definition: Definition) -> list[Row]:
+def _list_rewards(terms: list[Json]) -> list[Row]:
     return [
         (
-            term.name,
-            f"{term.weight:g}" + (" (a metric)" if term.weight == 0 else ""),
-            "" if term.weight == term.default else f"{term.default:g} in the task",
+            term["name"],
+            f"{term['weight']:g}" + (" (a metric)" if term["weight"] == 0 else ""),
+            "" if term["weight"] == term["default"] else f"{term['default']:g} in the task",
         )
-        for term in definition.rewards
+        for term in terms
     ]
 
 
-def _format_event(event: OfferedEvent) -> Row:
-    parameters = dict(event.parameters)
-    when = event.when
+def _format_event(event: Json) -> Row:
+    parameters, when = dict(event["parameters"]), event["when"]
     if "every_s" in parameters:
         when = f"every {_format_value(parameters.pop('every_s'))} s"
     arguments = ", ".join(f"{name} {_format_range(value)}" for name, value in parameters.items())
-    acts = "always" if event.enabled else "with this recipe" if event.acts else "with randomize=true"
-    return event.name, when, event.function, arguments, acts
+    acts = "always" if event["enabled"] else "with this recipe" if event["acts"] else "with randomize=true"
+    return event["name"], when, event["function"], arguments, acts
 
 
 def _format_stage(number: int, stage: Stage) -> Row:
@@ -209,17 +183,13 @@ def _format_range(value: Any) -> str:
     if isinstance(value, Mapping) and value.keys() == {"from", "to"}:
         return f"{_format_range(value['from'])} -> {_format_range(value['to'])}"
     if isinstance(value, list) and len(value) == 2 and all(isinstance(each, int | float) for each in value):
-        return f"{_format_number(value[0])}..{_format_number(value[1])}"
+        return f"{value[0]:.6g}..{value[1]:.6g}"
     return _format_value(value)
 
 
 def _format_value(value: Any) -> str:
     if isinstance(value, float):
-        return _format_number(value)
+        return f"{value:.6g}"
     if isinstance(value, list):
         return f"[{', '.join(map(_format_value, value))}]"
     return str(value)
-
-
-def _format_number(value: float) -> str:
-    return f"{value:.6g}"

@@ -41,7 +41,11 @@ def test_a_whole_file(write, arm):
     ("text", "message"),
     [
         ("comand: step", "limits.yaml:1: no key 'comand'. Did you mean 'command'? Keys here: command, scale"),
-        ("command: steps", "limits.yaml:1: command: expected position or step or speed or torque or action, got steps"),
+        (
+            "command: steps",
+            "limits.yaml:1: command: expected position or step or speed or torque or action, got 'steps'. "
+            "Did you mean 'step'?",
+        ),
         (
             "limits:\n  elbow: {position: [1, -1]}",
             "limits.yaml:2: limits.elbow.position: the lower bound 1 is not below the upper one, -1; write [low, high]",

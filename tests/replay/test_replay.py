@@ -77,7 +77,7 @@ def test_command_line_from_a_run_to_the_command_that_opens_it(replay, run, tmp_p
 
 def test_result_as_json(run, tmp_path):
     content = as_json(run_replay(ReplayRequest(str(run.run.best_policy), episodes=2, output=tmp_path)))
-    files = [str(tmp_path / name) for name in ("000000.rrd", "000001.rrd")]
+    files = [tmp_path / name for name in ("000000.rrd", "000001.rrd")]
     assert [episode["file"] for episode in content["episodes"]] == files
     assert content["episodes"][0].keys() == {
         "file",

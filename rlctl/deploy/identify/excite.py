@@ -34,10 +34,6 @@ class Excitation:
     largest_share: float
     """How far the joints went, of their range without its margins; 0 where no joint has limits."""
 
-    def as_json(self) -> dict[str, Any]:
-        """Return plain data."""
-        return {**dataclasses.asdict(self), "path": str(self.path)}
-
 
 def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) -> Excitation:
     """Write the largest trajectory that is safe in simulation, as a log: actions, and what the simulation did.

@@ -75,10 +75,6 @@ class Identification:
             settings[self.delay_event] = {"steps": [self.delay, self.delay]}
         return settings
 
-    def as_json(self) -> dict[str, Any]:
-        """Return plain data."""
-        return {**dataclasses.asdict(self), "log": str(self.log), "events": self.events()}
-
 
 def _round(value: float) -> float:
     return float(f"{value:.4g}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 
 import yaml
@@ -17,7 +18,7 @@ _PLOT_POINTS = 400
 def show(result: Identification, json: str | None) -> None:
     """Print the values with their intervals, or write them as JSON to a file or, for `-`, to stdout."""
     if json is not None:
-        output.write_result_json(json, result.as_json())
+        output.write_result_json(json, {**dataclasses.asdict(result), "events": result.events()})
     if json == "-":
         return
     out = output.out()
@@ -67,7 +68,7 @@ def draw_curves(result: Identification) -> str:
 def show_excitation(result: Excitation, json: str | None) -> None:
     """Print where a trajectory is and how it was bounded."""
     if json is not None:
-        output.write_result_json(json, result.as_json())
+        output.write_result_json(json, result)
     if json == "-":
         return
     lines = [
