@@ -130,6 +130,21 @@ def did_you_mean(word: str, options: Iterable[str]) -> str:
     return f" Did you mean {close[0]!r}?" if close else ""
 
 
+def check_name(
+    name: Any,
+    known: Iterable[str],
+    no_such: str,
+    error: type[RlctlError],
+    *,
+    listed: str = "It has",
+    none: str = "none",
+) -> None:
+    """Raise `error` for a name that is not known; it begins with `no_such`, then comes the closest one, then all."""
+    if name not in (names := list(known)):
+        there = short_repr(", ".join(names) or none, 200)
+        raise error(f"{no_such} {short_repr(name)!r}.{did_you_mean(str(name), names)} {listed}: {there}.")
+
+
 def short_repr(value: object, length: int = 80) -> str:
     """Return a value as Python writes it, text as it is, in one line of at most `length` characters."""
     try:

@@ -11,9 +11,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.deploy.bounds import Bounds
-from rlctl.deploy.limits import JointLimits, Limits, check_names
+from rlctl.deploy.limits import JointLimits, Limits
 from rlctl.deploy.observation import ObservationLayout
-from rlctl.errors import RecipeError, UsageError
+from rlctl.errors import RecipeError, UsageError, check_name
 from rlctl.joints import Joints
 from rlctl.run.env_info import EnvInfo
 
@@ -56,7 +56,8 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     if isinstance(space, spaces.Box):
         known = info.joints if info.joints is not None and len(info.joints.names) == count else None
         if limits.joints is not None and known is not None and limits.joints != list(known.names):
-            check_names("joint", limits.joints, known.names, "limits: joints: ")
+            for name in limits.joints:
+                check_name(name, known.names, "limits: joints: no joint", RecipeError, listed="Known")
             raise RecipeError(f"limits: joints: the action's order is {', '.join(known.names)}")
         names = limits.joints or (list(known.names) if known else [f"action[{index}]" for index in range(count)])
         if len(names) != count or len(set(names)) != count:
@@ -78,10 +79,10 @@ def _make_bounds(
     limits: Limits, space: spaces.Box, names: list[str], control_dt: float | None, known: Joints | None
 ) -> Bounds:
     """Return the limits as arrays, in the units of a command and per control step."""
-    given = [name for name in limits.limits if name != "all"]
     named = limits.joints is not None or known is not None
-    hint = "" if named else " This policy does not name them: write joints: [names, in the action's order]."
-    check_names("joint", given, names, "limits: ", hint)
+    listed = "Known" if named else "Write joints: [names, in the action's order], or one of"
+    for name in limits.limits.keys() - {"all"}:
+        check_name(name, names, "limits: no joint", RecipeError, listed=listed)
     each = [_merge(limits, name, _list_known(limits, known, index)) for index, name in enumerate(names)]
     for joint, name in zip(each, names, strict=True):
         _check_can_be_limited(limits, joint, name)
@@ -184,7 +185,7 @@ def _find_measured(limits: Limits, layout: ObservationLayout, count: int) -> sli
     name = limits.measured.position
     if name is None:
         return None
-    check_names("observation", [name], layout.slices, "limits: measured.position: ")
+    check_name(name, layout.slices, "limits: measured.position: no observation", RecipeError, listed="Known")
     place = layout.slices[name]
     if (size := place.stop - place.start) != count:
         raise RecipeError(f"limits: measured.position: {name} has {size} elements, the action has {count}")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import Field
 
-from rlctl.errors import RecipeError, did_you_mean, short_repr
+from rlctl.errors import RecipeError, short_repr
 from rlctl.run import schema_text, yaml_text
 from rlctl.run.quantities import Number
 
@@ -121,14 +121,3 @@ def _explain(problem: Any, place: tuple[str | int, ...], schema: schema_text.Sch
     if isinstance(given, str) and unit and _NUMBER_WITH_UNIT.match(given):
         return f"{key}: write the number alone, in {unit}, got {short_repr(given)!r}"
     return schema_text.explain(problem, place, schema, content, key=key, unit=unit)
-
-
-def check_names(kind: str, given: Any, known: Any, where: str = "", hint: str = "") -> None:
-    """Raise `RecipeError` for a name that is not known, with the closest one."""
-    known = list(known)
-    for name in given:
-        if name not in known:
-            listed = short_repr(", ".join(known) or "none", 200)
-            raise RecipeError(
-                f"{where}no {kind} {short_repr(name)!r}.{did_you_mean(str(name), known)} Known: {listed}.{hint}"
-            )

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import SINGLE, join, split, split_space
+from rlctl.dict_spaces import SINGLE, split, split_space
 from rlctl.errors import did_you_mean, short_repr
 from rlctl.run.env_info import EnvInfo
 
@@ -91,15 +91,6 @@ class ObservationLayout:
         if not self.slices:
             return np.zeros(0)
         return np.concatenate([np.asarray(parts[key], np.float64).ravel() for key in self.slices])
-
-    def zeros(self) -> Any:
-        """Return an observation of zeros, or of the first of its alternatives."""
-        return join(
-            {
-                key: np.full(space.shape or (), getattr(space, "start", 0), space.dtype)
-                for key, space in self._keys.items()
-            }
-        )
 
 
 def _convert(value: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:

@@ -132,18 +132,11 @@ async def _answer_health(request: web.Request) -> web.Response:
 
 async def _read_body(request: web.Request, largest: int) -> bytes:
     """Read a body of at most `largest` bytes that arrives in time."""
-    if (request.content_length or 0) > largest:
-        raise web.HTTPRequestEntityTooLarge(largest, request.content_length or 0)
-    content = bytearray()
     try:
         async with asyncio.timeout(_BODY_TIMEOUT_S):
-            async for chunk in request.content.iter_any():
-                content += chunk
-                if len(content) > largest:
-                    raise web.HTTPRequestEntityTooLarge(largest, len(content))
+            return await request.clone(client_max_size=largest).read()
     except TimeoutError:
         raise web.HTTPRequestTimeout from None
-    return bytes(content)
 
 
 def _refuse(status: int, text: str) -> web.Response:

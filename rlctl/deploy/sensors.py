@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.deploy.limits import Limits, check_names
+from rlctl.deploy.limits import Limits
 from rlctl.deploy.observation import ObservationLayout
-from rlctl.errors import RecipeError
+from rlctl.errors import RecipeError, check_name
 
 Array = NDArray[np.float64]
 Fault = tuple[str, str, float, float]
@@ -20,7 +20,8 @@ class SensorChecks:
     """Checks the numbers of one observation after the other."""
 
     def __init__(self, limits: Limits, layout: ObservationLayout, control_dt: float | None) -> None:
-        check_names("observation", limits.sensors, layout.slices, "limits: sensors: ")
+        for name in limits.sensors:
+            check_name(name, layout.slices, "limits: sensors: no observation", RecipeError, listed="Known")
         self._layout = layout
         self._oldest = math.inf if control_dt is None else limits.max_age_periods * control_dt
         self._low, self._high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)

@@ -7,6 +7,7 @@ import collections
 import dataclasses
 import functools
 import itertools
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,6 @@ from rlctl.deploy.rerun_log import RerunLog
 from rlctl.deploy.safety_events import SafetyEvent
 from rlctl.deploy.served_policy import ServedPolicy, load_served_policy
 from rlctl.deploy.session import Session
-from rlctl.dict_spaces import split
 from rlctl.errors import RlctlError, short_repr
 
 _HEARTBEAT_S = 30.0
@@ -65,7 +65,7 @@ class PolicyServer:
         """What an operator ordered, for clients that come later too; None: to act."""
         limits = settings.limits or Limits()
         self._limits = limits if settings.watchdog else limits.model_copy(update={"watchdog_periods": 0.0})
-        numbers = sum(part.size for part in split(ObservationLayout(policy.info.env).zeros()).values())
+        numbers = sum(map(math.prod, ObservationLayout(policy.info.env).shapes.values()))
         self.largest_message = 64 * numbers + 64 * 1024  # as text, and with names
         """Size of a request beyond which it is not read [bytes]."""
         self.posting = self._open_session()

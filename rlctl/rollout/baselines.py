@@ -31,7 +31,7 @@ SERVER = ("ws://", "wss://")
 def make_player(name: str, space: spaces.Space[Any], observation_space: spaces.Space[Any]) -> Player:
     """Return what plays `zero`, `random`, an exported file, a server (`ws://`), or a function for `load_function`."""
     if name.startswith(SERVER):
-        from rlctl.deploy.remote_player import RemotePlayer  # only here: it imports aiohttp
+        from rlctl.deploy.client import RemotePlayer  # only here: it imports aiohttp
 
         return RemotePlayer(name, observation_space, space)
     if name == "zero":

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, did_you_mean
+from rlctl.errors import TaskError, check_name
 from rlctl.task.bullet import pybullet
 from rlctl.task.motors import Motors
 
@@ -151,11 +151,7 @@ class Body(Motors):
         return np.array(state[2])
 
     def _joint_number(self, joint: str) -> int:
-        if joint not in self.all_joint_names:
-            raise TaskError(
-                f"{self.file.name} has no joint {joint!r}.{did_you_mean(joint, self.all_joint_names)} "
-                f"It has: {', '.join(self.all_joint_names) or 'none'}."
-            )
+        check_name(joint, self.all_joint_names, f"{self.file.name} has no joint", TaskError)
         return self.all_joint_names.index(joint)
 
     def solve_inverse_kinematics(

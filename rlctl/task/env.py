@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from rlctl.errors import RecipeError, TaskError, did_you_mean
+from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
 from rlctl.task.observation import Observation, ObservationFormat
@@ -210,11 +210,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:
     weights = {name: float(weight) for name, weight in task.reward_weights.items()}
     for name, weight in changes.items():
-        if name not in weights:
-            raise RecipeError(
-                f"reward_weights: {type(task).__name__} has no term {name!r}.{did_you_mean(name, weights)} "
-                f"It has: {', '.join(weights)}."
-            )
+        check_name(name, weights, f"reward_weights: {type(task).__name__} has no term", RecipeError)
         weights[name] = float(weight)
     return weights
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, did_you_mean
+from rlctl.errors import TaskError, check_name
 from rlctl.task.bullet import pybullet
 
 _RAIL = 100.0  # [m]
@@ -99,21 +99,15 @@ class Properties:
         pybullet.changeVisualShape(self.id, link, shapeIndex=shape, rgbaColor=color, physicsClientId=self.client)
 
     def _link_index(self, link: str) -> int:
-        if link not in self._links:
-            raise TaskError(
-                f"{self.file.name} has no link {link!r}.{did_you_mean(link, self._links)} "
-                f"It has: {', '.join(self._links) or f'only its base, {self.base_name!r}'}."
-            )
+        base = f"only its base, {self.base_name!r}"
+        check_name(link, self._links, f"{self.file.name} has no link", TaskError, none=base)
         return self._links[link]
 
     def _find_joints(self, joints: Sequence[str] = ()) -> list[int]:
         # Their indices in joint arrays.
         for joint in joints:
-            if joint not in self.joint_names:
-                raise TaskError(
-                    f"{self.file.name} has no joint {joint!r}.{did_you_mean(joint, self.joint_names)} "
-                    f"It has: {', '.join(self.joint_names) or 'none'}."
-                )
+            if joint not in self.joint_names:  # asked here, too: tasks may name joints at every step
+                check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
         if not self.joint_names:
             raise TaskError(f"{self.file.name} has no joints")
         return [self.joint_names.index(joint) for joint in joints or self.joint_names]

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, did_you_mean
+from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body
 from rlctl.task.bullet import pybullet, pybullet_data
 from rlctl.task.constraints import Constraints
@@ -130,10 +130,7 @@ class Sim(Constraints):
 
     def body(self, name: str) -> Body:
         """Return a loaded body by its name."""
-        if name not in self.bodies:
-            raise TaskError(
-                f"no body {name!r}.{did_you_mean(name, self.bodies)} Loaded: {', '.join(self.bodies) or 'none'}."
-            )
+        check_name(name, self.bodies, "no body", TaskError, listed="Loaded")
         return self.bodies[name]
 
     def step(self) -> None:

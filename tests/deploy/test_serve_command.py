@@ -53,7 +53,7 @@ def test_signals(served):
     ("settings", "code", "error"),
     [
         ({"host": "0.0.0.0"}, 2, "give a key"),
-        ({"limits": "limits.yaml"}, 2, "limits: no joint 'elbo'. Known: action[0], action[1]."),
+        ({"limits": "limits.yaml"}, 2, "or one of: action[0], action[1]."),
         ({"log": "policy.safetensors/log"}, 5, "the log cannot be written"),
     ],
 )

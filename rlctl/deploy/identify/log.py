@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import ArtifactError, UsageError, did_you_mean, short_repr
+from rlctl.errors import ArtifactError, UsageError, check_name
 from rlctl.run import files, untrusted
 
 Array = NDArray[np.float64]
@@ -41,17 +41,6 @@ class Log:
     """[rad or m], shape (T, joints)."""
     velocities: Array
     """[rad/s or m/s], shape (T, joints)."""
-
-    def as_json(self) -> dict[str, object]:
-        """Return plain data, for a worker."""
-        arrays = {key: getattr(self, key).tolist() for key in ("actions", "positions", "velocities")}
-        return {"joints": list(self.joints), **arrays}
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Sequence[object]]) -> Log:
-        """Return what `as_json` has written."""
-        arrays = {key: np.array(data[key], np.float64) for key in ("actions", "positions", "velocities")}
-        return cls(tuple(map(str, data["joints"])), **arrays)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,11 +80,8 @@ def read_log(path: Path, expected: Expected) -> Log:
     measured = [name.removeprefix(_POSITION) for name in columns if name.startswith(_POSITION)]
     joints = tuple(dict.fromkeys([*expected.driven, *measured]))
     for joint in joints:
-        if joint not in expected.joints:
-            raise ArtifactError(
-                f"{path}: column {_POSITION + joint!r}: the task has no joint {joint!r}."
-                f"{did_you_mean(joint, expected.joints)} It has: {', '.join(expected.joints)}."
-            )
+        no_joint = f"{path}: column {_POSITION + joint!r}: the task has no joint"
+        check_name(joint, expected.joints, no_joint, ArtifactError)
     if not joints:
         raise ArtifactError(
             f"{path}: no column of a joint's position: call it {_POSITION}{next(iter(expected.joints))}"
@@ -145,10 +131,7 @@ def _read_row(path: Path, line: int, row: list[str], names: list[str]) -> list[f
 
 
 def _take(path: Path, columns: Mapping[str, Array], name: str) -> Array:
-    if name not in columns:
-        raise ArtifactError(
-            f"{path}: no column {name!r}.{did_you_mean(name, columns)} It has: {short_repr(', '.join(columns), 200)}."
-        )
+    check_name(name, columns, f"{path}: no column", ArtifactError)
     return columns[name]
 
 

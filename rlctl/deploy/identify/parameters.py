@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Collection, Mapping
 
-from rlctl.errors import UsageError, did_you_mean
+from rlctl.errors import UsageError, check_name
 from rlctl.task.events import Event, delay, set_color, shift_gravity
 from rlctl.task.events.ranges import Widening
 
@@ -38,14 +38,6 @@ class Parameter:
             return self.low * math.exp(position * math.log(self.high / self.low))
         return self.low + position * (self.high - self.low)
 
-    def position(self, value: float) -> float:
-        """Return where a value is in the range, in [0, 1]."""
-        if self.is_logarithmic:
-            found = math.log(max(value, self.low) / self.low) / math.log(self.high / self.low)
-        else:
-            found = (value - self.low) / (self.high - self.low)
-        return min(max(found, 0.0), 1.0)
-
     @property
     def relative_span(self) -> float:
         """By how much a value changes over the range: of its logarithm, or in its own unit."""
@@ -76,10 +68,7 @@ def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: st
     Raises `UsageError` for a name that the task does not have, an event that no log can tell, and if nothing is left.
     """
     for name in chosen:
-        if name not in events:
-            raise UsageError(
-                f"--event: {task} has no event {name!r}.{did_you_mean(name, events)} It has: {', '.join(events)}."
-            )
+        check_name(name, events, f"--event: {task} has no event", UsageError)
     found: list[Parameter] = []
     delayed, longest = "", 0
     for name, event in events.items():

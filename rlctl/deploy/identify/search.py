@@ -38,29 +38,24 @@ class Fit:
     """Root mean square per measured position, then velocity, in their units."""
     rows_per_window: float
 
-    @classmethod
-    def from_answer(cls, answer: dict[str, Any]) -> Fit:
-        arrays = {key: np.array(answer[key], np.float64) for key in ("at", "information", "errors")}
-        return cls(**{**answer, **arrays})
+
+def encode(message: Any) -> bytes:
+    """Return a message between the search and its workers: JSON, in which arrays are lists."""
+    return json.dumps(message, default=np.ndarray.tolist).encode()
 
 
 class SearchWorkers:
     """Processes that follow a log. Answers come in the order of the questions; errors of the task are raised here."""
 
     def __init__(self, spec: EnvSpec, log: Log, unknowns: Unknowns, count: int) -> None:
-        first = {
-            "log": log.as_json(),
-            "parameters": [dataclasses.asdict(each) for each in unknowns.parameters],
-            "delay": unknowns.delay,
-            "longest_delay": unknowns.longest_delay,
-        }
+        first = encode({"log": dataclasses.asdict(log), "unknowns": dataclasses.asdict(unknowns)})
         main = "rlctl.deploy.identify.worker:main"
-        self._children = []
+        self._children: list[ChildProcess] = []
         try:
             for _ in range(count):
                 child = ChildProcess(main, {"spec": dataclasses.asdict(spec)}, stdout=2, stderr=2)
                 self._children.append(child)
-                child.connection.send_bytes(json.dumps(first).encode())
+                child.connection.send_bytes(first)
         except BaseException:
             self.close()
             raise
@@ -79,7 +74,7 @@ class SearchWorkers:
             while waiting and free:
                 index, question = waiting.pop()
                 connection = free.pop()
-                connection.send_bytes(json.dumps(question).encode())
+                connection.send_bytes(encode(question))
                 asked[connection] = index
             for connection in [each for each in wait(list(asked)) if isinstance(each, Connection)]:
                 try:
@@ -116,14 +111,15 @@ def search(
 
     def follow_up(questions: list[dict[str, Any]]) -> None:
         for answer in workers.ask(questions):
-            fit = Fit.from_answer(answer)
+            arrays = {key: np.array(answer[key], np.float64) for key in ("at", "information", "errors")}
+            fit = Fit(**{**answer, **arrays})
             if fit.delay not in fits or fit.cost < fits[fit.delay].cost:
                 fits[fit.delay] = fit
 
     trials = _make_trials(unknowns, seed)
     report(f"{len(trials)} trials")
     parts = [trials[index :: workers.count * 4] for index in range(workers.count * 4)]
-    costs = workers.ask([{"trials": part, "weights": weights.tolist()} for part in parts if part])
+    costs = workers.ask([{"trials": part, "weights": weights} for part in parts if part])
     ranked = sorted(
         (
             (cost, trial)
@@ -137,7 +133,7 @@ def search(
     follow_up([_ask_fit(trial["at"], trial["delay"], weights, _EVALUATIONS) for trial in starts])
     best = _best(fits)
     while beside := [d for d in (best.delay - 1, best.delay + 1) if 0 <= d <= _LONGEST_DELAY and d not in fits]:
-        follow_up([_ask_fit(best.at.tolist(), delay, weights, _EVALUATIONS) for delay in beside])
+        follow_up([_ask_fit(best.at, delay, weights, _EVALUATIONS) for delay in beside])
         if _best(fits).delay == best.delay:
             break
         best = _best(fits)
@@ -147,10 +143,7 @@ def search(
     near = [d for d in (best.delay - 1, best.delay, best.delay + 1) if d in fits]
     fits = {}
     follow_up(
-        [
-            _ask_fit(best.at.tolist(), delay, final, _LAST_EVALUATIONS if delay == best.delay else _EVALUATIONS)
-            for delay in near
-        ]
+        [_ask_fit(best.at, delay, final, _LAST_EVALUATIONS if delay == best.delay else _EVALUATIONS) for delay in near]
     )
     return fits
 
@@ -164,8 +157,8 @@ def _best(fits: dict[int, Fit]) -> Fit:
     return min(fits.values(), key=lambda fit: fit.cost)
 
 
-def _ask_fit(at: list[float], delay: int, weights: Array, evaluations: int) -> dict[str, Any]:
-    return {"at": at, "delay": delay, "weights": weights.tolist(), "evaluations": evaluations}
+def _ask_fit(at: Array | list[float], delay: int, weights: Array, evaluations: int) -> dict[str, Any]:
+    return {"at": at, "delay": delay, "weights": weights, "evaluations": evaluations}
 
 
 def _make_trials(unknowns: Unknowns, seed: int) -> list[dict[str, Any]]:

@@ -11,6 +11,7 @@ import numpy as np
 from rlctl.deploy.identify.follow import Follower, open_world
 from rlctl.deploy.identify.log import Array, Log
 from rlctl.deploy.identify.parameters import Parameter, Unknowns
+from rlctl.deploy.identify.search import encode
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError
 
@@ -23,13 +24,12 @@ def main(connection: Connection, spec: dict[str, Any]) -> None:
     """Build the world, then answer messages until the connection closes."""
     try:
         first = json.loads(connection.recv_bytes())
-        unknowns = Unknowns(
-            tuple(Parameter(**each) for each in first["parameters"]), first["delay"], first["longest_delay"]
-        )
-        follower = Follower(open_world(EnvSpec(**spec)), Log.from_json(first["log"]), unknowns)
+        parameters = tuple(Parameter(**each) for each in first["unknowns"].pop("parameters"))
+        log = Log(tuple(first["log"].pop("joints")), **{key: np.array(each) for key, each in first["log"].items()})
+        follower = Follower(open_world(EnvSpec(**spec)), log, Unknowns(parameters, **first["unknowns"]))
         while True:
             message = json.loads(connection.recv_bytes())
-            connection.send_bytes(json.dumps(_answer(follower, message)).encode())
+            connection.send_bytes(encode(_answer(follower, message)))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
 
@@ -82,10 +82,10 @@ def _fit(follower: Follower, at: Array, delay: int, weights: Array, evaluations:
         errors, derivatives = residuals(at), np.zeros((0, 0))
     by_row = errors.reshape(-1, len(weights))
     return {
-        "at": at.tolist(),
+        "at": at,
         "delay": delay,
         "cost": float(np.square(errors).mean()),
-        "information": (derivatives.T @ derivatives).tolist(),
-        "errors": np.sqrt(np.square(by_row / weights).mean(axis=0)).tolist(),
+        "information": derivatives.T @ derivatives,
+        "errors": np.sqrt(np.square(by_row / weights).mean(axis=0)),
         "rows_per_window": len(by_row) / len(follower.starts),
     }

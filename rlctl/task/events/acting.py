@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rlctl.errors import RlctlError, TaskError, did_you_mean
+from rlctl.errors import RlctlError, TaskError, check_name
 from rlctl.task.events.event import BoundEvent, Drawn, Parts, Signal, When
 from rlctl.task.sim import Sim
 
@@ -142,11 +142,8 @@ def _find_observed(event: BoundEvent, first: Parts) -> list[str]:
     of = event.event.of
     names = [of] if isinstance(of, str) else list(of)
     for name in names:
-        if name not in first:
-            raise event.error(
-                f"events.{event.name}: nothing observed is called {name!r}.{did_you_mean(str(name), first)} "
-                f"There is: {', '.join(first)}."
-            )
+        nothing = f"events.{event.name}: nothing observed is called"
+        check_name(name, first, nothing, event.error, listed="There is")
     return names or list(first)
 
 

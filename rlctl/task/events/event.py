@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 
 from numpy.typing import NDArray
 
-from rlctl.errors import RecipeError, RlctlError, TaskError, did_you_mean
+from rlctl.errors import RecipeError, RlctlError, TaskError, check_name
 from rlctl.task.events.ranges import Limits, Range, Widening, read_range
 
 When = Literal["reset", "start", "interval", "observation", "action"]
@@ -26,7 +26,6 @@ SignalMaker = Callable[..., tuple[Drawn, Signal]]
 """`(rng, first, **parameters)`: starts an episode whose first values are `first`; returns what it drew and a signal."""
 
 _MOMENTS: tuple[When, ...] = typing.get_args(When)
-_ALL_MOMENTS = f"There are: {', '.join(_MOMENTS)}."
 _SETTINGS: Mapping[When, list[str]] = {"interval": ["every_s"], "observation": ["of"]}
 _acts_at: dict[Callable[..., Any], tuple[When, ...]] = {}
 _nominal: dict[Callable[..., Any], Mapping[str, float]] = {}
@@ -102,19 +101,14 @@ class Event:
     def with_parameters(self, name: str, changes: Mapping[str, Any]) -> Event:
         """Return this event, enabled, with some parameters replaced; `name` is for the error."""
         for key in changes:
-            if key not in self.parameter_names:
-                raise RecipeError(
-                    f"events.{name}: no parameter {key!r}.{did_you_mean(str(key), self.parameter_names)} "
-                    f"It has: {', '.join(self.parameter_names) or 'none'}."
-                )
+            check_name(key, self.parameter_names, f"events.{name}: no parameter", RecipeError)
         settings = {"every_s": self.every_s, "of": self.of, **self.parameters, **changes}
         return Event(self.when, self.function, enabled=True, **settings)
 
     def bind(self, name: str, error: type[RlctlError] = TaskError) -> BoundEvent:
         """Check everything that can be known without a world; raises `error` that begins with `events.<name>`."""
         where = f"events.{name}"
-        if self.when not in _MOMENTS:
-            raise error(f"{where}: no moment {self.when!r}.{did_you_mean(self.when, _MOMENTS)} {_ALL_MOMENTS}")
+        check_name(self.when, _MOMENTS, f"{where}: no moment", error, listed="There are")
         possible = _acts_at.get(self.function, _MOMENTS)
         if self.when not in possible:
             function = getattr(self.function, "__name__", str(self.function))
@@ -199,11 +193,7 @@ class EventSettings:
     def apply(self, events: Mapping[str, Event]) -> dict[str, BoundEvent]:
         """Return the events that act, by name; checks the others for mistakes too."""
         for name in self.changes:
-            if name not in events:
-                raise RecipeError(
-                    f"events: this task has no event {name!r}.{did_you_mean(name, events)} "
-                    f"It has: {', '.join(events) or 'none'}."
-                )
+            check_name(name, events, "events: this task has no event", RecipeError)
         active = {}
         for name, event in events.items():
             bound = event.bind(name)
