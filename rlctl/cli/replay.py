@@ -15,7 +15,7 @@ from rlctl import completion
 from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Set, choose_checkpoint, claim_stdout, parse_changes
 
 if TYPE_CHECKING:
-    from rlctl.replay.choice import Choice
+    from rlctl.replay.replay import Choice
 
 _BY_OUTCOME = ("--worst", "--best", "--failures")
 
@@ -100,7 +100,7 @@ def replay(
 
 def _read_choice(**counts: int | None) -> Choice | None:
     from rlctl.errors import UsageError
-    from rlctl.replay.choice import Choice
+    from rlctl.replay.replay import Choice
 
     given = [Choice(kind, count) for kind, count in counts.items() if count is not None]  # type: ignore[arg-type]
     if len(given) > 1:

@@ -9,8 +9,7 @@ import onnx
 from gymnasium import spaces
 
 from rlctl.dict_spaces import SINGLE, split_space
-from rlctl.export.graph import BATCH, Graph, unsupported
-from rlctl.export.layers import concatenate, emit, emit_lstm
+from rlctl.export.layers import BATCH, Graph, concatenate, emit, emit_lstm, unsupported
 from rlctl.joints import Joints
 from rlctl.run.layers import Lstm, Normalize, OneHot
 from rlctl.run.network import Network, Tensors

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import abc
-import contextlib
 import fractions
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RlctlError, UsageError
@@ -50,14 +50,15 @@ def film_episodes(
     path: Path, env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose], *, policy: str
 ) -> tuple[list[Rollout], FilmReport]:
     """Play an episode per seed and write one film of all, whole or not at all."""
+    film = _Film(env, path.suffix)
     rollouts: list[Rollout] = []
-    film = _Film(path.suffix, env)
 
     def write(part: Path) -> None:
-        with film.open(part):
-            for seed in seeds:
-                rollouts.append(play_episode(env, spec, seed, film.watch(begin(seed)), policy=policy))
-                film.pause()
+        film.begin(part)
+        for seed in seeds:
+            rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=film.watch))
+            film.pause()
+        film.writer.close()
 
     files.write_with(path, write)
     return rollouts, film.report(path)
@@ -66,67 +67,48 @@ def film_episodes(
 class _Film:
     """Takes the pictures of one film."""
 
-    def __init__(self, suffix: str, env: Env) -> None:
+    def __init__(self, env: Env, suffix: str) -> None:
         self._view = look_at(env, *_SIZE[suffix])
         dt = frame_time(env) or _DT
         self._every = max(1, round(1 / (_RATE[suffix] * dt)))
-        self.rate = 1 / (dt * self._every)
-        self._writer: _Writer
+        self._rate = 1 / (dt * self._every)
         self._count = 0
         self._seconds = 0.0
-        self._last: Picture | None = None
+        self._last: Picture = np.zeros((0, 0, 3), np.uint8)
+        self._is_taken = False
 
-    @contextlib.contextmanager
-    def open(self, path: Path) -> Iterator[None]:
-        self._writer = (_Mp4 if path.suffix == ".mp4" else _Gif)(path, self.rate)
-        yield
-        self._writer.close()
+    def begin(self, path: Path) -> None:
+        """Begin to write a file."""
+        self.writer = (_Mp4 if path.suffix == ".mp4" else _Gif)(path, self._rate)
 
-    def watch(self, choose: Choose) -> Choose:
-        """Take a picture before actions: of the reset, and of every few steps."""
-
-        def take_and_choose(observation: Any, step: int) -> Any:
-            if step == 0:
-                self._view.begin()
-            if step % self._every == 0:
-                self._take()
-            return choose(observation, step)
-
-        return take_and_choose
+    def watch(self, step: int) -> None:
+        """Take a picture of the reset, and of every few steps."""
+        if step == 0:
+            self._view.begin()
+        self._is_taken = step % self._every == 0
+        if self._is_taken:
+            self._take()
 
     def _take(self) -> None:
         start = time.perf_counter()
         self._last = self._view.draw()
         self._seconds += time.perf_counter() - start
         self._count += 1
-        self._writer.add(self._last)
+        self.writer.add(self._last)
 
     def pause(self) -> None:
         """Take the end of an episode, and stay there for a moment."""
-        self._take()
-        assert self._last is not None
-        for _ in range(round(_PAUSE_S * self.rate)):
-            self._writer.add(self._last)
+        if not self._is_taken:
+            self._take()
+        for _ in range(round(_PAUSE_S * self._rate)):
+            self.writer.add(self._last)
 
     def report(self, path: Path) -> FilmReport:
-        assert self._last is not None
         height, width = self._last.shape[:2]
-        return FilmReport(path, self._count, width, height, self.rate, self._count / self._seconds)
+        return FilmReport(path, self._count, width, height, self._rate, self._count / self._seconds)
 
 
-class _Writer(abc.ABC):
-    """Encodes pictures into a file."""
-
-    @abc.abstractmethod
-    def add(self, picture: Picture) -> None:
-        """Add a picture."""
-
-    @abc.abstractmethod
-    def close(self) -> None:
-        """Finish the file."""
-
-
-class _Mp4(_Writer):
+class _Mp4:
     """H.264 in MP4, by PyAV: plays in browsers and slides."""
 
     def __init__(self, path: Path, rate: float) -> None:
@@ -149,7 +131,7 @@ class _Mp4(_Writer):
         self._container.close()
 
 
-class _Gif(_Writer):
+class _Gif:
     """An animated GIF, by Pillow, whose pictures are kept with their 256 colours until the end."""
 
     def __init__(self, path: Path, rate: float) -> None:

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from rlctl import dict_spaces, registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
-from rlctl.replay.scene import Camera, Env, Scene, SceneReader, Warn
+from rlctl.replay.scene import Env, Scene, Warn, make_reader
 from rlctl.run.env_info import EnvInfo, describe
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.run.policy import collect_versions
-from rlctl.task.env import TaskEnv
 
 Choose = Callable[[Any, int], Any]
 """From an observation and the number of steps done to an action; None ends the episode."""
+Watch = Callable[[int], None]
+"""Looks at an environment after a step; 0 is the reset."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,24 +73,35 @@ def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
 
 
 def play_episode(
-    env: Env, spec: EnvSpec, seed: int, choose: Choose, *, policy: str = "", draw: Warn | None = None
+    env: Env,
+    spec: EnvSpec,
+    seed: int,
+    choose: Choose,
+    *,
+    policy: str = "",
+    draw: Warn | None = None,
+    watch: Watch = lambda step: None,
 ) -> Rollout:
-    """Play the episode of a seed and record it.
+    """Play the episode of a seed and record it; `watch` is called after its reset and each of its steps.
 
     With `draw` the rollout has a scene, and `draw` receives why parts of it are missing. Raises `TaskError`, with
     seed and step, for whatever the environment raises.
     """
-    recorder = EpisodeRecorder(env, seed, draw)
+    recorder = EpisodeRecorder(env, seed)
+    reader = make_reader(env, draw) if draw is not None else None
+    looks = [watch] if reader is None else [reader.read, watch]
     with _locate_errors(spec.task, recorder):
         observation, info = env.reset(seed=seed)
         recorder.begin(observation, info)
-    recorder.draw()
+    for look in looks:
+        look(0)
     while not recorder.over and (action := choose(observation, recorder.step)) is not None:
         with _locate_errors(spec.task, recorder):
             observation, reward, terminated, truncated, info = env.step(_cast_action(action, env.action_space))
             recorder.add_step(action, observation, float(reward), bool(terminated), bool(truncated), info)
-        recorder.draw()
-    return recorder.rollout(spec, policy)
+        for look in looks:
+            look(recorder.step)
+    return recorder.rollout(spec, policy, Scene() if reader is None else reader.scene())
 
 
 def frame_time(env: Env) -> float | None:
@@ -141,16 +153,11 @@ def _locate_errors(task: str, recorder: EpisodeRecorder) -> Iterator[None]:
 class EpisodeRecorder:
     """Collects what an episode is made of, step by step."""
 
-    def __init__(self, env: Env, seed: int, warn: Warn | None = None) -> None:
-        """Record an episode of `env`; with `warn` also what can be drawn of it."""
+    def __init__(self, env: Env, seed: int) -> None:
         self.seed = seed
         self.over = False
         self._env = env
         self._info = describe(env)
-        self._view: SceneReader | Camera | None = None
-        if warn is not None:
-            inner = env.unwrapped
-            self._view = SceneReader(inner) if isinstance(inner, TaskEnv) else Camera(env, warn)
         self._terms = list(self._info.reward_weights)
         self._observations: list[Any] = []
         self._actions: list[Any] = []
@@ -195,12 +202,7 @@ class EpisodeRecorder:
         if self.over:
             self._log_end(terminated)
 
-    def draw(self) -> None:
-        """Add what can be drawn after the last step, if anything is to be drawn."""
-        if self._view is not None:
-            self._view.read(self.step)
-
-    def rollout(self, spec: EnvSpec, policy: str) -> Rollout:
+    def rollout(self, spec: EnvSpec, policy: str, scene: Scene) -> Rollout:
         """Return the episode as played so far."""
         steps, terms = self.step, len(self._terms)
         if not self.over:
@@ -225,7 +227,7 @@ class EpisodeRecorder:
             ended=self.over,
             log=self._log,
             dt=frame_time(self._env),
-            scene=Scene() if self._view is None else self._view.scene(),
+            scene=scene,
         )
 
     def _add_log(self, text: str, level: str = "INFO") -> None:

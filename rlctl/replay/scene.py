@@ -78,6 +78,12 @@ class Scene:
         return [body for body in self.bodies if body.joint_names]
 
 
+def make_reader(env: Env, warn: Warn) -> SceneReader | Camera:
+    """Return what reads the world of a task, or takes the pictures of any other environment."""
+    inner = env.unwrapped
+    return SceneReader(inner) if isinstance(inner, TaskEnv) else Camera(env, warn)
+
+
 class SceneReader:
     """Reads bodies and markers of a task's world; changes nothing."""
 

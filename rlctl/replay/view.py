@@ -1,8 +1,8 @@
-"""What a camera sees of an environment, without a display: for films and pictures."""
+"""What a camera sees of an environment, without a display: for films, and a few pictures of a recorded episode."""
 
 from __future__ import annotations
 
-import abc
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -10,8 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import UsageError
-from rlctl.replay.scene import Env
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.replay.difference import find_difference
+from rlctl.replay.recorder import play_episode, recorded_actions
+from rlctl.replay.scene import Env, encode_jpeg
+from rlctl.run.episode import RecordedEpisode
+from rlctl.task import Sim
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
 
@@ -23,7 +27,7 @@ _CLOSEST, _FARTHEST = 0.8, 8.0  # [m]; the renderer draws nothing beyond 10 m
 _GROUND_SIZE = 8.0  # [m]; what is wider both ways is not looked at
 
 
-def look_at(env: Env, width: int, height: int) -> View:
+def look_at(env: Env, width: int, height: int) -> _World | _Pictures:
     """Return the view of an environment: a camera in a task's world, or the pictures that it makes itself.
 
     Of a task, pictures have `width` and `height` [pixels].
@@ -32,24 +36,17 @@ def look_at(env: Env, width: int, height: int) -> View:
     return _World(inner, width, height) if isinstance(inner, TaskEnv) else _Pictures(env)
 
 
-class View(abc.ABC):
-    """Draws the present state of an environment."""
-
-    def begin(self) -> None:  # noqa: B027 (most have nothing to do)
-        """Look at an episode that begins."""
-
-    @abc.abstractmethod
-    def draw(self) -> Picture:
-        """Return a picture, shape (height, width, 3)."""
-
-
-class _Pictures(View):
+class _Pictures:
     """The pictures that an environment makes itself."""
 
     def __init__(self, env: Env) -> None:
         self._env = env
 
+    def begin(self) -> None:
+        """Look at an episode that begins."""
+
     def draw(self) -> Picture:
+        """Return a picture of the present state, shape (height, width, 3)."""
         try:
             picture = np.asarray(self._env.render())
         except Exception as error:  # missing pygame, no OpenGL
@@ -64,7 +61,7 @@ class _Pictures(View):
         return np.ascontiguousarray(picture[:height, :width].astype(np.uint8))
 
 
-class _World(View):
+class _World:
     """A task's PyBullet world, seen by a camera that follows the first robot that moves about."""
 
     def __init__(self, env: TaskEnv, width: int, height: int) -> None:
@@ -109,3 +106,49 @@ def _find_bounds(bodies: Sequence[Any], markers: Sequence[NDArray[Any]]) -> tupl
         wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
         corners += [] if wide else list(itertools.chain(*boxes))
     return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
+
+
+_WIDTH, _HEIGHT = 240, 180  # [pixels]
+
+
+@dataclasses.dataclass(frozen=True)
+class PictureStrip:
+    """An episode in pictures."""
+
+    pictures: list[tuple[int, bytes]]
+    """Step and JPEG file."""
+    deepest_contact: float
+    """How far bodies overlapped at most [m]; 0 where they did not, or where there is no world of a task."""
+
+
+def take_pictures(episode: RecordedEpisode, count: int) -> PictureStrip:
+    """Play an episode again and return `count` steps of it, the first and the last among them.
+
+    The camera follows the robot. Raises `TaskError` if the environment fails, `UsageError` if it cannot draw, and
+    `ArtifactError` if it does something else than when it was recorded.
+    """
+    spec, steps = episode.info.spec, len(episode.actions)
+    chosen = {int(step) for step in np.linspace(0, steps, count)}
+    pictures: list[tuple[int, bytes]] = []
+    deepest = 0.0
+    env = spec.make("rgb_array")
+    sim = getattr(env.unwrapped, "sim", None)
+    try:
+        view = look_at(env, _WIDTH, _HEIGHT)
+
+        def watch(step: int) -> None:
+            nonlocal deepest
+            if isinstance(sim, Sim):
+                deepest = max(deepest, sim.deepest_contact)
+            if step == 0:
+                view.begin()
+            if step in chosen:
+                pictures.append((step, encode_jpeg(view.draw())))
+
+        choose = recorded_actions(episode, env)
+        rollout = play_episode(env, spec, episode.info.seed, choose, policy=episode.info.policy, watch=watch)
+    finally:
+        env.close()
+    if difference := find_difference(episode, rollout):
+        raise ArtifactError(f"replayed, the episode differs from the recorded one; {difference}")
+    return PictureStrip(pictures, deepest)

@@ -7,12 +7,11 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
-from rlctl.replay.recorder import Choose, Rollout, frame_time, play_episode
+from rlctl.replay.recorder import Choose, Rollout, Watch, frame_time, play_episode
 from rlctl.replay.scene import Env
 
 _INSTEAD = "leave out --gui to write a recording instead"
@@ -31,7 +30,7 @@ def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable
     shown: list[Rollout] = []
     for seed in seeds:
         try:
-            shown.append(play_episode(env, spec, seed, _in_real_time(begin(seed), frame_time(env) or _DT)))
+            shown.append(play_episode(env, spec, seed, begin(seed), watch=_wait(frame_time(env) or _DT)))
         except TaskError as error:
             if "Not connected to physics server" not in str(error.__cause__):
                 raise
@@ -39,17 +38,16 @@ def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable
     return shown
 
 
-def _in_real_time(choose: Choose, dt: float) -> Choose:
-    """Wait before each action until the simulated time has passed on the clock; `dt` [s] is that of a step."""
+def _wait(dt: float) -> Watch:
+    """Return what waits after each step, of `dt` [s], until the simulated time has passed on the clock."""
     start: list[float] = []
 
-    def wait_and_choose(observation: Any, step: int) -> Any:
-        if not start:
+    def wait(step: int) -> None:
+        if step == 0:
             start.append(time.monotonic())
         time.sleep(max(0.0, start[0] + step * dt - time.monotonic()))
-        return choose(observation, step)
 
-    return wait_and_choose
+    return wait
 
 
 def _check_display(*, bullet: bool) -> None:

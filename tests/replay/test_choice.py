@@ -6,8 +6,7 @@ import typer
 from rlctl.cli import build_app
 from rlctl.errors import UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
-from rlctl.replay.choice import Choice, select
-from rlctl.replay.replay import ReplayRequest, run_replay
+from rlctl.replay.replay import Choice, ReplayRequest, run_replay, select
 from rlctl.rollout.messages import EpisodeResult
 
 

@@ -87,7 +87,7 @@ def _drawings(report: Report, pictures: bool) -> dict[str, Any]:
 
 
 def _take_pictures(report: Report) -> Iterator[tuple[str, list[tuple[int, str]]]]:
-    from rlctl.replay.pictures import take_pictures
+    from rlctl.replay.view import take_pictures
 
     for name, episode in content.choose_episodes(report):
         try:
