@@ -68,7 +68,8 @@ def show(listed: list[ListedTask], json: str | None) -> None:
     for each in listed:
         origin = f"{each.entry.distribution} {each.entry.version}"
         problem = Text(each.problem or "", style="red")
-        rows.append([each.entry.name, origin, each.algo or "ppo (default)", problem][: len(columns)])
+        row: list[str | Text] = [each.entry.name, origin, each.algo or "ppo (default)", problem]
+        rows.append(row[: len(columns)])
     output.print_table(columns, rows, left=columns)
 
 
