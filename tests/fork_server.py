@@ -25,11 +25,11 @@ import threading
 from pathlib import Path
 
 from rlctl.env_spec import EnvSpec
-from rlctl.rollout.process_start import set_default_start
+from rlctl.rollout.child_process import set_start
 from tests.forked_process import SIGNALS, become
 
 ROOT = Path(__file__).parents[1]
-FOR_WORKERS = ("rlctl.rollout.worker_process", "rlctl.task.env", "rlctl.run.env_info", "rlctl.check_env.child")
+FOR_WORKERS = ("rlctl.rollout.worker", "rlctl.task.env", "rlctl.run.env_info", "rlctl.check_env.child")
 FOR_COMMANDS = (
     *("torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
     *("rlctl.eval.evaluate", "rlctl.eval.report", "rlctl.run.torch_policy", "rlctl.tasks.listing"),
@@ -257,7 +257,7 @@ def serve(connection, commands=False):
 
 
 def _start_own_server():
-    set_default_start(ForkServer.fork().start)
+    set_start(ForkServer.fork().start)
 
 
 def _use_huge_pages():
@@ -276,8 +276,8 @@ def _read_messages():
     """Read a message of each kind: the first one takes as long as a worker's start otherwise."""
     from rlctl.rollout import messages
 
-    asked = messages.Build(EnvSpec("reach")), messages.Attach(1), messages.LoadPolicy(), messages.BeginEpisodes([])
-    for each in (*asked, messages.Play(messages.Segment(1), {}), messages.ComputeRewards()):
+    asked = messages.Build(EnvSpec("reach")), messages.Attach(1), messages.LoadPolicy(), messages.BeginEpisodes({})
+    for each in (*asked, messages.Play(messages.Segment(1), {}), messages.ComputeRewards(b"")):
         messages.decode(messages.encode(each))
     messages.decode_answer(messages.encode(messages.Answer()))
 

@@ -149,7 +149,7 @@ def test_environments_come_without_learning_libraries():
     loaded = loaded_after(
         "import rlctl; rlctl.make('reach').close()",
         "from rlctl.env_spec import EnvSpec; EnvSpec('Pendulum-v1').make()",
-        "from rlctl.rollout import collect, workers, worker_process",
+        "from rlctl.rollout import collect, worker, workers",
         "from rlctl.deploy import SafetyFilter",
     )
     assert {line: modules & TORCH for line, modules in loaded.items() if modules & TORCH} == {}

@@ -1,13 +1,14 @@
 """Fresh Python interpreters as child processes, each in a process group of its own, with a connection to it.
 
 Never forks: a process that holds PyBullet or torch cannot be forked safely. (Tests fork from one that does not run any
-environment: `process_start.set_default_start`.) What a child and its own children print
-goes to descriptors that the caller gives, for example to a `LineReader`.
+environment: `set_start`.) What a child and its own children print goes to descriptors that the caller gives, for
+example to a `LineReader`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import importlib
 import json
 import os
@@ -16,13 +17,9 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
-
-from rlctl.rollout.process_group import block_signals, end, end_with_parent
-from rlctl.rollout.process_start import StartProcess, default_start
 
 # Started this way a child finds the modules that its parent finds, and the caller's script is not run again.
 # Ctrl-C and `kill` may reach a child too, but its parent decides: ignored before anything slow is imported, and held
@@ -34,7 +31,24 @@ _BOOTSTRAP = (
     "import json, sys; job = json.loads(sys.argv[1]); sys.path[:] = job['sys_path']; "
     "from rlctl.rollout.child_process import run_main; run_main(job)"
 )
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+StartProcess = Callable[..., "subprocess.Popen[bytes]"]
+"""Takes what `subprocess.Popen` takes, and returns what has its `pid`, `poll` and `wait`."""
+_start: StartProcess = subprocess.Popen
+
+
+def start_process(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+    """Start a process as `subprocess.Popen` does, or as `set_start` has it."""
+    return _start(command, **options)
+
+
+def set_start(start: StartProcess) -> None:
+    """Set how this process starts all others: tests, which start many, fork them from a process made for it."""
+    global _start
+    _start = start
 
 
 class ChildProcess:
@@ -53,7 +67,6 @@ class ChildProcess:
         stderr: int,
         descriptors: Sequence[int] = (),
         environment: Mapping[str, str] | None = None,
-        start: StartProcess | None = None,
     ) -> None:
         """`main` is "package.module:function"; `arguments` are what JSON can hold."""
         ours, theirs = socket.socketpair()
@@ -63,13 +76,12 @@ class ChildProcess:
             "main": main,
             "arguments": dict(arguments),
             "sys_path": sys.path,
-            "parent": os.getpid(),
             "connection": theirs.fileno(),
             "lifeline": lifeline,
         }
         try:
-            with theirs, open(lifeline, "rb"), block_signals():
-                self.process = (start or default_start())(
+            with theirs, open(lifeline, "rb"), _block_signals():
+                self.process = start_process(
                     [sys.executable, "-c", _BOOTSTRAP, json.dumps(job)],
                     pass_fds=(theirs.fileno(), lifeline, *descriptors),
                     stdin=subprocess.DEVNULL,
@@ -97,7 +109,11 @@ class ChildProcess:
         """Kill the process group; the child gets `grace_s` seconds to end by itself. A second call does nothing."""
         if self._lifeline < 0:
             return
-        end(self.process, time.monotonic() + grace_s)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(timeout=grace_s)
+        with contextlib.suppress(ProcessLookupError, PermissionError):  # nobody is left, or only who has ended
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
         self.connection.close()
         os.close(self._lifeline)  # not before it has ended: this kills it
         self._lifeline = -1
@@ -105,9 +121,40 @@ class ChildProcess:
 
 def run_main(job: dict[str, Any]) -> None:
     """In the child: call what the parent asked for."""
-    end_with_parent(job["parent"], job["lifeline"])
+    _end_with_parent(job["lifeline"])
     module, _, name = job["main"].partition(":")
     getattr(importlib.import_module(module), name)(Connection(job["connection"]), **job["arguments"])
+
+
+@contextlib.contextmanager
+def _block_signals() -> Iterator[None]:
+    """Hold back signals that ask to stop: a child that is started meanwhile takes them when it is ready for them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent(lifeline: int) -> None:
+    """In a child: end it and its group when its parent ends, even while an environment is stuck in a step.
+
+    `lifeline` is the descriptor of a pipe whose other end the parent alone holds.
+    """
+    with contextlib.suppress(AttributeError, OSError):  # Linux only
+        # By the system itself: no thread of ours runs while a library is stuck that holds Python's lock.
+        fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid() if os.getpgrp() == os.getpid() else os.getpid())
+        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
+        fcntl.fcntl(lifeline, fcntl.F_SETFL, os.O_ASYNC)
+
+    def watch() -> None:
+        with contextlib.suppress(OSError):  # an environment has closed it
+            os.read(lifeline, 1)  # until there is no other end any more
+        if os.getpgrp() == os.getpid():
+            os.killpg(0, signal.SIGKILL)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def anonymous_file() -> int:

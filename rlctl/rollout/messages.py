@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import functools
 import json
@@ -54,10 +55,10 @@ class Attach:
 
 @dataclasses.dataclass(frozen=True)
 class BeginEpisodes:
-    """Begin episodes, and take the steps of the actions that follow as bytes."""
+    """Begin episodes, and take the steps of some actions."""
 
-    episodes: list[tuple[int, int, int]]
-    """Environment, seed and number of actions of each."""
+    episodes: dict[int, tuple[int, pydantic.Base64Bytes]]
+    """Per environment the seed, and the actions as the bytes of an array."""
     may_fail: bool = False
     """Whether an episode that fails is only reported, as one that ended."""
 
@@ -110,12 +111,14 @@ class Play:
 
 @dataclasses.dataclass(frozen=True)
 class ComputeRewards:
-    """Compute the rewards of the goals that follow as bytes."""
+    """Compute the rewards of goals."""
+
+    goals: pydantic.Base64Bytes
+    """See `goal_rewards.encode_request`."""
 
 
 Message = Build | SetEvents | Attach | BeginEpisodes | LoadPolicy | LimitActions | Play | ComputeRewards
 _MESSAGES: dict[str, Any] = {each.__name__: each for each in get_args(Message)}
-FOLLOWED_BY_BYTES = (BeginEpisodes, ComputeRewards)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,6 +177,8 @@ def encode(message: Message | Answer) -> bytes:
 def _to_plain(value: Any) -> Any:
     if isinstance(value, pydantic.BaseModel):
         return value.model_dump()  # not in its JSON mode, which has no infinite numbers
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
     return dict(value) if isinstance(value, Mapping) else vars(value)
 
 

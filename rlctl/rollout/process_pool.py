@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import signal
-import subprocess
 import time
 from collections.abc import Callable, Iterable
 from multiprocessing.connection import wait
@@ -12,7 +10,6 @@ from multiprocessing.connection import wait
 from rlctl.rollout import messages
 from rlctl.rollout.child_process import ChildProcess, LineReader
 from rlctl.rollout.messages import Answer, Job, Message
-from rlctl.rollout.process_start import StartProcess
 from rlctl.rollout.worker_output import MAX_LINE_BYTES, LineFilter
 
 _CHECK_EVERY_S = 0.2
@@ -27,19 +24,13 @@ class WorkerFault(Exception):
 
 
 class ProcessPool:
-    """A process per job, started with `start`. Raises `OSError` if one cannot be started.
+    """A process per job. Raises `OSError` if one cannot be started.
 
     What they print goes to `on_output`, line by line, from a thread. `progress` returns what changes whenever an
     environment begins or ends a call.
     """
 
-    def __init__(
-        self,
-        jobs: Iterable[Job],
-        on_output: Callable[[str], None],
-        progress: Callable[[], bytes],
-        start: StartProcess | None = None,
-    ) -> None:
+    def __init__(self, jobs: Iterable[Job], on_output: Callable[[str], None], progress: Callable[[], bytes]) -> None:
         self._progress = progress
         self.waiting_for: set[int] = set()
         """The workers that have not answered yet."""
@@ -48,23 +39,17 @@ class ProcessPool:
         self._output = LineReader(self._printed.line, MAX_LINE_BYTES)
         try:
             for job in jobs:
-                self._processes.append(_start_process(job, self._output.descriptor, start))
+                self._processes.append(_start_process(job, self._output.descriptor))
         except BaseException:
             self.close(grace_s=0.0)
             raise
         finally:
             self._output.close_descriptor()
 
-    def __len__(self) -> int:
-        return len(self._processes)
-
-    def send(self, worker: int, message: Message, data: bytes | None = None) -> None:
-        """Send a message, and bytes if it is one that some follow."""
-        connection = self._processes[worker].connection
+    def send(self, worker: int, message: Message) -> None:
+        """Send a message."""
         try:
-            connection.send_bytes(messages.encode(message))
-            if data is not None:
-                connection.send_bytes(data)
+            self._processes[worker].connection.send_bytes(messages.encode(message))
         except OSError:
             raise WorkerFault(worker, self._describe_death(worker, "idle")) from None
         self.waiting_for.add(worker)
@@ -109,14 +94,9 @@ class ProcessPool:
         return messages.decode_answer(content)
 
     def _describe_death(self, worker: int, doing: str) -> str:
-        try:
-            code = self._processes[worker].process.wait(timeout=5.0)
-            how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-        except subprocess.TimeoutExpired:
-            how = "it closed its connection"
-        if how == "SIGKILL":
-            how += ": the system does that when memory runs out; fewer environments (--n-envs) need less"
-        return f"worker {worker} died while {doing} ({how})"
+        how = self._processes[worker].describe_end()
+        hint = ": the system does that when memory runs out; fewer environments (--n-envs) need less"
+        return f"worker {worker} {how} while {doing}{hint if 'SIGKILL' in how else ''}"
 
     def close(self, grace_s: float) -> None:
         """End the processes; those that do not end within `grace_s` are killed. A second call does nothing."""
@@ -132,12 +112,11 @@ class ProcessPool:
         self._printed.end()
 
 
-def _start_process(job: Job, printing: int, start: StartProcess | None) -> ChildProcess:
+def _start_process(job: Job, printing: int) -> ChildProcess:
     return ChildProcess(
-        "rlctl.rollout.worker_process:main",
+        "rlctl.rollout.worker:main",
         {"job": dataclasses.asdict(job)},
         stdout=printing,
         stderr=printing,
         descriptors=(job.memory, job.numbers),
-        start=start,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import mmap
 import os
 from collections.abc import Mapping, Sequence
@@ -12,14 +13,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.dict_spaces import split_space
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.env_info import EnvInfo
 
-Fields = dict[str, tuple[tuple[int, ...], np.dtype[Any]]]
+Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
+"""Shape and dtype per name."""
 
 _ALIGNMENT = 64  # [bytes], a cache line: two workers never write one
 
 
-def observation_fields(space: spaces.Space[Any]) -> Fields:
+def observation_fields(space: spaces.Space[Any]) -> Layout:
     """Return shape and dtype per observation key; see `rlctl.dict_spaces`."""
     return {key: _leaf(part) for key, part in split_space(space).items()}
 
@@ -28,10 +31,6 @@ def _leaf(space: spaces.Space[Any]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     if space.shape is None or space.dtype is None:
         raise TypeError(f"{type(space).__name__} inside a Dict space is not supported")
     return space.shape, np.dtype(space.dtype)
-
-
-Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
-"""Shape and dtype per name."""
 
 
 def map_arrays(descriptor: int, layout: Layout) -> dict[str, NDArray[Any]]:
@@ -61,7 +60,7 @@ class SharedArrays:
         observation_space, action_space = info.spaces()
         observation, action = observation_fields(observation_space), _leaf(action_space)
         stored = np.dtype(np.float32 if isinstance(action_space, spaces.Box) else np.int64)
-        of_segment: Fields = {
+        of_segment: Layout = {
             "stored": ((max(1, int(np.prod(action[0]))),), stored),
             "action": action,
             "reward": ((), np.dtype(np.float64)),
@@ -83,23 +82,53 @@ class SharedArrays:
         when its worker dies or hangs. Step 0 is the reset; a negative step: in no call."""
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}
         """What the next action is chosen from."""
-        self.segment = SegmentArrays(arrays, list(observation))
+        self.segment = SegmentArrays(
+            {key: arrays[f"segment/observation/{key}"] for key in observation},
+            {key: arrays[f"segment/final/{key}"] for key in observation},
+            arrays["segment/stored"],
+            arrays["segment/action"],
+            arrays["segment/reward"],
+            arrays["segment/terminated"],
+            arrays["segment/truncated"],
+            arrays["segment/terms"],
+        )
 
 
+@dataclasses.dataclass(frozen=True)
 class SegmentArrays:
     """What was played last: arrays of shape (n_envs, steps, ...)."""
 
-    def __init__(self, arrays: Mapping[str, NDArray[Any]], keys: Sequence[str]) -> None:
-        self.observation = {key: arrays[f"segment/observation/{key}"] for key in keys}
-        """What each action was chosen from, and what followed the last; shape (n_envs, steps + 1, ...)."""
-        self.final = {key: arrays[f"segment/final/{key}"] for key in keys}
-        """What an episode ended with, in the row of its last step."""
-        self.stored = arrays["segment/stored"]
-        """Actions as the policy chose them: not clipped, or scaled to [-1, 1]; shape (n_envs, steps, elements)."""
-        self.action = arrays["segment/action"]
-        """Actions as the environments took them."""
-        self.reward = arrays["segment/reward"]
-        self.terminated = arrays["segment/terminated"]
-        self.truncated = arrays["segment/truncated"]
-        self.terms = arrays["segment/terms"]
-        """Raw reward terms, shape (n_envs, steps, terms), where they were to be recorded."""
+    observation: dict[str, NDArray[Any]]
+    """What each action was chosen from, and what followed the last; shape (n_envs, steps + 1, ...)."""
+    final: dict[str, NDArray[Any]]
+    """What an episode ended with, in the row of its last step."""
+    stored: NDArray[Any]
+    """Actions as the policy chose them: not clipped, or scaled to [-1, 1]; shape (n_envs, steps, elements)."""
+    action: NDArray[Any]
+    """Actions as the environments took them."""
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    terms: NDArray[np.float64]
+    """Raw reward terms, shape (n_envs, steps, terms), where they were to be recorded."""
+    ended: Sequence[EpisodeResult] = ()
+    """The episodes that ended, of `first`."""
+
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """Where an episode ended."""
+        return self.terminated | self.truncated
+
+    def first(self, steps: int, ended: Sequence[EpisodeResult]) -> SegmentArrays:
+        """Return the first steps, in which some episodes ended; the arrays are the same memory."""
+        return SegmentArrays(
+            {key: rows[:, : steps + 1] for key, rows in self.observation.items()},
+            {key: rows[:, :steps] for key, rows in self.final.items()},
+            self.stored[:, :steps],
+            self.action[:, :steps],
+            self.reward[:, :steps],
+            self.terminated[:, :steps],
+            self.truncated[:, :steps],
+            self.terms[:, :steps],
+            ended,
+        )

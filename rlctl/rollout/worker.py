@@ -1,12 +1,19 @@
-"""A few environments, and a policy that plays them; runs in a process of its own (`worker_process.py`)."""
+"""A worker: a process with a few environments, and a policy that plays them; imports no torch.
+
+The main process sends a message (`messages.py`); the worker answers once. Observations, actions, rewards, flags and a
+policy's numbers are in shared memory.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import gc
 import itertools
+import sys
 from collections.abc import Iterator
+from multiprocessing.connection import Connection
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -17,7 +24,7 @@ from rlctl.env_spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
 from rlctl.rollout import messages
 from rlctl.rollout.baselines import make_player
-from rlctl.rollout.failures import FailedInEpisode
+from rlctl.rollout.failures import FailedInEpisode, describe_failure
 from rlctl.rollout.goal_rewards import compute_answer
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
 from rlctl.rollout.returned_values import ObservationWriter
@@ -43,15 +50,15 @@ class Worker:
         self._arrays: SharedArrays
         self._writer: ObservationWriter
 
-    def answer(self, message: Message, data: bytes = b"") -> Answer:
-        """Do what is asked; `data` are the bytes that follow the message."""
+    def answer(self, message: Message) -> Answer:
+        """Do what is asked."""
         match message:
             case messages.Play():
                 return Answer(ended=self._play(message))
             case messages.BeginEpisodes():
-                return Answer(left=self._begin_episodes(message, data))
+                return Answer(left=self._begin_episodes(message))
             case messages.ComputeRewards():
-                return Answer(rewards=compute_answer(self._episodes[0].env, data))
+                return Answer(rewards=compute_answer(self._episodes[0].env, message.goals))
             case messages.Build():
                 self._build(message.spec)
                 return Answer(info=self._info)
@@ -118,17 +125,16 @@ class Worker:
         assert self._player is not None  # a policy is loaded before anything is played
         return self._player
 
-    def _begin_episodes(self, message: messages.BeginEpisodes, data: bytes) -> list[int]:
+    def _begin_episodes(self, message: messages.BeginEpisodes) -> list[int]:
         """Begin episodes and take the steps that led to where they were; return the environments that left them."""
         row = self._arrays.segment.action[0, 0]
-        actions = np.frombuffer(data, row.dtype).reshape(-1, *row.shape)
-        left, first = [], 0
-        for env, seed, steps in message.episodes:
+        left = []
+        for env, (seed, data) in message.episodes.items():
             episode = self._episodes[env - self._job.first]
             try:
                 with self._within(episode):
                     self._begin(episode, seed)
-                    if self._repeat(episode, actions[first : first + steps]):
+                    if self._repeat(episode, np.frombuffer(data, row.dtype).reshape(-1, *row.shape)):
                         left.append(env)
             except FailedInEpisode as failure:
                 if not message.may_fail:
@@ -136,7 +142,6 @@ class Worker:
                 # It did not fail the first time, so its state differs now: it may begin its next episode.
                 left.append(env)
                 write_stderr(f"{failure} when it was replayed")
-            first += steps
         return left
 
     def _begin(self, episode: RunningEpisode, seed: int) -> None:
@@ -253,3 +258,32 @@ def _training_seeds(run_seed: int, env: int, episode: int) -> Iterator[int]:
     """Yield the seeds of an environment's training episodes, from a number on."""
     for number in itertools.count(episode):
         yield EpisodeAddress(run_seed, Stream.TRAIN, env, number).seed
+
+
+def main(connection: Connection, job: dict[str, Any]) -> None:
+    """Answer messages until the connection closes."""
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # lines are forwarded at once
+    try:
+        _serve(connection, Worker(messages.Job(**job)))
+    except (BrokenPipeError, ConnectionResetError):  # the main process needs no more answers
+        return
+    except OSError as error:
+        reason = error.strerror
+        write_stderr(
+            f"no connection to rlctl any more ({reason}): did an environment close a file descriptor of rlctl?"
+        )
+        sys.exit(1)
+
+
+def _serve(connection: Connection, worker: Worker) -> None:
+    while True:
+        try:
+            message = messages.decode(connection.recv_bytes())
+        except (EOFError, ConnectionResetError):
+            break
+        try:
+            answer = worker.answer(message)
+        except BaseException as error:
+            answer = messages.Answer(failure=describe_failure(error))
+        connection.send_bytes(messages.encode(answer))
+    worker.close()

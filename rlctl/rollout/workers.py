@@ -24,7 +24,6 @@ from rlctl.rollout.failures import format_hint, make_error
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
 from rlctl.rollout.policy_numbers import PolicyNumbers
 from rlctl.rollout.process_pool import ProcessPool, WorkerFault
-from rlctl.rollout.process_start import StartProcess
 from rlctl.rollout.shared_arrays import SharedArrays
 from rlctl.rollout.worker_output import write_stderr
 from rlctl.run.env_info import EnvInfo
@@ -43,8 +42,7 @@ class Workers:
     Building starts at once and is waited for by the first use, so that a caller can do its own slow imports
     meanwhile. Errors in an environment raise `TaskError` with the episode's seed and step; a worker that dies or
     does not answer within `timeout_s` does too. After an error the workers are gone. What environments print goes to
-    `on_output`, line by line, from a thread; without it to stderr. `start` starts a process as `subprocess.Popen`
-    does; without it `process_start.default_start()` does.
+    `on_output`, line by line, from a thread; without it to stderr.
     """
 
     def __init__(
@@ -55,7 +53,6 @@ class Workers:
         n_workers: int | None = None,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         on_output: Callable[[str], None] | None = None,
-        start: StartProcess | None = None,
     ) -> None:
         self.n_envs = n_envs
         self.timeout_s = timeout_s
@@ -70,7 +67,7 @@ class Workers:
         self._ready = False
         jobs = [messages.Job(self._memory, self._numbers_memory, low, high - low, n_envs) for low, high in self._ranges]
         try:
-            self._pool = ProcessPool(jobs, on_output or write_stderr, self._read_progress, start)
+            self._pool = ProcessPool(jobs, on_output or write_stderr, self._read_progress)
         except BaseException as error:
             self._close_memory()
             if isinstance(error, OSError):
@@ -168,9 +165,8 @@ class Workers:
     ) -> set[int]:
         dtype = self.arrays.segment.action.dtype
         for worker, envs in self._by_worker(episodes).items():
-            heads = [(env, episodes[env][0], len(episodes[env][1])) for env in envs]
-            data = b"".join(episodes[env][1].astype(dtype).tobytes() for env in envs)
-            self._send(worker, messages.BeginEpisodes(heads, may_fail), data)
+            begun = {env: (episodes[env][0], episodes[env][1].astype(dtype).tobytes()) for env in envs}
+            self._send(worker, messages.BeginEpisodes(begun, may_fail))
         return {env for answer in self._wait(doing).values() for env in answer.left}
 
     def set_policy(self, info: PolicyInfo, tensors: Mapping[str, NDArray[Any]]) -> None:
@@ -222,7 +218,7 @@ class Workers:
         does not return n finite numbers.
         """
         self._wait_until_built()
-        self._send(0, messages.ComputeRewards(), goal_rewards.encode_request(achieved, desired))
+        self._send(0, messages.ComputeRewards(goal_rewards.encode_request(achieved, desired)))
         return np.array(self._wait("in compute_reward")[0].rewards, np.float64)
 
     def _by_worker(self, envs: Iterable[int]) -> dict[int, list[int]]:
@@ -236,9 +232,9 @@ class Workers:
             self._send(worker, message)
         return self._wait(doing)
 
-    def _send(self, worker: int, message: Message, data: bytes | None = None) -> None:
+    def _send(self, worker: int, message: Message) -> None:
         try:
-            self._pool.send(worker, message, data)
+            self._pool.send(worker, message)
         except WorkerFault as fault:
             self._fail(self._name_episode(fault))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,15 +11,15 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.her import HerReplayBuffer
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.workers import Workers
 from rlctl.run.env_info import EnvInfo
-from rlctl.run.stages import Stage, format_title
+from rlctl.run.stages import Promotion, Stage, format_title
 from rlctl.train.display import percent
-from rlctl.train.hindsight import HindsightBuffer
 from rlctl.train.progress import Progress
 
 
@@ -46,9 +47,9 @@ class Curriculum:
         return self._progress.stage
 
     @property
-    def spec(self) -> EnvSpec:
-        """What the environments of the present stage are made from."""
-        return self._specs[max(self.number, 1) - 1]
+    def _rule(self) -> Promotion | None:
+        """When the present stage is over; None for the last."""
+        return self.stages[self.number - 1].promote if self.stages else None
 
     @property
     def title(self) -> str:
@@ -65,7 +66,7 @@ class Curriculum:
 
     def count(self, ended: Sequence[EpisodeResult]) -> None:
         """Take note of training episodes of the present stage, in the order in which they ended."""
-        rule = self.stages[self.number - 1].promote if self.stages else None
+        rule = self._rule
         if rule is None:
             return
         if rule.success is not None:
@@ -76,7 +77,7 @@ class Curriculum:
 
     def measured(self) -> float | None:
         """Return the success rate or mean return that the rule looks at; None while its window is not full."""
-        rule = self.stages[self.number - 1].promote if self.stages else None
+        rule = self._rule
         values = self._progress.stage_episodes
         if rule is None or len(values) < rule.window:
             return None
@@ -86,7 +87,7 @@ class Curriculum:
     def is_due(self, steps: int) -> bool:
         """Say whether the present stage is done, after `steps` environment steps of training."""
         measured = self.measured()
-        rule = self.stages[self.number - 1].promote if self.stages else None
+        rule = self._rule
         if rule is None or measured is None:
             return False
         return steps - self._progress.stage_began >= rule.min_steps and measured >= rule.threshold
@@ -97,7 +98,7 @@ class Curriculum:
 
     def enter_next_stage(self, steps: int) -> tuple[str, str]:
         """Enter the next stage; return its title and why it begins."""
-        rule, measured = self.stages[self.number - 1].promote, self.measured()
+        rule, measured = self._rule, self.measured()
         assert rule is not None  # else nothing would be due
         assert measured is not None
         reason = f"success {percent(measured)}" if rule.success is not None else f"return {measured:.2f}"
@@ -107,7 +108,7 @@ class Curriculum:
 
     def warning(self) -> str | None:
         """Return, once, what is wrong with a rule that nothing can fulfil."""
-        rule = self.stages[self.number - 1].promote if self.stages else None
+        rule = self._rule
         values = self._progress.stage_episodes
         if rule is None or self._warned or len(values) < rule.window or any(each is not None for each in values):
             return None
@@ -152,14 +153,14 @@ def begin_next_episodes(model: BaseAlgorithm) -> None:
         _cut_episodes(model.replay_buffer)
     model._last_obs = env.reset()
     model._last_episode_starts = np.ones(env.num_envs, np.bool_)
-    if (normalizer := model.get_vec_normalize_env()) is not None:
-        model._last_original_obs = normalizer.get_original_obs()
 
 
 def _cut_episodes(buffer: ReplayBuffer) -> None:
     """Mark the running episodes as cut short but not over: no return, and no goal, reaches into the next stage."""
-    if isinstance(buffer, HindsightBuffer):
-        buffer.truncate_last_trajectory()
+    if isinstance(buffer, HerReplayBuffer):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # SB3 warns of the very thing
+            buffer.truncate_last_trajectory()
         return
     last = buffer.pos - 1
     running = buffer.dones[last] == 0.0  # the others have ended by themselves

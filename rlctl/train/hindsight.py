@@ -6,13 +6,11 @@ In a curriculum, exchanged goals are rewarded as the present stage does, whichev
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples
-from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
 from rlctl.errors import RecipeError
@@ -33,8 +31,8 @@ def replay_arguments(recipe: Recipe, her: Hindsight, env: EnvInfo) -> dict[str, 
     steps = (env.max_steps or 0) * recipe.n_envs
     _check_room(recipe, steps)
     return {
-        "replay_buffer_class": HindsightBuffer,
-        "replay_buffer_kwargs": {**her.model_dump(), "episode_steps": env.max_steps},
+        "replay_buffer_class": HerReplayBuffer,
+        "replay_buffer_kwargs": her.model_dump(),
         "learning_starts": max(_LEARNING_STARTS, steps),
     }
 
@@ -78,41 +76,14 @@ def _no_room(size: int, n_envs: int, what_will_do: str) -> str:
     )
 
 
-class HindsightBuffer(HerReplayBuffer):
-    """SB3's buffer, whose error says what to change where it has no whole episode to learn from.
-
-    `episode_steps` are the most that an episode has, None if that is not known.
-    """
-
-    def __init__(self, *args: Any, episode_steps: int | None = None, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._episode_steps = episode_steps
-
-    def sample(  # type: ignore[override]  # as SB3's own
-        self, batch_size: int, env: VecNormalize | None = None
-    ) -> DictReplayBufferSamples:
-        """Return a batch, part of it with goals that were reached; raises `RecipeError` if no episode is whole yet."""
-        try:
-            return super().sample(batch_size, env)
-        except RuntimeError as error:
-            if (self.ep_length > 0).any():
-                raise
-            raise self._no_episode() from error
-
-    def _no_episode(self) -> RecipeError:
-        if self.full:
-            advice = f"give it twice the steps of an episode, times {self.n_envs}"
-            return RecipeError(_no_room(self.buffer_size * self.n_envs, self.n_envs, advice))
-        advice = f"give it the steps of an episode, times {self.n_envs} environments"
-        if self._episode_steps is not None:
-            advice = f"{self._episode_steps * self.n_envs} will do"
-        return RecipeError(
-            f"algo_kwargs.learning_starts: learning began after {self.pos * self.n_envs} steps, before an episode was "
-            f"over, and hindsight learns from whole ones; {advice}"
+def has_whole_episode(buffer: ReplayBuffer) -> bool:
+    """Say whether there is one to learn from, if it is a buffer for hindsight; raises `RecipeError` if none can be."""
+    if not isinstance(buffer, HerReplayBuffer) or (buffer.ep_length > 0).any():
+        return True
+    if buffer.full:
+        size, advice = (
+            buffer.buffer_size * buffer.n_envs,
+            f"give it twice the steps of an episode, times {buffer.n_envs}",
         )
-
-    def truncate_last_trajectory(self) -> None:
-        """End the running episodes here, as a time limit would, so that none goes on with what comes next."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # SB3 warns of the very thing
-            super().truncate_last_trajectory()
+        raise RecipeError(_no_room(size, buffer.n_envs, advice))
+    return False

@@ -8,12 +8,14 @@ import numpy as np
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from rlctl.dict_spaces import join, split_space
+from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.run.acting import Exploration
 from rlctl.run.network import DETERMINISTIC
 from rlctl.run.recipe import Recipe
+from rlctl.train.hindsight import has_whole_episode
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, to_network_layout
-from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
+from rlctl.train.vec_env import WorkerVecEnv
 
 _LONGEST = 1000
 """Steps after which an episode without a time limit is stored in parts."""
@@ -62,12 +64,12 @@ class OffPolicyRollouts(Rollouts):
         while True:
             segment = self.env.finish(check)
             self._store(segment)
-            self._episodes_left -= len(segment.infos)
+            self._episodes_left -= len(segment.ended)
             if self._episodes_left <= 0:
                 return
             self._start_episode()
 
-    def _store(self, segment: PlayedSegment) -> None:
+    def _store(self, segment: SegmentArrays) -> None:
         """Put a chunk into the replay buffer, raw, and do what SB3 does after each step."""
         model, spaces = self.model, split_space(self.model.observation_space)
         observation = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.observation.items()}
@@ -87,16 +89,15 @@ class OffPolicyRollouts(Rollouts):
             model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
             model._on_step()
         self._progress.steps_to_learn += done.size
-        model._episode_num += len(segment.infos)
+        model._episode_num += len(segment.ended)
         self.update_reward_statistics(segment)
         self.finish_segment(segment)
-        model._last_original_obs = segment.last_observation
 
     def learn(self) -> None:
-        """Do the updates that are due for the last chunk."""
+        """Do the updates that are due for the last chunk; with hindsight none before the first episode is over."""
         model = self.model
         steps, self._progress.steps_to_learn = self._progress.steps_to_learn, 0
-        if steps and model.num_timesteps > model.learning_starts:
+        if steps and model.num_timesteps > model.learning_starts and has_whole_episode(model.replay_buffer):
             updates = model.gradient_steps if model.gradient_steps >= 0 else steps
             if updates > 0:
                 self._learner.train(batch_size=model.batch_size, gradient_steps=updates)

@@ -13,12 +13,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.run.policy import PolicyInfo
 from rlctl.run.recipe import Recipe
 from rlctl.train.pack import observation_statistics, pack
 from rlctl.train.progress import Progress
 from rlctl.train.updates import choose_learner
-from rlctl.train.vec_env import PlayedSegment, WorkerVecEnv
+from rlctl.train.vec_env import WorkerVecEnv
 
 Check = Callable[[], None]
 """Called several times a second while workers play; may raise to leave."""
@@ -91,7 +93,7 @@ class Rollouts(abc.ABC):
             state[:, 0], state[:, 1] = (part.cpu().numpy().transpose(1, 0, 2) for part in last)
             state[np.asarray(model._last_episode_starts)] = 0.0
 
-    def update_reward_statistics(self, segment: PlayedSegment) -> NDArray[np.float32]:
+    def update_reward_statistics(self, segment: SegmentArrays) -> NDArray[np.float32]:
         """Take the returns of a segment into account, and return its rewards divided by their deviation."""
         normalizer = self.model.get_vec_normalize_env()
         rewards = segment.reward
@@ -106,16 +108,22 @@ class Rollouts(abc.ABC):
         normalized: NDArray[np.float32] = normalizer.normalize_reward(rewards).astype(np.float32)
         return normalized
 
-    def finish_segment(self, segment: PlayedSegment) -> None:
-        """Take the observations of a stored segment into account, and remember where it ended."""
+    def finish_segment(self, segment: SegmentArrays) -> None:
+        """Take the observations of a stored segment into account, and remember which episodes it ended."""
         model = self.model
         for key, rms in observation_statistics(model.get_vec_normalize_env()).items():
             rows = segment.observation[key][:, 1:]
             rms.update(rows.reshape(-1, *rows.shape[2:]))
-        model._last_obs = segment.last_observation
         model._last_episode_starts = segment.done[:, -1]
-        model._update_info_buffer(segment.infos, np.ones(len(segment.infos), np.bool_))
+        infos = [_info_at_end(each) for each in segment.ended]
+        model._update_info_buffer(infos, np.ones(len(infos), np.bool_))
         model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
+
+
+def _info_at_end(result: EpisodeResult) -> dict[str, Any]:
+    """Return what SB3 expects in an episode's last info."""
+    success = {} if result.success is None else {"is_success": result.success}
+    return {"episode": {"r": result.total_reward, "l": result.length, "t": 0.0}, **success}
 
 
 def to_network_layout(rows: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:

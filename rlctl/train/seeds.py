@@ -5,23 +5,24 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from rlctl import output, registry
 from rlctl.errors import Interrupted, RlctlError, UsageError
 from rlctl.eval.evaluate import EvalRequest
 from rlctl.eval.group import GroupScore, as_json, evaluate_group
-from rlctl.rollout.child_process import LineReader
-from rlctl.rollout.process_start import Process, default_start
+from rlctl.rollout.child_process import LineReader, start_process
 from rlctl.rollout.workers import available_cores
 from rlctl.run import files
 from rlctl.run.group import Group, create_group, parse_seeds, read_group
@@ -32,7 +33,6 @@ from rlctl.train.warm_start import find_source
 
 CORES_PER_TRAINING = 2
 """One plays while the other learns, in turn or side by side."""
-_POLL_S = 0.1
 
 
 class SeedsFailed(RlctlError):
@@ -75,7 +75,7 @@ def train_seeds(
     options = [] if seeds is not None else list_options(request)
     waiting = [seed for seed in group.seeds if not group.is_done(seed) or options]
     jobs = _choose_jobs(group, len(waiting), jobs)
-    failed = _Trainings({seed: _make_command(group, seed, options) for seed in waiting}, jobs).run(group)
+    failed = _Trainings(jobs).run({seed: _make_command(group, seed, options) for seed in waiting}, group.path)
     score = evaluate_group(group, EvalRequest(None, episodes=episodes))
     files.write_json(group.scores_file, as_json(score))
     return SeedsResult(score, failed)
@@ -141,47 +141,60 @@ def _make_command(group: Group, seed: int, options: Sequence[str]) -> list[str]:
 
 
 class _Trainings:
-    """Processes that train a seed each, some of them at a time."""
+    """Processes that train a seed each, some of them at a time, and each of these with its share of the cores."""
 
-    def __init__(self, commands: Mapping[int, list[str]], jobs: int) -> None:
-        self._waiting = dict(commands)
-        self._running: dict[int, tuple[int, Process]] = {}  # per place: seed and process
-        self._failed: dict[int, int] = {}
+    def __init__(self, jobs: int) -> None:
         self._jobs = jobs
-        self._signals: list[int] = []
-        self._readers: list[LineReader] = []
+        self._places = itertools.count()
+        self._running: set[int] = set()  # by process id
+        self._stopped_by: int | None = None
 
-    def run(self, group: Group) -> dict[int, int]:
-        """Train all; return the exit code of each seed that failed."""
-        first = None
-        with self._take_signals():
-            while self._running or (self._waiting and first is None):
-                while self._signals:
-                    number = self._signals.pop(0)
-                    first = first or number
-                    for _, process in self._running.values():
-                        with contextlib.suppress(ProcessLookupError):
-                            os.kill(process.pid, number)
-                if first is None:
-                    self._start_next()
-                self._take_ended()
-                time.sleep(_POLL_S)
-        for reader in self._readers:
-            reader.wait()
-        if first is not None:
-            raise Interrupted(f"interrupted; go on with: rlctl train --resume {group.path}", first)
-        return self._failed
+    def run(self, commands: Mapping[int, list[str]], group: Path) -> dict[int, int]:
+        """Train all; return the exit code of each seed that failed. Raises `Interrupted` after a signal."""
+        with self._pass_signals_on(), ThreadPoolExecutor(self._jobs, initializer=self._take_cores) as pool:
+            codes = list(pool.map(self._train, commands, commands.values()))
+        if self._stopped_by is not None:
+            raise Interrupted(f"interrupted; go on with: rlctl train --resume {group}", self._stopped_by)
+        return {seed: code for seed, code in zip(commands, codes, strict=True) if code}
+
+    def _take_cores(self) -> None:
+        """Let what this thread starts use its share of the cores, from which it also takes its number of workers."""
+        place = next(self._places)
+        if self._jobs > 1 and hasattr(os, "sched_setaffinity"):
+            cores = sorted(os.sched_getaffinity(0))
+            share = max(1, len(cores) // self._jobs)
+            first = place * share % len(cores)
+            os.sched_setaffinity(0, cores[first : first + share])
+
+    def _train(self, seed: int, arguments: Sequence[str]) -> int:
+        """Train a seed; return its exit code."""
+        if self._stopped_by is not None:
+            return 0
+        reader = LineReader(functools.partial(_print_line, seed))
+        process = start_process(
+            [sys.executable, "-m", "rlctl", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=reader.descriptor,
+            process_group=0,  # which a terminal's Ctrl-C does not reach: signals are passed on, once each
+        )
+        self._running.add(process.pid)
+        reader.close_descriptor()
+        if self._stopped_by is not None:  # meanwhile
+            os.kill(process.pid, self._stopped_by)
+        code = process.wait()
+        self._running.discard(process.pid)
+        reader.wait()
+        return code if code >= 0 else 128 - code
 
     @contextlib.contextmanager
-    def _take_signals(self) -> Iterator[None]:
-        # They are passed on by the loop, once each: the processes have groups of their own, which a terminal's Ctrl-C
-        # does not reach.
+    def _pass_signals_on(self) -> Iterator[None]:
         if threading.current_thread() is not threading.main_thread():
             yield
             return
         numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
         before = {
-            each: signal.signal(each, lambda number, _: self._signals.append(number))
+            each: signal.signal(each, self._handle)
             for each in numbers
             if signal.getsignal(each) != signal.SIG_IGN or each == signal.SIGINT
         }
@@ -191,49 +204,12 @@ class _Trainings:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    def _start_next(self) -> None:
-        for place in range(self._jobs):
-            if place in self._running or not self._waiting:
-                continue
-            seed = next(iter(self._waiting))
-            arguments = self._waiting.pop(seed)
-            with _share_of_cores(place, self._jobs):
-                reader = LineReader(functools.partial(_print_line, seed))
-                process = default_start()(
-                    [sys.executable, "-m", "rlctl", *arguments],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=reader.descriptor,
-                    process_group=0,
-                )
-            reader.close_descriptor()
-            self._running[place] = seed, process
-            self._readers.append(reader)
-
-    def _take_ended(self) -> None:
-        for place, (seed, process) in list(self._running.items()):
-            code = process.poll()
-            if code is not None:
-                del self._running[place]
-                if code:
-                    self._failed[seed] = code if code > 0 else 128 - code
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self._stopped_by = self._stopped_by or number
+        for process in list(self._running):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, number)
 
 
 def _print_line(seed: int, line: str) -> None:
     print(f"seed {seed}: {line}", file=sys.stderr, flush=True)
-
-
-@contextlib.contextmanager
-def _share_of_cores(place: int, jobs: int) -> Iterator[None]:
-    """Let what is started meanwhile use its share of the cores only, from which it also takes its number of workers."""
-    if jobs == 1 or not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    cores = sorted(os.sched_getaffinity(0))
-    share = max(1, len(cores) // jobs)
-    first = place * share % len(cores)
-    os.sched_setaffinity(0, cores[first : first + share])
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)

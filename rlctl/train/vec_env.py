@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,43 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from rlctl.dict_spaces import join
 from rlctl.errors import EpisodeFailed
 from rlctl.rollout.history import ActionHistory
 from rlctl.rollout.messages import EpisodeResult, Play, Segment
 from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
 from rlctl.train.space_monitor import SpaceMonitor
-
-
-@dataclasses.dataclass(frozen=True)
-class PlayedSegment:
-    """What all environments did in some steps; arrays of shape (n_envs, steps, ...), in shared memory."""
-
-    observation: dict[str, NDArray[Any]]
-    """One row more than steps: what followed the last."""
-    final: dict[str, NDArray[Any]]
-    """What an episode ended with, in the row of its last step."""
-    stored: NDArray[Any]
-    """Actions as the policy chose them."""
-    action: NDArray[Any]
-    """Actions as the environments took them."""
-    reward: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-    infos: list[dict[str, Any]]
-    """As SB3 has them at the end of an episode."""
-
-    @property
-    def done(self) -> NDArray[np.bool_]:
-        """Where an episode ended."""
-        return self.terminated | self.truncated
-
-    @property
-    def last_observation(self) -> Any:
-        """A copy of what followed the last step, shape (n_envs, ...)."""
-        return join({key: rows[:, -1].copy() for key, rows in self.observation.items()})
 
 
 class WorkerVecEnv(VecEnv):
@@ -58,12 +28,12 @@ class WorkerVecEnv(VecEnv):
         self.run_seed = run_seed
         self.episodes_started = [0] * workers.n_envs
         """Per environment, how many episodes have begun: the next one's number."""
-        self.history = ActionHistory(workers.n_envs)
+        self.history = ActionHistory(workers.arrays.segment.action[:, :0])
         """What was done in the running episodes."""
         self.monitor = SpaceMonitor(workers.info.spaces()[0])
         self.ended: list[EpisodeResult] = []
         """Episodes that ended since the last `take_ended`."""
-        self.last_segment: PlayedSegment | None = None
+        self.last_segment: SegmentArrays | None = None
         """What `finish` returned last; its arrays are overwritten by the next."""
         self.waited_s = 0.0
         """Time spent waiting for the environments to play [s], since it was set to 0."""
@@ -81,7 +51,7 @@ class WorkerVecEnv(VecEnv):
             error.actions = []
             raise
         self.episodes_started = [number + 1 for number in self.episodes_started]
-        self.history = ActionHistory(self.num_envs)
+        self.history = ActionHistory(self.workers.arrays.segment.action[:, :0])
         return self.workers.observations()
 
     def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
@@ -93,7 +63,7 @@ class WorkerVecEnv(VecEnv):
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
         ended = self.workers.replay_actions(dict(enumerate(zip(seeds, actions, strict=True))), may_fail=True)
-        self.history = ActionHistory.of_episodes(actions, self.workers.arrays.segment.action[:, 0])
+        self.history = ActionHistory(actions)
         return ended
 
     def start(self, steps: int, exploration: Exploration, *, until_end: bool = False) -> None:
@@ -103,7 +73,7 @@ class WorkerVecEnv(VecEnv):
         going_on = dict.fromkeys(range(self.num_envs), -1)
         self.workers.start_playing(Play(segment, going_on, dict(enumerate(self.episodes_started)), self.run_seed))
 
-    def finish(self, check: Callable[[], None] | None = None) -> PlayedSegment:
+    def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
         """Wait for what `start` has begun; `check` is called several times a second."""
         began = time.monotonic()
         try:
@@ -120,16 +90,7 @@ class WorkerVecEnv(VecEnv):
         self.ended += ended
         seen = {key: rows[:, 1 : steps + 1].reshape(-1, *rows.shape[2:]) for key, rows in segment.observation.items()}
         self.monitor.look(seen)
-        self.last_segment = PlayedSegment(
-            {key: rows[:, : steps + 1] for key, rows in segment.observation.items()},
-            {key: rows[:, :steps] for key, rows in segment.final.items()},
-            segment.stored[:, :steps],
-            segment.action[:, :steps],
-            segment.reward[:, :steps],
-            segment.terminated[:, :steps],
-            segment.truncated[:, :steps],
-            [_info_at_end(result) for result in ended],
-        )
+        self.last_segment = segment.first(steps, ended)
         return self.last_segment
 
     def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any] | None:
@@ -174,10 +135,3 @@ class WorkerVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         return [False for _ in self._get_indices(indices)]
-
-
-def _info_at_end(result: EpisodeResult) -> dict[str, Any]:
-    info: dict[str, Any] = {"episode": {"r": result.total_reward, "l": result.length, "t": 0.0}}
-    if result.success is not None:
-        info["is_success"] = result.success
-    return info

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from rlctl.rollout.process_start import set_default_start
+from rlctl.rollout.child_process import set_start
 from tests.crash import outside_changes
 from tests.crash.faulty_os import FaultyOs, FaultyShutil
 
@@ -19,7 +19,7 @@ def run(arguments, plan):
         # One core, one worker: a trial is a matter of less than a second.
         os.sched_setaffinity(0, {plan["core"]})
     if plan.get("real_workers"):
-        set_default_start(subprocess.Popen)
+        set_start(subprocess.Popen)
     from rlctl.run import files
     from rlctl.train import saving
 

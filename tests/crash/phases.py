@@ -12,10 +12,10 @@ import rlctl.train.evaluation
 import rlctl.train.loop
 import rlctl.train.status
 import rlctl.train.vec_env
-from rlctl.rollout import process_start
+from rlctl.rollout import child_process
 
 PHASES = {
-    "workers start": (process_start, "default_start", 1),
+    "workers start": (child_process, "start_process", 1),
     "workers build": (rlctl.rollout.workers.Workers, "info", 1),
     "run folder": (rlctl.train.status, "write_start", 1),
     "first rollout": (rlctl.train.vec_env.WorkerVecEnv, "finish", 1),

@@ -1,9 +1,11 @@
+import subprocess
 from pathlib import Path
 
 import psutil
 import pytest
 
 from rlctl.env_spec import EnvSpec
+from rlctl.rollout.child_process import set_start
 from rlctl.rollout.workers import Workers
 from tests import fork_server
 
@@ -32,6 +34,14 @@ def start():
     yield make
     for workers in started:
         workers.close()
+
+
+@pytest.fixture
+def fresh_interpreters():
+    """Start workers as a user's process does, and not as forks of a warm one."""
+    set_start(subprocess.Popen)
+    yield
+    set_start(fork_server.start)
 
 
 @pytest.fixture

@@ -72,7 +72,7 @@ def test_rebuilt_environments_answer(spec, start, goals):
         ("number", "compute_reward returned shape () for 7 goals at once, not (7,)"),
         ("nan", "compute_reward is nan for achieved [2. 2. 2.], desired [0. 0. 0.]"),
         ("text", "compute_reward returned an array of <U32, not of numbers"),
-        ("_exit", "worker 0 died while in compute_reward (exit code 4)\nit ran the environments 0 to 1"),
+        ("_exit", "worker 0 ended with exit code 4 while in compute_reward\nit ran the environments 0 to 1"),
     ],
 )
 def test_a_fault_names_compute_reward(spec, start, fault, message):

@@ -21,14 +21,14 @@ SEGMENT = messages.Segment(40, Exploration(stochastic=True, epsilon=0.5), until_
         messages.Build(SPEC),
         messages.SetEvents(SPEC, {"every_s": 0.5}),
         messages.Attach(40),
-        messages.BeginEpisodes([(0, 2**31 - 1, 3)], may_fail=True),
+        messages.BeginEpisodes({0: (2**31 - 1, bytes(range(256)))}, may_fail=True),
         messages.LoadPolicy(
             PolicyInfo(algo="ppo", policy="MlpPolicy", env=ENV, spec=EnvSpec("reach")), [("a", [2, 3], "float32")]
         ),
         messages.LoadPolicy(other="zero"),
         messages.LimitActions({"low": [-math.inf]}),
         messages.Play(SEGMENT, {0: -1, 3: 7}, {0: 5}, run_seed=3),
-        messages.ComputeRewards(),
+        messages.ComputeRewards(b"\xff\n"),
     ],
     ids=lambda message: type(message).__name__,
 )

@@ -1,7 +1,6 @@
 """Environments in worker processes: the same bits on any number of them, every kind of space, all output forwarded."""
 
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -103,6 +102,7 @@ def test_without_a_listener_prints_go_to_stderr(spec, start, capfd):
     assert sorted(err.splitlines()) == ["hello from its child", "hello from the environment"]
 
 
+@pytest.mark.usefixtures("fresh_interpreters")
 def test_workers_import_no_learning_library(spec, start, tmp_path):
     module = tmp_path / "spy_env.py"
     module.write_text(
@@ -114,7 +114,7 @@ def test_workers_import_no_learning_library(spec, start, tmp_path):
         "        return super().reset(**options)\n"
     )
     lines = []
-    workers = start(EnvSpec(f"{module}:Spy"), 1, on_output=lines.append, start=subprocess.Popen)
+    workers = start(EnvSpec(f"{module}:Spy"), 1, on_output=lines.append)
     workers.reset({0: 0})
     workers.close()
     loaded = set(lines[0].split())
@@ -122,14 +122,15 @@ def test_workers_import_no_learning_library(spec, start, tmp_path):
     assert not loaded & {"torch", "stable_baselines3", "sb3_contrib", "rerun", "onnxruntime", "rich", "typer"}
 
 
+@pytest.mark.usefixtures("fresh_interpreters")
 def test_nothing_is_left_open(spec):
-    Workers(spec("Walk"), 1, start=subprocess.Popen).close()
+    Workers(spec("Walk"), 1).close()
     process = psutil.Process()
     files, threads = process.num_fds(), threading.active_count()
-    with Workers(spec("Walk"), 2, n_workers=1, start=subprocess.Popen) as workers:
+    with Workers(spec("Walk"), 2, n_workers=1) as workers:
         workers.replay_actions({0: still(0, 1), 1: still(1, 1)})
     del workers
-    workers = Workers(spec("Walk"), 1, start=subprocess.Popen)
+    workers = Workers(spec("Walk"), 1)
     workers.close()  # before it was used
     workers.close()
     del workers
@@ -151,10 +152,11 @@ def test_a_misspelt_parameter_keeps_its_kind_of_error(spec, start):
         _ = workers.info
 
 
+@pytest.mark.usefixtures("fresh_interpreters")
 def test_paths_of_this_process_are_those_of_its_workers(start, tmp_path, monkeypatch):
     (tmp_path / "only_here.py").write_text("from tests.rollout.envs import Walk as Here\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    workers = start(EnvSpec("only_here:Here"), 1, start=subprocess.Popen)
+    workers = start(EnvSpec("only_here:Here"), 1)
     workers.reset({0: 0})
     assert workers.info.action_space["shape"] == [2]
 

@@ -34,7 +34,7 @@ def only_run(tmp_path):
     ("fault", "message"),
     [
         ("raise", "RuntimeError: the gripper fell off"),
-        pytest.param("out of memory", "worker 0 died while stepping (SIGKILL: ", marks=pytest.mark.slow),
+        pytest.param("out of memory", "worker 0 was killed by SIGKILL while stepping: ", marks=pytest.mark.slow),
         pytest.param("sleep", "no answer for 3 s while stepping", marks=pytest.mark.slow),
     ],
 )

@@ -47,11 +47,11 @@ ENDS = {
     "unprintable": "Unprintable: (message unavailable: ZeroDivisionError)",
     "exit": "SystemExit: 0",
     "nan reward": "ValueError: reward is nan",
-    "_exit": "worker 1 died while stepping (exit code 0)",
-    "segfault": "worker 1 died while stepping (SIGSEGV)",
-    "abort": "worker 1 died while stepping (SIGABRT)",
-    "out of memory": "worker 1 died while stepping (SIGKILL: the system does that when memory runs out; "
-    "fewer environments (--n-envs) need less)",
+    "_exit": "worker 1 ended with exit code 0 while stepping",
+    "segfault": "worker 1 was killed by SIGSEGV while stepping",
+    "abort": "worker 1 was killed by SIGABRT while stepping",
+    "out of memory": "worker 1 was killed by SIGKILL while stepping: the system does that when memory runs out; "
+    "fewer environments (--n-envs) need less",
 }
 HANGS = ("stopped", "endless", "sleep")
 QUICK = ("raise", "out of memory")
@@ -96,7 +96,7 @@ def test_a_reset_that_hangs(fail):
 
 def test_connections_closed_by_the_environment(fail, capfd):
     error, _ = fail(fault="closes files")
-    assert "worker 1 died while " in str(error)
+    assert "worker 1 ended with exit code 1 while " in str(error)
     assert "did an environment close a file descriptor of rlctl?" in capfd.readouterr().err
 
 
