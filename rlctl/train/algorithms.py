@@ -37,7 +37,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         raise RecipeError(f"{recipe.algo} cannot be used here: it has no network for {kind}")
     check_spaces(recipe.algo, env.observation_space, env.action_space)
     _check_rollout(recipe, env.num_envs)
-    footprint.check(recipe, env.observation_space, env.action_space, env.num_envs)
+    footprint.check(recipe, env)
     keep_compiler_out()
     try:
         model: BaseAlgorithm = cls(
@@ -80,10 +80,7 @@ def _check_device(device: str) -> None:
     # SB3 silently takes the CPU where there is no GPU.
     if device == "auto":
         return
-    try:
-        requested = torch.device(device)
-    except RuntimeError:
-        raise UsageError(f"--device {device!r}: no such device; give cpu, cuda, cuda:1, or auto") from None
+    requested = torch.device(device)
     if requested.type == "cuda" and (requested.index or 0) >= torch.cuda.device_count():
         raise UsageError(
             f"--device {device}: torch sees {torch.cuda.device_count()} CUDA devices here; use cpu or auto"

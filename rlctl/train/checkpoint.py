@@ -87,7 +87,7 @@ class Checkpoints:
     def save(self, packed: tuple[PolicyInfo, Tensors], progress: Progress) -> Path:
         """Write a checkpoint of the present boundary and remove the oldest; return its folder.
 
-        Raises `OSError` if the disk does not take it, and `DivergedError` if a number in it is not finite.
+        Raises `OSError` if the disk does not take it.
         """
         target = self._run.checkpoint(self._model.num_timesteps)
         tensors, plain = snapshot.take(self._model)
@@ -145,8 +145,8 @@ class Checkpoints:
             mismatch = _restore_environments(self._env, tensors)
         except (ArtifactError, KeyError) as error:
             raise ArtifactError(f"{checkpoint.folder}: {error}") from None
-        if (normalizer := model.get_vec_normalize_env()) is not None:
-            normalizer.old_obs = self._env.workers.observations()
+        # That there is one keeps SB3 from a reset; nothing else is done with it.
+        model._last_obs = self._env.workers.observations()
         if mismatch is not None:
             begin_next_episodes(model)
             if self._replay is not None:

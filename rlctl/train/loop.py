@@ -16,12 +16,12 @@ from rlctl.eval.statistics import mean_return, success_rate
 from rlctl.rollout.collect import Episode
 from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
-from rlctl.train import measurements, space_monitor, status, table_rows
+from rlctl.runs.diagnosis import Grade, diagnose
+from rlctl.train import measurements, status, table_rows
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
 from rlctl.train.episodes import EpisodeKeeper
 from rlctl.train.evaluation import Evaluator
-from rlctl.train.findings import FindingReporter
 from rlctl.train.finite import check_finite
 from rlctl.train.pack import pack
 from rlctl.train.progress import Progress
@@ -41,10 +41,6 @@ class Learner:
     progress: Progress
 
 
-class _StopRequested(Exception):
-    """A signal came while evaluation episodes were played."""
-
-
 class TrainingLoop:
     """A training that is prepared, with its run folder."""
 
@@ -61,7 +57,8 @@ class TrainingLoop:
         self._evaluator = evaluator
         self._display = display
         self._episodes = EpisodeKeeper(saver, learner.curriculum.goal_spec, learner.curriculum.goal)
-        self._findings = FindingReporter(saver.run, display.message)
+        self._reported: set[str] = set()
+        """The findings that were shown."""
         self._stop_announced = False
         self._started = time.monotonic() - self.progress.seconds
         self._last_row = (time.monotonic(), self.steps)
@@ -157,15 +154,12 @@ class TrainingLoop:
             )
 
     def _stop_if_requested(self) -> None:
-        if self.stop_signal is not None:
-            self._stop(self.stop_signal)
-
-    def _stop(self, number: int) -> None:
-        saved = self.save_checkpoint()
-        state = "checkpoint saved" if saved else "the last saved checkpoint stands"
+        if self.stop_signal is None:
+            return
+        state = "checkpoint saved" if self.save_checkpoint() else "the last saved checkpoint stands"
         raise Interrupted(
             f"interrupted at step {self.steps:,}; {state}. Go on with: rlctl train --resume {self.saver.run.path}",
-            number,
+            self.stop_signal,
         )
 
     def _write_metrics(self) -> None:
@@ -206,26 +200,26 @@ class TrainingLoop:
         packed = self._pack()
         self._display.phase("evaluating")
         try:
-            episodes = self._evaluator.run(*packed, self._raise_if_stop_requested)
-        except _StopRequested:
-            assert self.stop_signal is not None
-            self._stop(self.stop_signal)
+            # They may take minutes, too long to wait after a signal; the resumed run repeats them.
+            episodes = self._evaluator.run(*packed, self._stop_if_requested)
         except (TaskError, UsageError, ArtifactError) as error:  # the last two where files were removed meanwhile
             self._note_failed_evaluation(error)
         else:
             self._note_evaluation(episodes, packed)
         self.progress.last_eval = steps
         if steps < self.recipe.total_timesteps:  # at the end all of it is said
-            self._findings.report_new()
+            self._report_findings()
         while self.progress.next_eval <= steps:
             self.progress.next_eval += self.recipe.eval.every_steps or self.recipe.total_timesteps
         # The rate of training is without the time of evaluations.
         self._last_row = (self._last_row[0] + time.monotonic() - began, self._last_row[1])
 
-    def _raise_if_stop_requested(self) -> None:
-        # An evaluation may take minutes, too long to wait after a signal; the resumed run repeats it.
-        if self.stop_signal is not None:
-            raise _StopRequested
+    def _report_findings(self) -> None:
+        """Show the warnings of the run's own records that were not there the last time."""
+        for finding in diagnose(self.saver.run):
+            if finding.grade == Grade.WARNING and finding.id not in self._reported:
+                self._reported.add(finding.id)
+                self._display.message(finding.line)
 
     def _note_failed_evaluation(self, error: RlctlError) -> None:
         progress, steps = self.progress, self.steps
@@ -291,8 +285,8 @@ class TrainingLoop:
 
     def write_end(self, recordings: int) -> list[Path]:
         """Write that the training is done; return the requested recordings of the last evaluation's episodes."""
-        if warning := space_monitor.summarize(self.progress):
-            self._display.message(warning)
+        if count := self.progress.observations_outside:
+            self._display.message(f"warning: {count:,} observations were outside their space")
         write = lambda: status.write_end(self.saver.run, self.steps, self.progress)  # noqa: E731
         self.saver.retry(lambda: self.saver.attempt("run.json", write))
         return self._episodes.record(recordings)

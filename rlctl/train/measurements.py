@@ -76,7 +76,9 @@ def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> Pla
         return None
     rollout: Any = model.rollout_buffer  # type: ignore[attr-defined]
     observation = {key: rows[:, :-1] for key, rows in segment.observation.items()}
-    action = _scale(env.action_space, segment.action)
+    space, action, half = env.action_space, segment.action, _half_range(env.action_space)
+    if isinstance(space, spaces.Box) and half is not None:
+        action = (action - (space.high + space.low) / 2) / half  # as a replay buffer has it
     return Play(observation, action, segment.terminated, segment.truncated, rollout.values.ravel())
 
 
@@ -91,18 +93,17 @@ def _read_replay_buffer(model: BaseAlgorithm, buffer: Any, steps: int) -> Play |
     return Play(observation, buffer.actions[rows].swapaxes(0, 1), done & ~timeout, done & timeout, None)
 
 
-def _scale(space: spaces.Space[Any], action: NDArray[Any]) -> NDArray[Any]:
-    """Return actions scaled to [-1, 1] where they have limits, else as they are."""
-    if isinstance(space, spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all():
-        middle, half = (space.high + space.low) / 2, np.maximum((space.high - space.low) / 2, 1e-12)
-        scaled: NDArray[Any] = (action - middle) / half
-        return scaled
-    return action
+def _half_range(space: spaces.Space[Any]) -> NDArray[Any] | None:
+    """Return half the range of each element of an action; None for actions without limits, or discrete ones."""
+    if not isinstance(space, spaces.Box) or not np.isfinite([space.low, space.high]).all():
+        return None
+    half: NDArray[Any] = np.maximum((space.high - space.low) / 2, 1e-12)
+    return half
 
 
 def summarize_play(play: Play | None, space: spaces.Space[Any], log: Mapping[str, Any]) -> dict[str, float | None]:
     """Return what can be said of steps with actions of a space; `log` is what SB3 logged of the update."""
-    limited = isinstance(space, spaces.Box) and bool(np.isfinite(space.low).all() and np.isfinite(space.high).all())
+    limited = _half_range(space) is not None
     actions = None if play is None or not isinstance(space, spaces.Box) else play.action.astype(np.float32)
     return {
         "terminated": None if play is None else _terminated_share(play),
@@ -134,11 +135,10 @@ def _exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
         return None
     if isinstance(space, spaces.Discrete):
         return math.exp(-entropy_loss) / int(space.n)
-    if not isinstance(space, spaces.Box) or not np.isfinite(space.low).all() or not np.isfinite(space.high).all():
+    if (half := _half_range(space)) is None:
         return None
-    half_range = float(np.exp(np.log(np.maximum((space.high - space.low) / 2, 1e-12)).mean()))
-    per_element = -entropy_loss / math.prod(space.shape)
-    return math.exp(min(per_element - 0.5 * math.log(2 * math.pi * math.e), 50.0)) / half_range
+    per_element = -entropy_loss / half.size
+    return math.exp(min(per_element - 0.5 * math.log(2 * math.pi * math.e), 50.0)) / float(np.exp(np.log(half).mean()))
 
 
 def _expected_value(play: Play | None, log: Mapping[str, Any]) -> float | None:

@@ -49,7 +49,7 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
         n_envs = min(recipe.eval.episodes, available_cores())
         evaluator = Evaluator(recipe, lambda: _make_workers(specs[-1], n_envs, start, display))
         stack.callback(evaluator.close)
-        display.run_folder(run.path, run.metrics_file, run.evals_file)
+        display.run_folder(run)
         try:
             yield TrainingLoop(learner, evaluator, saver, display)
         except BaseException as error:

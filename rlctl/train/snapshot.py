@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from rlctl.dict_spaces import split
-from rlctl.errors import ArtifactError, DivergedError
+from rlctl.errors import ArtifactError
 from rlctl.train.pack import observation_statistics
 
 Tensors = dict[str, NDArray[Any]]
@@ -26,11 +25,15 @@ _COUNTERS = (
 )  # fmt: skip
 
 
-def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
-    """Return the state of a model at a boundary between updates; raises `DivergedError` if it is not finite."""
+def learned_tensors(model: BaseAlgorithm) -> tuple[Tensors, Any]:
+    """Return all that training changes in a model and its normalisation, and the structure of its state dicts."""
     weights, structure = _flatten(model.get_parameters(), "parameters")
-    tensors = {**weights, **_variables(model), **_normalizer_tensors(model)}
-    _check_finite(tensors, model.num_timesteps)
+    return {**weights, **_variables(model), **_normalizer_tensors(model)}, structure
+
+
+def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
+    """Return the state of a model at a boundary between updates."""
+    tensors, structure = learned_tensors(model)
     tensors |= _randomness_tensors() | _rollout_tensors(model)
     plain = {
         "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
@@ -38,9 +41,6 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
         "randomness": {"python": _python_state(), "action_space": model.action_space.np_random.bit_generator.state},
         "episodes": list(model.ep_info_buffer or ()),
         "successes": [bool(each) for each in model.ep_success_buffer or ()],
-        "log": _log_values(model),
-        # Images lie in memory with their channels last, and convolutions of another layout round differently.
-        "axes": {name: _axes(values) for name, values in _observed(model).items()},
     }
     return tensors, plain
 
@@ -52,32 +52,15 @@ def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> No
         model.set_parameters(parameters, exact_match=True, device=model.device)
         _restore_variables(model, tensors)
         _restore_normalizer(model, tensors)
-        _restore_rollout(model, tensors, plain["axes"])
+        _restore_rollout(model, tensors)
         for name in _COUNTERS:  # no other: a file does not choose what is set
             if name in plain["counters"]:
                 setattr(model, name, plain["counters"][name])
-        _restore_log(model, plain)
+        model.ep_info_buffer = deque(plain["episodes"], maxlen=model._stats_window_size)
+        model.ep_success_buffer = deque(plain["successes"], maxlen=model._stats_window_size)
         _restore_randomness(model, tensors, plain)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise ArtifactError(f"does not fit this recipe: {' '.join(str(error).split())[:200]}") from None
-
-
-def _restore_log(model: BaseAlgorithm, plain: dict[str, Any]) -> None:
-    """Give SB3 its last episodes, and the logger the values of the last update: TensorBoard goes on with them."""
-    model.ep_info_buffer = deque(plain["episodes"], maxlen=model._stats_window_size)
-    model.ep_success_buffer = deque(plain["successes"], maxlen=model._stats_window_size)
-    for key, value, exclude in plain["log"]:
-        model.logger.record(key, value, exclude=tuple(exclude))
-
-
-def _log_values(model: BaseAlgorithm) -> list[Any]:
-    excluded = model.logger.name_to_excluded
-    values: dict[str, Any] = model.logger.name_to_value
-    return [
-        [key, float(value), list(excluded.get(key) or ())]
-        for key, value in values.items()
-        if isinstance(value, int | float | np.number)
-    ]
 
 
 def _restore_randomness(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
@@ -104,15 +87,6 @@ def _randomness_tensors() -> Tensors:
 def _python_state() -> list[Any]:
     version, numbers, gauss = random.getstate()
     return [version, list(numbers), gauss]
-
-
-def _check_finite(tensors: Tensors, steps: int) -> None:
-    for name, values in tensors.items():
-        if values.dtype.kind == "f" and not np.isfinite(values).all():
-            raise DivergedError(
-                f"training diverged: {name.replace('/', ' ')} is not finite at step {steps:,}. A smaller "
-                "algo_kwargs.learning_rate or a smaller reward helps most often."
-            )
 
 
 def _array(tensor: torch.Tensor) -> NDArray[Any]:
@@ -187,32 +161,9 @@ def _restore_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
         rms.count = float(tensors[f"normalize/{key}/count"])
 
 
-_OBSERVED = ("_last_obs", "_last_original_obs")
-
-
-def _observed(model: BaseAlgorithm) -> Tensors:
-    found: Tensors = {}
-    for name in _OBSERVED:
-        value: Any = getattr(model, name)
-        parts = split(value)
-        found |= {f"rollout/{name}/{key}": part for key, part in parts.items() if part is not None}
-    return found
-
-
-def _axes(array: NDArray[Any]) -> list[int]:
-    """Return the axes in the order in which they lie in memory, the slowest first."""
-    return sorted(range(array.ndim), key=lambda axis: -array.strides[axis])
-
-
-def _copy_with_axes(values: NDArray[Any], axes: list[int]) -> NDArray[Any]:
-    """Copy an array into memory in the order of `axes`."""
-    return values.transpose(axes).copy().transpose(np.argsort(axes))
-
-
 def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
-    """Return what the next step is chosen from."""
+    """Return what the next step depends on beside the environments."""
     tensors: Tensors = {"rollout/starts": np.asarray(model._last_episode_starts)}
-    tensors |= {name: np.asarray(part) for name, part in _observed(model).items()}
     states: Any = getattr(model, "_last_lstm_states", None)
     for kind, pair in zip(("pi", "vf"), states or (), strict=False):
         for index, each in enumerate(pair):
@@ -220,17 +171,8 @@ def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
     return tensors
 
 
-def _restore_rollout(model: BaseAlgorithm, tensors: Tensors, axes: dict[str, list[int]]) -> None:
+def _restore_rollout(model: BaseAlgorithm, tensors: Tensors) -> None:
     model._last_episode_starts = tensors["rollout/starts"].copy()
-    for name in _OBSERVED:
-        prefix = f"rollout/{name}/"
-        # In the order of `axes`: a file of tensors has them by name, a dict observation as its space has them.
-        parts = {
-            key[len(prefix) :]: _copy_with_axes(tensors[key], order)
-            for key, order in axes.items()
-            if key.startswith(prefix)
-        }
-        setattr(model, name, parts.get("", parts or None))
     if getattr(model, "_last_lstm_states", None) is not None:
         pairs = [
             tuple(torch.from_numpy(tensors[f"rollout/lstm/{kind}/{index}"].copy()).to(model.device) for index in (0, 1))

@@ -37,20 +37,21 @@ def show(result: TrainResult, json: str | None) -> None:
 
 
 def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:
+    progress, stages = result.progress, len(result.recipe.stages)
     return {
         "run": str(result.run.path),
         "task": result.task,
         "steps": result.steps,
-        "seconds": round(result.seconds, 3),
+        "seconds": round(progress.seconds, 3),
         "wall_seconds": round(result.wall_seconds, 3),
         "best": {
-            "step": result.best_step,
-            "success_rate": result.best_success,
-            "mean_return": result.best_return,
-            "episodes": result.eval_episodes,
+            "step": progress.best_step,
+            "success_rate": progress.best_success,
+            "mean_return": progress.best_return,
+            "episodes": result.recipe.eval.episodes,
             "policy": str(result.run.best_policy),
         },
-        **({"stage": result.stage, "stages": result.stages} if result.stages else {}),
+        **({"stage": progress.stage, "stages": stages} if stages else {}),
         "findings": as_json(findings),
         "recordings": [str(path) for path in result.recordings],
         "note": result.note,
@@ -58,21 +59,18 @@ def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:
 
 
 def _format_result(result: TrainResult) -> list[str]:
-    lines = [f"trained {result.task}: {result.steps:,} steps in {duration(result.seconds)}{_format_wall(result)}"]
-    if result.best_return is not None and result.best_step is not None:
-        success = "" if result.best_success is None else f"success {percent(result.best_success)}, "
+    progress, stages = result.progress, len(result.recipe.stages)
+    line = f"trained {result.task}: {result.steps:,} steps in {duration(progress.seconds)}"
+    if result.wall_seconds >= progress.seconds + 3:
+        line += f" ({duration(result.wall_seconds)} with start, check and end)"
+    lines = [line]
+    if progress.best_return is not None and progress.best_step is not None:
+        success = "" if progress.best_success is None else f"success {percent(progress.best_success)}, "
         lines.append(
-            f"best at step {result.best_step:,}: {success}return {result.best_return:.2f} "
-            f"(mean of {result.eval_episodes} episodes)"
+            f"best at step {progress.best_step:,}: {success}return {progress.best_return:.2f} "
+            f"(mean of {result.recipe.eval.episodes} episodes)"
         )
-    if result.stages:
-        short = "" if result.stage == result.stages else "; evaluated in the last, which it did not reach"
-        lines.append(f"ended in stage {result.stage} of {result.stages}{short}")
+    if stages:
+        short = "" if progress.stage == stages else "; evaluated in the last, which it did not reach"
+        lines.append(f"ended in stage {progress.stage} of {stages}{short}")
     return lines
-
-
-def _format_wall(result: TrainResult) -> str:
-    """Return how long the whole command took, where that is clearly more than the training."""
-    if result.wall_seconds < result.seconds + 3:
-        return ""
-    return f" ({duration(result.wall_seconds)} with start, check and end)"

@@ -24,11 +24,11 @@ def training_row(recent: Sequence[EpisodeResult], terms: Iterable[str], log: Map
     """
     means = mean_terms(recent) if recent else {}
     return {
-        "acting": float(np.mean([each.acting for each in recent])) if recent else None,
+        "acting": _mean(each.acting for each in recent),
         "return": mean_return(recent) if recent else None,
-        "length": _mean_length(recent) if recent else None,
+        "length": _mean(each.length for each in recent),
         "success": success_rate(recent) if recent else None,
-        "distance": _mean_distance(recent),
+        "distance": _mean(each.final_distance for each in recent),
         **{f"term/{name}": means.get(name) for name in terms},
         **{name: log.get(f"train/{name}") for name in _LOSSES},
     }
@@ -43,28 +43,19 @@ def tensorboard_values(row: Mapping[str, Any]) -> dict[str, float]:
 
 def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     """Return what the episodes of an evaluation have come to."""
+    depths = [each.deepest_contact for each in results if each.deepest_contact is not None]
     return {
         "episodes": len(results),
         "success": success_rate(results),
         "return": mean_return(results),
-        "length": _mean_length(results),
-        "distance": _mean_distance(results),
-        "overlap": _median_overlap(results),
+        "length": _mean(each.length for each in results),
+        "distance": _mean(each.final_distance for each in results),
+        "overlap": float(np.median(depths)) if depths else None,
         **{f"term/{name}": value for name, value in mean_terms(results).items()},
     }
 
 
-def _mean_length(results: Sequence[EpisodeResult]) -> float:
-    return float(np.mean([result.length for result in results]))
-
-
-def _median_overlap(results: Sequence[EpisodeResult]) -> float | None:
-    """Return the median over episodes of how far bodies overlapped at most [m]; None where no episode was measured."""
-    depths = [result.deepest_contact for result in results if result.deepest_contact is not None]
-    return float(np.median(depths)) if depths else None
-
-
-def _mean_distance(results: Sequence[EpisodeResult]) -> float | None:
-    """Return the mean distance to the goal at the end; None where the environment reports none."""
-    distances = [result.final_distance for result in results if result.final_distance is not None]
-    return float(np.mean(distances)) if distances else None
+def _mean(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are known; None without any."""
+    known = [each for each in values if each is not None]
+    return float(np.mean(known)) if known else None

@@ -51,7 +51,7 @@ def test_promotion_by_success(staged):
     assert column(run.metrics_file, "steps") == [64, 128, 192, 256]
     assert column(run.metrics_file, "stage") == [1, 1, 2, 2]
     assert column(run.metrics_file, "success", float) == [1.0, 1.0, 0.0, 0.0]
-    assert (staged.stage, staged.stages, run.status()["stage"]) == (2, 2, 2)
+    assert (staged.progress.stage, len(staged.recipe.stages), run.status()["stage"]) == (2, 2, 2)
 
 
 def test_evaluation_is_always_in_the_last_stage(staged):
@@ -171,7 +171,7 @@ def test_resume_goes_on_in_the_middle_of_a_stage(train, resume, small_ppo):
 def test_a_stage_that_is_done_with_the_training_is_left_by_its_resume(train, resume, small_ppo):
     stages = [{"task": EASY, "promote": {"success": 1.0, "window": 4}}, {"task": HARD}]
     result = train("Staged", {**small_ppo, "total_timesteps": 64, "stages": stages})
-    assert (result.stage, saved(result.run).progress.stage_began) == (2, 64)
+    assert (result.progress.stage, saved(result.run).progress.stage_began) == (2, 64)
     resume(result, total_timesteps=128)
     assert column(result.run.metrics_file, "stage") == [1, 2]
     assert column(result.run.metrics_file, "success", float) == [1.0, 0.0]

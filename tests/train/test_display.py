@@ -6,6 +6,7 @@ import re
 import pytest
 from rich.console import Console
 
+from rlctl.run.directory import RunDirectory
 from rlctl.train.display import LiveDisplay
 
 ROW = {"steps": 640, "fps": 1234.0, "return": 5.5, "success": 0.25, "term/distance": -3.5, "term/effort": None}
@@ -42,7 +43,7 @@ def test_an_evaluation_is_named_until_it_ends(display):
 
 
 def test_a_wide_terminal_has_folder_time_and_terms(display, tmp_path):
-    display.run_folder(tmp_path, tmp_path / "metrics.csv", tmp_path / "evals.csv")
+    display.run_folder(RunDirectory(tmp_path))
     display.metrics(ROW)
     wide, narrow = draw(display, 160), draw(display, 80)
     assert str(tmp_path)[:100] in wide
@@ -60,7 +61,7 @@ def test_a_wide_terminal_has_folder_time_and_terms(display, tmp_path):
 def test_a_resumed_run_shows_its_earlier_curve(display, tmp_path):
     (tmp_path / "metrics.csv").write_text("steps,fps,return,success\n10,1,-2.0,0\n20,1,,\n30,1,4.0,1.0\n")
     (tmp_path / "evals.csv").write_text("steps,success,return\n20,0.5,3.0\n30,0.25,9.0\n")
-    display.run_folder(tmp_path, tmp_path / "metrics.csv", tmp_path / "evals.csv")
+    display.run_folder(RunDirectory(tmp_path))
     drawn = draw(display, 80)
     assert "return  ▁█ 4.00" in drawn
     assert "success ▁█ 100%" in drawn

@@ -79,7 +79,7 @@ def test_tensorboard_has_distributions(finished):
 def test_best_policy_is_that_of_the_best_evaluation(finished):
     result = finished
     best = max(rows(result.run.evals_file), key=lambda row: float(row["return"]))
-    assert load_policy(result.run.best_policy).info.training_steps == int(best["steps"]) == result.best_step
+    assert load_policy(result.run.best_policy).info.training_steps == int(best["steps"]) == result.progress.best_step
 
 
 def test_kept_episodes_are_the_first_and_the_worst(finished):
@@ -210,7 +210,7 @@ def test_a_fault_leaves_the_last_boundary_to_resume_from(train, small_ppo, tmp_p
 
 
 def test_a_worker_that_dies_ends_the_run(train, small_ppo):
-    with pytest.raises(TaskError, match=r"worker \d died while stepping \(exit code 9\)"):
+    with pytest.raises(TaskError, match=r"worker \d ended with exit code 9 while stepping"):
         train("Faulty", {**small_ppo, "total_timesteps": 1000, "task": {"fault": "die"}})
 
 
