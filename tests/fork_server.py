@@ -277,7 +277,7 @@ def _read_messages():
     from rlctl.rollout import messages
 
     asked = messages.Build(EnvSpec("reach")), messages.Attach(1), messages.LoadPolicy(), messages.BeginEpisodes({})
-    for each in (*asked, messages.Play(messages.Segment(1), {}), messages.ComputeRewards(b"")):
+    for each in (*asked, messages.Play(1, {}), messages.ComputeRewards(b"")):
         messages.decode(messages.encode(each))
     messages.decode_answer(messages.encode(messages.Answer()))
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.dict_spaces import Observations, join
 from rlctl.errors import EpisodeFailed
-from rlctl.rollout.messages import EpisodeResult, Play, Segment
+from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
 
@@ -62,8 +62,6 @@ def play_episodes(
     """
     steps = min(workers.info.max_steps or _SEGMENT, _SEGMENT)
     terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms
-    segment = Segment(steps, exploration, until_end=True, record=terms)
-    measured = dataclasses.replace(segment, contacts=terms)
     waiting = list(enumerate(seeds))[::-1]
     running: dict[int, _Recorder] = {}
     episodes: dict[int, Episode] = {}
@@ -75,8 +73,10 @@ def play_episodes(
             play(env, seed)
 
     def play(env: int, seed: int) -> None:
-        is_measured = running[env].index < _CONTACTS_MEASURED
-        workers.start_playing(Play(measured if is_measured else segment, {env: seed}))
+        contacts = terms and running[env].index < _CONTACTS_MEASURED
+        workers.start_playing(
+            Play(steps, {env: seed}, exploration=exploration, until_end=True, record=terms, contacts=contacts)
+        )
 
     for env in workers.first_envs:
         begin(env)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,9 @@ MAX_BYTES = 2**28
 class ActionHistory:
     """Stores the actions of each environment's running episode; `episodes` are those so far, shape (steps, ...)."""
 
-    def __init__(self, episodes: Sequence[NDArray[Any]]) -> None:
+    def __init__(self, episodes: Iterable[NDArray[Any]]) -> None:
         self._parts = [[actions] for actions in episodes]
-        self._bytes = [actions.nbytes for actions in episodes]
+        self._bytes = [actions.nbytes for (actions,) in self._parts]
 
     def add_segment(self, actions: NDArray[Any], ended: Iterable[tuple[int, int]]) -> None:
         """Store a segment, shape (n_envs, steps, ...), in which episodes ended: (environment, row) each, by row."""

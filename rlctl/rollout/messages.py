@@ -83,11 +83,16 @@ class LimitActions:
 
 
 @dataclasses.dataclass(frozen=True)
-class Segment:
-    """How a segment is played."""
+class Play:
+    """Play a segment in some environments, one after the other."""
 
     steps: int
-    """Steps of each environment, at most."""
+    """Of each environment, at most."""
+    begin: dict[int, int]
+    """Per environment the seed of the episode to begin with; negative: the running one goes on."""
+    next_episodes: dict[int, int] = dataclasses.field(default_factory=dict)
+    """Per environment the number of the training episode that begins where one ends; empty: none begins."""
+    run_seed: int = 0
     exploration: Exploration = dataclasses.field(default_factory=Exploration)
     until_end: bool = False
     """Whether to stop where an episode ends."""
@@ -95,18 +100,6 @@ class Segment:
     """Whether to write reward terms."""
     contacts: bool = False
     """Whether to measure, after every step, how far bodies of a task overlap."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Play:
-    """Play a segment in some environments, one after the other."""
-
-    segment: Segment
-    begin: dict[int, int]
-    """Per environment the seed of the episode to begin with; negative: the running one goes on."""
-    next_episodes: dict[int, int] = dataclasses.field(default_factory=dict)
-    """Per environment the number of the training episode that begins where one ends; empty: none begins."""
-    run_seed: int = 0
 
 
 @dataclasses.dataclass(frozen=True)

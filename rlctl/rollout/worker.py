@@ -163,7 +163,7 @@ class Worker:
     def _play(self, message: messages.Play) -> list[EpisodeResult]:
         """Play a segment in some environments, one after the other; return the episodes that ended."""
         ended: list[EpisodeResult] = []
-        self._loaded_player.explore(message.segment.exploration)
+        self._loaded_player.explore(message.exploration)
         for env, seed in message.begin.items():
             episode = self._episodes[env - self._job.first]
             number = message.next_episodes.get(env)
@@ -173,11 +173,11 @@ class Worker:
                     self._begin(episode, seed)
                     if self._states is not None:
                         self._states[env] = 0.0
-                ended += self._play_one(episode, message.segment, next_seeds)
+                ended += self._play_one(episode, message, next_seeds)
         return ended
 
     def _play_one(
-        self, episode: RunningEpisode, asked: messages.Segment, next_seeds: Iterator[int] | None
+        self, episode: RunningEpisode, asked: messages.Play, next_seeds: Iterator[int] | None
     ) -> list[EpisodeResult]:
         """Play a segment of one environment; without `next_seeds` no episode begins where one ends."""
         arrays, index, player, write = self._arrays, episode.index, self._loaded_player, self._writer.write

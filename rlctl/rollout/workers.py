@@ -56,7 +56,8 @@ class Workers:
     ) -> None:
         self.n_envs = n_envs
         self.timeout_s = timeout_s
-        self._spec = spec
+        self.spec = spec
+        """What the environments are made from."""
         n_workers = min(n_envs, n_workers or available_cores())
         bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
         self._ranges = list(itertools.pairwise(bounds))
@@ -74,11 +75,6 @@ class Workers:
                 raise TaskError(f"task {spec.task!r}: no worker can be started: {error.strerror or error}") from None
             raise
         self._begin_to_build()
-
-    @property
-    def spec(self) -> EnvSpec:
-        """What the environments are made from."""
-        return self._spec
 
     @property
     def info(self) -> EnvInfo:
@@ -113,14 +109,14 @@ class Workers:
         None of them is in an episode then: call `reset`. `arrays` are new ones.
         """
         self._wait_until_built()
-        self._spec = spec
+        self.spec = spec
         self._ready = False
         self._begin_to_build()
         return self.info
 
     def _begin_to_build(self) -> None:
         for worker in range(len(self._ranges)):
-            self._send(worker, messages.Build(self._spec))
+            self._send(worker, messages.Build(self.spec))
 
     def _wait_until_built(self) -> None:
         if self._ready:
@@ -143,7 +139,7 @@ class Workers:
         None of the environments is in an episode then.
         """
         self._wait_until_built()
-        self._spec = spec
+        self.spec = spec
         self._info = _info_of(self._ask_all(messages.SetEvents(spec, dict(push) if push else None), "changing events"))
         return self._info
 
@@ -197,8 +193,8 @@ class Workers:
         `play.next_episodes` none does, and the environment stops there.
         """
         self._wait_until_built()
-        if self._steps < play.segment.steps:
-            self._attach(play.segment.steps)
+        if self._steps < play.steps:
+            self._attach(play.steps)
         for worker, envs in self._by_worker(play.begin).items():
             self._send(worker, dataclasses.replace(play, begin={env: play.begin[env] for env in envs}))
 
@@ -245,7 +241,7 @@ class Workers:
             self._fail(self._name_episode(fault))
         for answer in answers.values():
             if answer.failure is not None:
-                self._fail(make_error(answer.failure, self._spec.task))
+                self._fail(make_error(answer.failure, self.spec.task))
         return answers
 
     def _read_progress(self) -> bytes:
@@ -258,11 +254,11 @@ class Workers:
     def _name_episode(self, fault: WorkerFault) -> TaskError:
         """Name the episode a worker was in when it stopped answering, or the environments it ran."""
         low, high = self._ranges[fault.worker]
-        message = f"task {self._spec.task!r}: {fault}"
+        message = f"task {self.spec.task!r}: {fault}"
         if self._ready:
             for env, (seed, step, _) in enumerate(self._arrays.inside[low:high].tolist(), start=low):
                 if step >= 0:
-                    return EpisodeFailed(message, env, seed, step, hint=format_hint(self._spec.task))
+                    return EpisodeFailed(message, env, seed, step, hint=format_hint(self.spec.task))
         return TaskError(f"{message}\nit ran the environments {low} to {high - 1}")
 
     def close(self, grace_s: float = 2.0) -> None:

@@ -73,18 +73,14 @@ class TrainingLoop:
 
         Raises `Interrupted` after a signal, when the state is saved.
         """
-        total = self.recipe.total_timesteps
         if self.recipe.stages:
             self._display.stage(self.curriculum.title)
         self._display.phase("first steps")
         try:
-            self.rollouts.begin(total)
-            while self.steps < total:
-                if self.boundary():
-                    return
+            self.rollouts.begin(self.recipe.total_timesteps)
+            while not self.boundary():
                 self.rollouts.advance(self._announce_stop)
                 self._display.steps(self.steps)
-            self.finish()
         except TaskError as error:
             raise self._explain_fault(error) from None
         except ValueError:
@@ -92,24 +88,28 @@ class TrainingLoop:
             raise
 
     def boundary(self) -> bool:
-        """Do what is due between two updates and was not done before a resume; return whether nothing is left to do."""
-        steps = self.steps
+        """Do what is due between two updates and was not done before a resume; return whether nothing is left to do.
+
+        Raises `ArtifactError` if what the training ends with cannot be saved.
+        """
+        steps, progress = self.steps, self.progress
+        is_last = steps >= self.recipe.total_timesteps
         self._take_ended()
         if steps == 0:
             self._begin()
             return False
         stage_done = self.curriculum.is_due(steps)
-        if stage_done or self.recipe.algo in ON_POLICY or steps >= self.progress.next_row:
+        if is_last or stage_done or self.recipe.algo in ON_POLICY or steps >= progress.next_row:
             self._write_metrics()
-        if stage_done:
+        if stage_done:  # also at the end: for a resume that makes the run longer
             self._begin_next_stage()
         self._stop_if_requested()
-        if steps >= self.progress.next_eval:
+        if steps >= progress.next_eval or (is_last and progress.last_eval < steps):
             self.evaluate()
-            if self.recipe.stop_success is not None and self.progress.good_in_a_row >= 2:
-                self._save_the_end()
-                return True
-            self._stop_if_requested()
+        if is_last or (self.recipe.stop_success is not None and progress.good_in_a_row >= 2):
+            self._save_the_end()
+            return True
+        self._stop_if_requested()
         if self.saver.checkpoint_is_due():
             self.save_checkpoint()
         return False
@@ -120,17 +120,6 @@ class TrainingLoop:
             if self.progress.next_eval == 0:
                 self.evaluate()
             self.save_checkpoint()
-
-    def finish(self) -> None:
-        """Evaluate and save what the training ended with; raises `ArtifactError` if it cannot be saved."""
-        self._take_ended()
-        stage_done = self.curriculum.is_due(self.steps)
-        self._write_metrics()
-        if stage_done:  # for a resume that makes the run longer
-            self._begin_next_stage()
-        if self.progress.last_eval < self.steps:
-            self.evaluate()
-        self._save_the_end()
 
     def _take_ended(self) -> None:
         ended = self._env.take_ended()

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from rlctl.errors import EpisodeFailed
 from rlctl.rollout.history import ActionHistory
-from rlctl.rollout.messages import EpisodeResult, Play, Segment
+from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
@@ -69,9 +69,10 @@ class WorkerVecEnv(VecEnv):
     def start(self, steps: int, exploration: Exploration, *, until_end: bool = False) -> None:
         """Begin to play up to `steps` steps, with `until_end` only up to the end of the running episode."""
         self._steps, self._until_end = steps, until_end
-        segment = Segment(steps, exploration, until_end=until_end)
-        going_on = dict.fromkeys(range(self.num_envs), -1)
-        self.workers.start_playing(Play(segment, going_on, dict(enumerate(self.episodes_started)), self.run_seed))
+        going_on, following = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
+        self.workers.start_playing(
+            Play(steps, going_on, following, self.run_seed, exploration=exploration, until_end=until_end)
+        )
 
     def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
         """Wait for what `start` has begun; `check` is called several times a second."""

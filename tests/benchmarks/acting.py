@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
 from rlctl.rollout.collect import play_episodes
-from rlctl.rollout.messages import Play, Segment
+from rlctl.rollout.messages import Play
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run.acting import Exploration
@@ -114,7 +114,7 @@ class _Player:
 
     def _play(self, begin: dict[int, int]) -> None:
         self.workers.set_policy(*self._policy)
-        self.workers.start_playing(Play(Segment(STEPS, SAMPLES), begin, dict(enumerate(self._started))))
+        self.workers.start_playing(Play(STEPS, begin, dict(enumerate(self._started)), exploration=SAMPLES))
         for result in self.workers.finish_playing():
             self._started[result.env] += 1
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import rlctl
 from rlctl.env_spec import EnvSpec
-from rlctl.rollout.messages import Play, Segment
+from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run.acting import Exploration
 from rlctl.task.bullet import pybullet, pybullet_data
@@ -164,11 +164,11 @@ def many_environments(repeat: int) -> Row:
     processes = SubprocVecEnv([lambda: rlctl.make(TASK)] * FEW)
     processes.reset()
     rounds = 120  # steps of all environments
-    uniform, envs = Segment(rounds, Exploration(warmup=True)), range(MANY)
+    uniform, envs = Exploration(warmup=True), range(MANY)
     actions = np.random.default_rng(0).uniform(-1, 1, (rounds, FEW, 7)).astype(np.float32)
 
     def play() -> None:
-        workers.start_playing(Play(uniform, dict.fromkeys(envs, -1), dict.fromkeys(envs, 1)))
+        workers.start_playing(Play(rounds, dict.fromkeys(envs, -1), dict.fromkeys(envs, 1), exploration=uniform))
         workers.finish_playing()
 
     def step_processes() -> None:

@@ -25,7 +25,7 @@ PHASES = {
     "checkpoint": (rlctl.run.files, "os.rename", 2),
     "evaluated checkpoint": (rlctl.run.files, "os.rename", 4),
     "final evaluation": (rlctl.train.evaluation.Evaluator, "run", 2),
-    "the end": (rlctl.train.loop.TrainingLoop, "finish", 1),
+    "the end": (rlctl.train.loop.TrainingLoop, "boundary", 4),
     "last checkpoint": (rlctl.run.files, "os.rename", 6),
     "done": (rlctl.train.status, "write_end", 1),
 }

@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.rollout.messages import Play, Segment
+from rlctl.rollout.messages import Play
 from tests.rollout.conftest import ENVS
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("no_child_left")
 def play(workers, steps=4):
     """Play episodes from seed 5 on: environment 2 plays the faulty seed."""
     workers.set_other_policy("zero")
-    workers.start_playing(Play(Segment(steps), {env: env + 5 for env in range(workers.n_envs)}))
+    workers.start_playing(Play(steps, {env: env + 5 for env in range(workers.n_envs)}))
     workers.finish_playing()
 
 
@@ -98,16 +98,16 @@ PARENT = textwrap.dedent(
     """
     import sys
     from rlctl.env_spec import EnvSpec
-    from rlctl.rollout.messages import Play, Segment
+    from rlctl.rollout.messages import Play
     from rlctl.rollout.workers import Workers
     workers = Workers(EnvSpec(sys.argv[1], {"fault": "hang"}), 4, n_workers=2)
     workers.set_other_policy("zero")
     envs, first = range(4), int(sys.argv[2])
-    workers.start_playing(Play(Segment(2), {env: env + first for env in envs}))
+    workers.start_playing(Play(2, {env: env + first for env in envs}))
     workers.finish_playing()
     print("stepping", flush=True)
     while True:
-        workers.start_playing(Play(Segment(1), dict.fromkeys(envs, -1), dict.fromkeys(envs, 1)))
+        workers.start_playing(Play(1, dict.fromkeys(envs, -1), dict.fromkeys(envs, 1)))
         workers.finish_playing()
     """
 )

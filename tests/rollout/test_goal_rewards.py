@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.rollout.messages import Play, Segment
+from rlctl.rollout.messages import Play
 from tests.rollout.conftest import ENVS
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
@@ -50,7 +50,7 @@ def test_asking_changes_nothing_of_the_episodes(spec, start, goals):
         for _ in range(4):
             if asks:
                 workers.compute_rewards(*goals)
-            workers.start_playing(Play(Segment(1), dict.fromkeys(range(3), -1)))
+            workers.start_playing(Play(1, dict.fromkeys(range(3), -1)))
             workers.finish_playing()
         seen.append(np.column_stack([workers.observations(), workers.arrays.segment.reward]))
     np.testing.assert_array_equal(*seen)

@@ -12,7 +12,7 @@ from rlctl.run.policy import PolicyInfo
 
 ENV = EnvInfo(observation_space={"type": "Discrete", "n": 2}, action_space={}, control_dt=math.inf)
 SPEC = EnvSpec("reach", {"limit": math.inf, "name": "x"}, named_by="run")
-SEGMENT = messages.Segment(40, Exploration(stochastic=True, epsilon=0.5), until_end=True)
+EXPLORATION = Exploration(stochastic=True, epsilon=0.5)
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ SEGMENT = messages.Segment(40, Exploration(stochastic=True, epsilon=0.5), until_
         ),
         messages.LoadPolicy(other="zero"),
         messages.LimitActions({"low": [-math.inf]}),
-        messages.Play(SEGMENT, {0: -1, 3: 7}, {0: 5}, run_seed=3),
+        messages.Play(40, {0: -1, 3: 7}, {0: 5}, run_seed=3, exploration=EXPLORATION, until_end=True),
         messages.ComputeRewards(b"\xff\n"),
     ],
     ids=lambda message: type(message).__name__,

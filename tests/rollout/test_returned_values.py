@@ -7,7 +7,7 @@ import pytest
 from rlctl.env_spec import EnvSpec
 from rlctl.rollout.child_process import LineReader, anonymous_file
 from rlctl.rollout.failures import FailedInEpisode, describe_failure
-from rlctl.rollout.messages import Attach, Build, Failure, Job, LoadPolicy, Play, Segment
+from rlctl.rollout.messages import Attach, Build, Failure, Job, LoadPolicy, Play
 from rlctl.rollout.worker import Worker
 from rlctl.rollout.worker_output import MAX_LINE_BYTES, MAX_LINES_PER_S, LineFilter, replace_control_characters
 from tests.train import faulty_envs
@@ -22,7 +22,7 @@ def failure(env, **parameters):
     worker.answer(Attach(10))
     worker.answer(LoadPolicy(other="zero"))
     with pytest.raises(FailedInEpisode) as caught:
-        worker.answer(Play(Segment(10), {0: 7}))
+        worker.answer(Play(10, {0: 7}))
     return describe_failure(caught.value)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import EpisodeFailed
-from rlctl.rollout.messages import Play, Segment
+from rlctl.rollout.messages import Play
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.run.acting import Exploration, PolicyPlayer
 from tests.rollout.policies import linear
@@ -25,7 +25,7 @@ def play(workers, segments, steps):
     started, results, parts = [1] * workers.n_envs, [], []
     for number in range(segments):
         begin = {env: -1 if number else seed(env, 0) for env in range(workers.n_envs)}
-        workers.start_playing(Play(Segment(steps, SAMPLES), begin, dict(enumerate(started)), run_seed=3))
+        workers.start_playing(Play(steps, begin, dict(enumerate(started)), run_seed=3, exploration=SAMPLES))
         ended = workers.finish_playing()
         for each in ended:
             started[each.env] += 1
@@ -90,7 +90,7 @@ def test_a_segment_up_to_the_end_of_an_episode(spec, start):
     """As off-policy algorithms play whose `train_freq` counts episodes: the next one has begun then."""
     workers = start(spec("Walk"), 1)
     workers.set_policy(*linear(workers.info, WEIGHT))
-    workers.start_playing(Play(Segment(50, until_end=True), {0: seed(0, 0)}, {0: 1}, run_seed=3))
+    workers.start_playing(Play(50, {0: seed(0, 0)}, {0: 1}, run_seed=3, until_end=True))
     (result,) = workers.finish_playing()
     assert result.row + 1 == result.length < 50
     first, _ = spec("Walk").make().reset(seed=seed(0, 1))
@@ -100,7 +100,7 @@ def test_a_segment_up_to_the_end_of_an_episode(spec, start):
 def test_an_environment_stops_where_its_episode_ends_without_a_next_one(spec, start):
     workers = start(spec("Walk"), 2, n_workers=1)
     workers.set_policy(*linear(workers.info, WEIGHT))
-    workers.start_playing(Play(Segment(60), {0: 1, 1: 2}, {1: 5}, run_seed=3))
+    workers.start_playing(Play(60, {0: 1, 1: 2}, {1: 5}, run_seed=3))
     ended = workers.finish_playing()
     assert [each.seed for each in ended if each.env == 0] == [1]
     assert [each.seed for each in ended if each.env == 1][:3] == [2, seed(1, 5), seed(1, 6)]
@@ -111,7 +111,7 @@ def test_an_environment_stops_where_its_episode_ends_without_a_next_one(spec, st
 def test_uniform_actions_of_a_warm_up(spec, start):
     workers = start(spec("Spaces", kind="discrete"), 2)
     workers.set_policy(*linear(workers.info, np.zeros((2, 7))))
-    workers.start_playing(Play(Segment(40, Exploration(warmup=True)), {0: 1, 1: 2}, {0: 1, 1: 1}, run_seed=3))
+    workers.start_playing(Play(40, {0: 1, 1: 2}, {0: 1, 1: 1}, run_seed=3, exploration=Exploration(warmup=True)))
     workers.finish_playing()
     assert set(workers.arrays.segment.action[:, :40].ravel().tolist()) == {0, 1}
 
@@ -119,7 +119,7 @@ def test_uniform_actions_of_a_warm_up(spec, start):
 def test_the_step_of_a_segment_that_fails_is_named(spec, start):
     workers = start(spec("Walk", fault="raise"), 3, n_workers=2)
     workers.set_policy(*linear(workers.info, WEIGHT))
-    workers.start_playing(Play(Segment(20), {0: 5, 1: 6, 2: 7}, {0: 1, 1: 1, 2: 1}, run_seed=3))
+    workers.start_playing(Play(20, {0: 5, 1: 6, 2: 7}, {0: 1, 1: 1, 2: 1}, run_seed=3))
     with pytest.raises(EpisodeFailed) as caught:
         workers.finish_playing()
     assert (caught.value.env, caught.value.seed, caught.value.step) == (2, 7, 3)

@@ -12,7 +12,7 @@ import pytest
 from rlctl.dict_spaces import join
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError
-from rlctl.rollout.messages import Play, Segment
+from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers
 from tests.rollout.policies import linear
 
@@ -23,7 +23,7 @@ def play(workers: Workers, steps: int = 20, policy: str = "random"):
     """Play a segment, the next episode where one ends; return what was observed, rewarded and ended."""
     envs = range(workers.n_envs)
     workers.set_other_policy(policy)
-    workers.start_playing(Play(Segment(steps), {env: 100 * env for env in envs}, dict.fromkeys(envs, 1), run_seed=3))
+    workers.start_playing(Play(steps, {env: 100 * env for env in envs}, dict.fromkeys(envs, 1), run_seed=3))
     ended = workers.finish_playing()
     segment = workers.arrays.segment
     return segment.observation[""].copy(), segment.reward.copy(), ended
@@ -44,7 +44,7 @@ def test_reach_does_not_depend_on_the_number_of_environments(start):
 def test_terms_of_a_task(spec, start):
     workers = start(spec("Counting"), 1)
     workers.set_policy(*linear(workers.info, [[0.0]], bias=0.25))
-    workers.start_playing(Play(Segment(4, record=True), {0: 1}, {0: 1}))
+    workers.start_playing(Play(4, {0: 1}, {0: 1}, record=True))
     (result,) = workers.finish_playing()
     segment = workers.arrays.segment
     begin = float(segment.observation[""][0, 0, 0])
@@ -62,7 +62,7 @@ def test_every_kind_of_space(spec, start, kind):
     env = spec("Spaces", kind=kind).make()
     workers = start(spec("Spaces", kind=kind), 3, n_workers=1)
     workers.set_other_policy("random")
-    workers.start_playing(Play(Segment(3), {0: 0, 1: 1, 2: 2}))
+    workers.start_playing(Play(3, {0: 0, 1: 1, 2: 2}))
     ended = workers.finish_playing()
     segment = workers.arrays.segment
     expected, _ = env.reset(seed=1)
@@ -184,7 +184,7 @@ def test_what_cannot_be_rebuilt_ends_the_workers(spec, start):
 def test_episodes_end_in_the_order_of_the_environments(spec, start):
     workers = start(spec("Walk"), 6, n_workers=3)
     workers.set_other_policy("zero")
-    workers.start_playing(Play(Segment(20), dict.fromkeys(range(6), 1)))
+    workers.start_playing(Play(20, dict.fromkeys(range(6), 1)))
     assert [result.env for result in workers.finish_playing()] == [0, 1, 2, 3, 4, 5]
 
 
