@@ -279,7 +279,7 @@ def _read_messages():
     asked = messages.Build(EnvSpec("reach")), messages.Attach(1), messages.LoadPolicy(), messages.BeginEpisodes({})
     for each in (*asked, messages.Play(1, {}), messages.ComputeRewards(b"")):
         messages.decode(messages.encode(each))
-    messages.decode_answer(messages.encode(messages.Answer()))
+    messages.decode(messages.encode(messages.Answer()))
 
 
 def main(descriptor, commands):

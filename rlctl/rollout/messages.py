@@ -111,7 +111,6 @@ class ComputeRewards:
 
 
 Message = Build | SetEvents | Attach | BeginEpisodes | LoadPolicy | LimitActions | Play | ComputeRewards
-_MESSAGES: dict[str, Any] = {each.__name__: each for each in get_args(Message)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,19 +174,13 @@ def _to_plain(value: Any) -> Any:
     return dict(value) if isinstance(value, Mapping) else vars(value)
 
 
-def decode(content: bytes) -> Message:
-    """Return the message of some JSON."""
-    fields = json.loads(content)
-    message: Message = _reader(_MESSAGES[fields.pop("message")]).validate_python(fields)
-    return message
+_KINDS: dict[str, Any] = {each.__name__: each for each in (*get_args(Message), Answer)}
 
 
-def decode_answer(content: bytes) -> Answer:
-    """Return the answer of some JSON."""
+def decode(content: bytes) -> Any:
+    """Return the message, or answer, of some JSON."""
     fields = json.loads(content)
-    del fields["message"]
-    answer: Answer = _reader(Answer).validate_python(fields)
-    return answer
+    return _reader(_KINDS[fields.pop("message")]).validate_python(fields)
 
 
 @functools.cache

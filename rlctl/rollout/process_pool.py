@@ -91,7 +91,8 @@ class ProcessPool:
         except (EOFError, OSError):
             raise WorkerFault(worker, self._describe_death(worker, doing)) from None
         self.waiting_for.discard(worker)
-        return messages.decode_answer(content)
+        answer: Answer = messages.decode(content)
+        return answer
 
     def _describe_death(self, worker: int, doing: str) -> str:
         how = self._processes[worker].describe_end()

@@ -84,12 +84,8 @@ class Checkpoints:
         """How many transitions the replay buffer has been given: one for each step of all environments."""
         return self._model.num_timesteps // self._env.num_envs
 
-    def save(self, packed: tuple[PolicyInfo, Tensors], progress: Progress) -> Path:
-        """Write a checkpoint of the present boundary and remove the oldest; return its folder.
-
-        Raises `OSError` if the disk does not take it.
-        """
-        target = self._run.checkpoint(self._model.num_timesteps)
+    def save(self, packed: tuple[PolicyInfo, Tensors], progress: Progress) -> None:
+        """Write a checkpoint of the present boundary; raises `OSError` if the disk does not take it."""
         tensors, plain = snapshot.take(self._model)
         tensors |= _environment_tensors(self._env)
         segments: list[Segment] = []
@@ -108,11 +104,10 @@ class Checkpoints:
             computed_with=self.computed_with(),
             sha256={name: files.digest(content) for name, content in contents.items()},
         )
-        with files.whole_folder(target) as folder:
+        with files.whole_folder(self._run.checkpoint(state.step)) as folder:
             for name, content in contents.items():
                 files.write_new(folder / name, content)
             files.write_new(folder / _STATE, _encode_state(state.model_dump(mode="json")))
-        return target
 
     def computed_with(self) -> dict[str, str]:
         """Return what the last bits of this training's results depend on."""

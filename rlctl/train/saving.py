@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
-import shutil
 import time
 from collections.abc import Callable
 from typing import Any
@@ -42,7 +39,6 @@ class Saver:
         self._next_checkpoint = time.monotonic()
         self._uncounted_checkpoints = 1
         """Checkpoints that come whether they are due or not: the last one."""
-        self._last_bytes = 0
         self._reminded = 0.0
         self._unsaved_best: Packed | None = None
         """The best policy, until the disk takes it."""
@@ -122,8 +118,5 @@ class Saver:
         progress.metrics_sha256, progress.evals_sha256 = self.metrics.digest(), self.evals.digest()
         self._write_best()
         save_policy(self.run.last_policy, *packed)
-        if shutil.disk_usage(self.run.path).free < 2 * self._last_bytes:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        folder = self._checkpoints.save(packed, progress)
-        self._last_bytes = sum(file.stat().st_size for file in folder.iterdir())
+        self._checkpoints.save(packed, progress)
         self.saved_step = packed[0].training_steps

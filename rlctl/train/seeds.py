@@ -8,10 +8,8 @@ import functools
 import itertools
 import json
 import os
-import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -29,6 +27,7 @@ from rlctl.run.group import Group, create_group, parse_seeds, read_group
 from rlctl.run.recipe_sources import resolve
 from rlctl.train.process_state import preserve_process_state
 from rlctl.train.request import TrainRequest
+from rlctl.train.signals import HandledSignals
 from rlctl.train.warm_start import find_source
 
 CORES_PER_TRAINING = 2
@@ -151,7 +150,7 @@ class _Trainings:
 
     def run(self, commands: Mapping[int, list[str]], group: Path) -> dict[int, int]:
         """Train all; return the exit code of each seed that failed. Raises `Interrupted` after a signal."""
-        with self._pass_signals_on(), ThreadPoolExecutor(self._jobs, initializer=self._take_cores) as pool:
+        with HandledSignals(self._pass_on), ThreadPoolExecutor(self._jobs, initializer=self._take_cores) as pool:
             codes = list(pool.map(self._train, commands, commands.values()))
         if self._stopped_by is not None:
             raise Interrupted(f"interrupted; go on with: rlctl train --resume {group}", self._stopped_by)
@@ -187,24 +186,7 @@ class _Trainings:
         reader.wait()
         return code if code >= 0 else 128 - code
 
-    @contextlib.contextmanager
-    def _pass_signals_on(self) -> Iterator[None]:
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-        before = {
-            each: signal.signal(each, self._handle)
-            for each in numbers
-            if signal.getsignal(each) != signal.SIG_IGN or each == signal.SIGINT
-        }
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
+    def _pass_on(self, number: int, frame: FrameType | None) -> None:
         self._stopped_by = self._stopped_by or number
         for process in list(self._running):
             with contextlib.suppress(ProcessLookupError):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from collections.abc import Callable
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from rlctl import output
 from rlctl.errors import Interrupted
@@ -17,40 +18,56 @@ if TYPE_CHECKING:
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_S = 1.0  # equal signals within it are one: `timeout` sends SIGTERM to the process and to its group
 
+Handler = Callable[[int, FrameType | None], None]
 
-class StopSignals:
-    """Handles SIGINT, SIGTERM and SIGHUP, which a closed terminal sends, as long as it is entered.
+
+class HandledSignals:
+    """Lets `handle` take SIGINT, SIGTERM and SIGHUP, which a closed terminal sends, as long as it is entered."""
+
+    def __init__(self, handle: Handler) -> None:
+        self._handler = handle
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        # Python has signal handlers in the main thread only; a caller in another keeps its own.
+        if threading.current_thread() is threading.main_thread():
+            # Set even where a shell has made SIGINT ignored, as for a command in the background; what `nohup` has made
+            # ignored stays so.
+            self._before = {
+                each: signal.getsignal(each)
+                for each in _STOP_SIGNALS
+                if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN
+            }
+        self.handle_again()
+        return self
+
+    def handle_again(self) -> None:
+        """Set the handlers anew: importing a task may have put others there."""
+        for number in self._before:
+            signal.signal(number, self._handler)
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
+class StopSignals(HandledSignals):
+    """Stops a training by signals.
 
     Before the training they end the process at once; while it goes on the first ends it at the next boundary and the
     second at once, if it is another signal or comes more than a second later; when it is done they change nothing.
     """
 
     def __init__(self) -> None:
+        super().__init__(self._handle)
         self._loop: TrainingLoop | None = None
         self._done = False
         self._received_s = 0.0
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> StopSignals:
-        # Python has signal handlers in the main thread only; a caller in another keeps its own.
-        if threading.current_thread() is threading.main_thread():
-            # Set even where a shell has made SIGINT ignored, as for a command in the background; what `nohup` has made
-            # ignored stays so.
-            asking = [
-                each for each in _STOP_SIGNALS if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN
-            ]
-            self._before = {number: signal.signal(number, self._handle) for number in asking}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
 
     def begin(self, loop: TrainingLoop) -> None:
         """From now on let `loop` end the training at a boundary."""
         self._loop = loop
-        for number in self._before:  # importing the task may have put other handlers there
-            signal.signal(number, self._handle)
+        self.handle_again()
 
     def end(self) -> None:
         """The training is done and saved: later signals change nothing."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import registry
-from rlctl.errors import ArtifactError, RecipeError, UsageError
+from rlctl.errors import RecipeError, UsageError
 from rlctl.run import directory, lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.recipe import Recipe, validate
@@ -131,7 +131,7 @@ def _find_checkpoint(request: TrainRequest) -> Start:
     try:
         recipe = validate({**before.model_dump(by_alias=True), **request.settings}, "recipe")
         status = run.status()
-        task = lookup.locate_task(_read_task(status, run), run)
+        task = lookup.locate_task(status["task"], run)
         changes = describe_task_changes(status, task)
         if changes and not request.force:
             raise UsageError(
@@ -141,7 +141,8 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         found, damage = checkpoint.read_newest(run)
         if found is not None and request.settings:
             found = _reopen(found, before, recipe)
-        notes = _describe(found, damage)
+        notes = tuple(f"warning: {each}; going on from step {found.state.step:,}" for each in damage if found)
+        notes = notes if found else ("no checkpoint yet: the training begins at its first step",)
         return Start(request, task, recipe, run, lock, found, notes, status.get("from"), tuple(changes))
     except BaseException:
         lock.release()
@@ -156,19 +157,6 @@ def _check_resume(request: TrainRequest) -> None:
     for key in request.settings:
         if key not in _MAY_CHANGE:
             raise UsageError(f"--resume goes on with the run's own recipe: {key} cannot be changed, only -n")
-
-
-def _read_task(content: Mapping[str, Any], run: RunDirectory) -> str:
-    task = content["task"]
-    if not isinstance(task, str):
-        raise ArtifactError(f"{run.status_file}: damaged: its task is {task!r}")
-    return task
-
-
-def _describe(found: Checkpoint | None, damage: list[str]) -> tuple[str, ...]:
-    if found is None:
-        return ("no checkpoint yet: the training begins at its first step",)
-    return tuple(f"warning: {each}; going on from step {found.state.step:,}" for each in damage)
 
 
 def _reopen(found: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:

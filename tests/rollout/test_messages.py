@@ -46,6 +46,6 @@ def test_messages(message):
     ],
 )
 def test_answers(answer):
-    received = messages.decode_answer(messages.encode(answer))
+    received = messages.decode(messages.encode(answer))
     assert received == answer
     assert [(each.row, each.report) for each in received.ended] == [(each.row, each.report) for each in answer.ended]
