@@ -107,7 +107,7 @@ class ComputeRewards:
     """Compute the rewards of goals."""
 
     goals: pydantic.Base64Bytes
-    """See `goal_rewards.encode_request`."""
+    """Arrays `achieved` and `desired`, shape (n, *goal), as safetensors."""
 
 
 Message = Build | SetEvents | Attach | BeginEpisodes | LoadPolicy | LimitActions | Play | ComputeRewards

@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterable
 from multiprocessing.connection import wait
 
 from rlctl.rollout import messages
-from rlctl.rollout.child_process import ChildProcess, LineReader
+from rlctl.rollout.child_process import MAX_LINE_BYTES, ChildProcess, LineFilter, LineReader
 from rlctl.rollout.messages import Answer, Job, Message
-from rlctl.rollout.worker_output import MAX_LINE_BYTES, LineFilter
 
 _CHECK_EVERY_S = 0.2
 

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.dict_spaces import SINGLE, split, split_space
+from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
 from rlctl.rollout.shared_arrays import observation_fields
 
 STEP = ("observation", "reward", "terminated", "truncated", "info")
@@ -108,3 +109,26 @@ def _category_bounds(space: spaces.Space[Any]) -> NDArray[Any] | None:
         start = np.asarray(space.start)
         return np.stack([start, start + space.nvec - 1])
     return None
+
+
+def compute_rewards(env: Any, goals: Mapping[str, NDArray[Any]]) -> list[float]:
+    """Return the rewards that an environment computes for n achieved and n desired goals; else `TaskError`."""
+    count = len(goals["achieved"])
+    infos: list[dict[str, Any]] = [{} for _ in range(count)]
+    try:
+        rewards = np.asarray(env.unwrapped.compute_reward(goals["achieved"], goals["desired"], infos))
+    except BaseException as error:  # a plugin may raise anything, SystemExit too
+        raise TaskError(
+            f"compute_reward raised {describe_exception(error)}", details=format_plugin_traceback(error)
+        ) from error
+    if rewards.dtype.kind not in "fiub":
+        raise TaskError(f"compute_reward returned an array of {rewards.dtype}, not of numbers")
+    if rewards.shape != (count,):
+        raise TaskError(f"compute_reward returned shape {rewards.shape} for {count} goals at once, not ({count},)")
+    if not np.isfinite(rewards).all():
+        bad = int(np.flatnonzero(~np.isfinite(rewards))[0])
+        raise TaskError(
+            f"compute_reward is {rewards[bad]} for achieved {goals['achieved'][bad]}, desired {goals['desired'][bad]}"
+        )
+    result: list[float] = rewards.astype(np.float64).tolist()
+    return result

@@ -16,6 +16,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+import safetensors.numpy
 from gymnasium import spaces
 from numpy.typing import NDArray
 
@@ -24,14 +25,13 @@ from rlctl.env_spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
 from rlctl.rollout import messages
 from rlctl.rollout.baselines import make_player
+from rlctl.rollout.child_process import write_stderr
 from rlctl.rollout.failures import FailedInEpisode, describe_failure
-from rlctl.rollout.goal_rewards import compute_answer
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
-from rlctl.rollout.returned_values import ObservationWriter
+from rlctl.rollout.returned_values import ObservationWriter, compute_rewards
 from rlctl.rollout.running_episode import RunningEpisode
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
-from rlctl.rollout.worker_output import write_stderr
 from rlctl.run.acting import Player, PolicyPlayer
 from rlctl.run.env_info import EnvInfo, describe
 from rlctl.task.env import TaskEnv
@@ -58,7 +58,7 @@ class Worker:
             case messages.BeginEpisodes():
                 return Answer(left=self._begin_episodes(message))
             case messages.ComputeRewards():
-                return Answer(rewards=compute_answer(self._episodes[0].env, message.goals))
+                return Answer(rewards=compute_rewards(self._episodes[0].env, safetensors.numpy.load(message.goals)))
             case messages.Build():
                 self._build(message.spec)
                 return Answer(info=self._info)

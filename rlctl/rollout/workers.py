@@ -13,19 +13,18 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NoReturn
 
 import numpy as np
+import safetensors.numpy
 from numpy.typing import NDArray
 
 from rlctl.dict_spaces import Observations, join
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
-from rlctl.rollout import goal_rewards, messages
-from rlctl.rollout.child_process import anonymous_file
+from rlctl.rollout import messages
+from rlctl.rollout.child_process import anonymous_file, write_stderr
 from rlctl.rollout.failures import format_hint, make_error
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
-from rlctl.rollout.policy_numbers import PolicyNumbers
 from rlctl.rollout.process_pool import ProcessPool, WorkerFault
-from rlctl.rollout.shared_arrays import SharedArrays
-from rlctl.rollout.worker_output import write_stderr
+from rlctl.rollout.shared_arrays import PolicyNumbers, SharedArrays
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.policy import PolicyInfo
 
@@ -214,7 +213,9 @@ class Workers:
         does not return n finite numbers.
         """
         self._wait_until_built()
-        self._send(0, messages.ComputeRewards(goal_rewards.encode_request(achieved, desired)))
+        # safetensors writes the memory as it lies, so that columns would be taken for rows.
+        goals = {"achieved": np.ascontiguousarray(achieved), "desired": np.ascontiguousarray(desired)}
+        self._send(0, messages.ComputeRewards(safetensors.numpy.save(goals)))
         return np.array(self._wait("in compute_reward")[0].rewards, np.float64)
 
     def _by_worker(self, envs: Iterable[int]) -> dict[int, list[int]]:

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import inspect
+import itertools
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from rich.filesize import decimal as format_bytes
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from rlctl.dict_spaces import split_space
 from rlctl.errors import RecipeError, UsageError, short_repr
-from rlctl.run.recipe import Normalize, Recipe
+from rlctl.run import memory
+from rlctl.run.recipe import ON_POLICY, Normalize, Recipe
 from rlctl.run.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
-from rlctl.train import footprint
 from rlctl.train.hindsight import replay_arguments
 from rlctl.train.vec_env import WorkerVecEnv
 
+# numpy reserves a replay buffer without touching it: one of a terabyte is made at once, and fills up step by step.
+_FLOAT32 = 4  # [bytes]
+_BYTES_PER_WEIGHT = 4 * _FLOAT32  # the weight, its gradient, and two moments of the optimiser
+_LSTM_PARTS = 4  # hidden and cell state, of actor and critic
+_USABLE_SHARE = 0.9  # of the memory that is free; the environments need some as well
 _CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
 
 
@@ -37,7 +45,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         raise RecipeError(f"{recipe.algo} cannot be used here: it has no network for {kind}")
     check_spaces(recipe.algo, env.observation_space, env.action_space)
     _check_rollout(recipe, env.num_envs)
-    footprint.check(recipe, env)
+    _check_memory(recipe, env)
     keep_compiler_out()
     try:
         model: BaseAlgorithm = cls(
@@ -159,3 +167,44 @@ def wrap_normalize(env: VecEnv, settings: Normalize | None, gamma: float) -> Vec
 
 def _is_real(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and not is_image_space(space)
+
+
+def _check_memory(recipe: Recipe, env: VecEnv) -> None:
+    """Raise `RecipeError`, with the bytes, for buffers or networks that do not fit into this machine's memory."""
+    free = memory.available()
+    for name, size in _sizes(recipe, env).items():
+        if free is not None and size > _USABLE_SHARE * free:
+            _, _, key = name.partition(".")
+            given = recipe.algo_kwargs.get(key) if key else "this network"
+            needs, are = format_bytes(size), format_bytes(free)
+            raise RecipeError(f"{name}: {given} needs {needs} of memory, and {are} are free; give less")
+
+
+def _sizes(recipe: Recipe, env: VecEnv) -> dict[str, int]:
+    """Return the bytes that each of a recipe's keys asks for."""
+    kwargs, network = recipe.algo_kwargs, recipe.policy_kwargs
+    parts = [(math.prod(part.shape or ()), part.dtype) for part in split_space(env.observation_space).values()]
+    observation = sum(elements for elements, _ in parts) * _FLOAT32
+    action = math.prod(env.action_space.shape or ()) * _FLOAT32
+    if recipe.algo in ON_POLICY:
+        row = observation + action + 6 * _FLOAT32
+        if recipe.algo == "recurrent_ppo":
+            hidden = int(network.get("lstm_hidden_size", 256))
+            row += _LSTM_PARTS * int(network.get("n_lstm_layers", 1)) * hidden * _FLOAT32
+        buffers = {"algo_kwargs.n_steps": int(kwargs.get("n_steps", 5)) * env.num_envs * row}
+    else:  # observations before and after, action, reward and two flags; the buffer has them in the space's dtype
+        stored = sum(elements * np.dtype(dtype or np.float32).itemsize for elements, dtype in parts)
+        buffers = {
+            "algo_kwargs.buffer_size": int(kwargs["buffer_size"]) * (2 * stored + action + 3 * _FLOAT32),
+            "algo_kwargs.batch_size": int(kwargs.get("batch_size", 1)) * (2 * observation + action + 3 * _FLOAT32),
+        }
+    return {**buffers, "policy_kwargs": _count_weights(network) * _BYTES_PER_WEIGHT}
+
+
+def _count_weights(kwargs: Mapping[str, Any]) -> int:
+    """Return how many weights lie between given layers; what depends on the spaces is not counted."""
+    arch = kwargs.get("net_arch") or []
+    parts = list(arch.values()) if isinstance(arch, Mapping) else [arch, arch]
+    weights = sum(int(before) * int(after) for part in parts for before, after in itertools.pairwise(part))
+    hidden = int(kwargs.get("lstm_hidden_size", 0))
+    return weights + 2 * 4 * hidden * hidden * int(kwargs.get("n_lstm_layers", 1))

@@ -17,16 +17,15 @@ from rlctl.rollout.collect import Episode
 from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
 from rlctl.runs.diagnosis import Grade, diagnose
-from rlctl.train import measurements, status, table_rows
+from rlctl.train import measurements, status
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
-from rlctl.train.episodes import EpisodeKeeper
-from rlctl.train.evaluation import Evaluator
-from rlctl.train.finite import check_finite
+from rlctl.train.evaluation import EpisodeKeeper, Evaluator
 from rlctl.train.pack import pack
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Rollouts
 from rlctl.train.saving import Packed, Saver
+from rlctl.train.snapshot import check_finite
 
 _OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
 
@@ -168,12 +167,12 @@ class TrainingLoop:
             "fps": round((steps - steps_before) / elapsed, 1),
             "playing": round(self._env.waited_s / elapsed, 3),
             **self.curriculum.columns(),
-            **table_rows.training_row(recent, self._env.workers.info.reward_weights, logger.name_to_value),
+            **measurements.training_row(recent, self._env.workers.info.reward_weights, logger.name_to_value),
             **measurements.measure(self._model, self._env, progress.last_row, self.recipe.total_timesteps),
         }
         self._env.waited_s = 0.0
         self.saver.row(self.saver.metrics, row)
-        for name, value in table_rows.tensorboard_values(row).items():
+        for name, value in measurements.tensorboard_values(row).items():
             logger.record(name, value)
         self._model.dump_logs()
         self._display.metrics(row)
@@ -233,7 +232,7 @@ class TrainingLoop:
             "steps": steps,
             "seconds": round(time.monotonic() - self._started, 3),
             **self.curriculum.columns(),
-            **table_rows.evaluation_row(results),
+            **measurements.evaluation_row(results),
         }
         self.saver.row(self.saver.evals, row)
         logger.record("eval/mean_reward", mean)

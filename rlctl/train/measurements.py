@@ -1,14 +1,14 @@
-"""What a row of metrics has beside returns and losses: actions, exploration, values, gradients.
+"""The columns of `metrics.csv` and `evals.csv`, beside those of steps, time and stage.
 
-All of it is read from what SB3 holds after an update anyway, and depends on steps alone, so a resumed run measures the
-same. Where something does not exist, as limits of discrete actions, it is None.
+Actions, exploration, values and gradients are read from what SB3 holds after an update anyway; it depends on steps
+alone, so a resumed run measures the same. Where something does not exist, as limits of discrete actions, it is None.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rlctl.dict_spaces import split
+from rlctl.eval.statistics import mean_return, mean_terms, success_rate
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.env_info import EnvInfo
 from rlctl.train.vec_env import WorkerVecEnv
 
@@ -30,6 +32,13 @@ _SAMPLES = 2000
 """Values in a histogram."""
 _AT_LIMIT = 0.99
 """From this part of its range on an action counts as saturated."""
+
+
+_LOSSES = (
+    "learning_rate", "loss", "policy_gradient_loss", "policy_loss", "value_loss", "entropy_loss", "approx_kl",
+    "clip_fraction", "clip_range", "explained_variance", "std", "actor_loss", "critic_loss", "ent_coef",
+    "ent_coef_loss", "n_updates",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,3 +208,47 @@ def _angles(observation: Mapping[str, NDArray[Any]], info: EnvInfo) -> dict[str,
 def _sample(values: NDArray[Any]) -> torch.Tensor:
     flat = np.asarray(values, np.float32).ravel()
     return torch.from_numpy(flat[:: max(1, len(flat) // _SAMPLES)].copy())
+
+
+def training_row(recent: Sequence[EpisodeResult], terms: Iterable[str], log: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the episodes that ended lately have come to, and what SB3 logged of the last update.
+
+    `terms` are the names of the reward terms; missing values are None.
+    """
+    means = mean_terms(recent) if recent else {}
+    return {
+        "acting": _mean(each.acting for each in recent),
+        "return": mean_return(recent) if recent else None,
+        "length": _mean(each.length for each in recent),
+        "success": success_rate(recent) if recent else None,
+        "distance": _mean(each.final_distance for each in recent),
+        **{f"term/{name}": means.get(name) for name in terms},
+        **{name: log.get(f"train/{name}") for name in _LOSSES},
+    }
+
+
+def tensorboard_values(row: Mapping[str, Any]) -> dict[str, float]:
+    """Return what TensorBoard gets of a row of metrics, by its tags, beside what SB3 and `measurements` log."""
+    tags = {"distance": "rollout/final_distance", "stage": "curriculum/stage"}
+    tags |= {name: f"reward_terms/{name.removeprefix('term/')}" for name in row if name.startswith("term/")}
+    return {tag: row[name] for name, tag in tags.items() if row.get(name) is not None}
+
+
+def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Return what the episodes of an evaluation have come to."""
+    depths = [each.deepest_contact for each in results if each.deepest_contact is not None]
+    return {
+        "episodes": len(results),
+        "success": success_rate(results),
+        "return": mean_return(results),
+        "length": _mean(each.length for each in results),
+        "distance": _mean(each.final_distance for each in results),
+        "overlap": float(np.median(depths)) if depths else None,
+        **{f"term/{name}": value for name, value in mean_terms(results).items()},
+    }
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are known; None without any."""
+    known = [each for each in values if each is not None]
+    return float(np.mean(known)) if known else None

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from rlctl.check_env.check import Report, check
+from rlctl.check_env.families import find_rules
+from rlctl.check_env.finding import Severity
 from rlctl.env_spec import EnvSpec
+from rlctl.errors import AnswerIsNo
 from rlctl.named_task import RUN
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
@@ -15,13 +20,18 @@ from rlctl.run.policy import read_policy
 from rlctl.run.recipe import ON_POLICY
 from rlctl.train import status
 from rlctl.train.display import Display
-from rlctl.train.precheck import Precheck
 from rlctl.train.start import Start
 
 if TYPE_CHECKING:
     from rlctl.train.checkpoint import Checkpoints
     from rlctl.train.loop import Learner, TrainingLoop
     from rlctl.train.saving import Saver
+
+
+_CHECK_BUDGET_S = 2.0
+"""Time for playing episodes [s]; importing and building the environment come on top."""
+_EXPERIMENTS = ("build", "comparisons", "episodes")
+"""What one child process can do in that time."""
 
 
 @contextlib.contextmanager
@@ -33,7 +43,7 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
     with contextlib.ExitStack() as stack:
         # The workers build their environments, and the check runs, while this process imports torch.
         workers = stack.enter_context(_make_workers(specs[start.stage - 1], recipe.n_envs, start, display))
-        precheck = Precheck(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
+        precheck = _Precheck(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
         from rlctl.train.evaluation import Evaluator
         from rlctl.train.loop import TrainingLoop
 
@@ -97,8 +107,7 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
 def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Saver:
     """Restore the checkpoint, if there is one, and return what writes from now on."""
     from rlctl.train.checkpoint import Checkpoints
-    from rlctl.train.cut_back import cut_back
-    from rlctl.train.saving import Saver
+    from rlctl.train.saving import Saver, cut_back
     from rlctl.train.tensorboard import make_logger
 
     model = learner.rollouts.model
@@ -130,3 +139,53 @@ def _restore(start: Start, checkpoints: Checkpoints, learner: Learner) -> str:
     inexact += [mismatch] if mismatch else []
     exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "as if it had never stopped"
     return f"going on at step {start.step:,}, {exactness}"
+
+
+class _Precheck:
+    """Checks an environment in a child process, watched by a thread of this one."""
+
+    def __init__(self, spec: EnvSpec, env_timeout_s: float) -> None:
+        self._spec = spec
+        self._env_timeout_s = env_timeout_s
+        self._report: Report | None = None
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._check, daemon=True)  # the child ends with this process
+        self._thread.start()
+
+    def _check(self) -> None:
+        try:
+            self._report = check(
+                self._spec,
+                rules=find_rules(_EXPERIMENTS),
+                only=_EXPERIMENTS,
+                budget_s=_CHECK_BUDGET_S,
+                env_timeout_s=self._env_timeout_s,
+                show_progress=False,
+            )
+        except BaseException as error:  # raised again where somebody waits for it
+            self._error = error
+
+    def refuse_errors(self, display: Display) -> None:
+        """Wait for the end of the check; raises `AnswerIsNo` if it found an error."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        report = self._report
+        if report is None or report.records.built is None:
+            return  # the workers build it too, and report what is wrong
+        task, found = self._spec.task, report.verdict.findings
+        for name in report.verdict.crashed:
+            display.message(f"check before training: {name} crashed, a bug in rlctl; what it would find is not known")
+        errors = [finding for finding in found if finding.severity is Severity.ERROR]
+        if errors:
+            text = "; ".join(f"{each.rule} {each.name} ({each.message})" for each in errors)
+            count = f"{len(errors)} error{'s' if len(errors) > 1 else ''}"
+            raise AnswerIsNo(
+                f"the check before training found {count}: {text}\n"
+                f"rlctl check-env {task} shows details; --no-check trains anyway."
+            )
+        warnings = [finding.rule for finding in found if finding.severity is Severity.WARNING]
+        if warnings:
+            display.message(
+                f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} shows details"
+            )

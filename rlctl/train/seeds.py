@@ -25,9 +25,9 @@ from rlctl.rollout.workers import available_cores
 from rlctl.run import files
 from rlctl.run.group import Group, create_group, parse_seeds, read_group
 from rlctl.run.recipe_sources import resolve
-from rlctl.train.process_state import preserve_process_state
 from rlctl.train.request import TrainRequest
 from rlctl.train.signals import HandledSignals
+from rlctl.train.start import preserve_process_state
 from rlctl.train.warm_start import find_source
 
 CORES_PER_TRAINING = 2

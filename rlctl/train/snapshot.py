@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import random
 from collections import deque
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from rlctl.errors import ArtifactError
+from rlctl.errors import ArtifactError, DivergedError
 from rlctl.train.pack import observation_statistics
 
 Tensors = dict[str, NDArray[Any]]
@@ -23,6 +24,8 @@ Tensors = dict[str, NDArray[Any]]
 _COUNTERS = (
     "num_timesteps", "_n_updates", "_episode_num", "_n_calls", "exploration_rate", "_current_progress_remaining",
 )  # fmt: skip
+# Explained variance, for one, is not a number where rewards are constant, and nothing is wrong.
+_MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", "actor_loss", "critic_loss")
 
 
 def learned_tensors(model: BaseAlgorithm) -> tuple[Tensors, Any]:
@@ -179,3 +182,15 @@ def _restore_rollout(model: BaseAlgorithm, tensors: Tensors) -> None:
             for kind in ("pi", "vf")
         ]
         model._last_lstm_states = RNNStates(*pairs)  # type: ignore[attr-defined]
+
+
+def check_finite(model: BaseAlgorithm, run: Path) -> None:
+    """Raise `DivergedError`, which names `run`, if a loss, or a number that is learnt, is not finite."""
+    tensors, _ = learned_tensors(model)
+    losses = {name: np.array(model.logger.name_to_value.get(f"train/{name}", 0.0)) for name in _MUST_BE_FINITE}
+    for name, values in {**tensors, **losses}.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise DivergedError(
+                f"training diverged: {name.replace('/', ' ')} is not finite at step {model.num_timesteps:,}. A smaller "
+                f"algo_kwargs.learning_rate or a smaller reward helps most often.\nWhat was saved before is in {run}"
+            )

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import os
 import re
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from rlctl import registry
 from rlctl.errors import RecipeError, UsageError
@@ -16,7 +21,6 @@ from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.recipe import Recipe, validate
 from rlctl.run.recipe_sources import describe_rounding, resolve
 from rlctl.run.task_version import describe_task_changes
-from rlctl.train.process_state import preserve_process_state
 from rlctl.train.warm_start import find_source
 
 if TYPE_CHECKING:
@@ -167,3 +171,35 @@ def _reopen(found: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:
         return found
     progress = dataclasses.replace(found.progress, done=False, good_in_a_row=0)
     return dataclasses.replace(found, state=found.state.model_copy(update={"progress": progress}))
+
+
+@contextlib.contextmanager
+def preserve_process_state() -> Iterator[None]:
+    """Restore what importing somebody's module may change and a training relies on.
+
+    That is the working directory, the permissions of new files, and the defaults of numpy and torch. Signal handlers
+    are set anew when the training begins.
+    """
+    mask = os.umask(0o077)
+    os.umask(mask)
+    printing = np.get_printoptions()
+    try:
+        with contextlib.chdir("."), np.errstate():
+            yield
+    finally:
+        os.umask(mask)
+        np.set_printoptions(**printing)
+        _restore_torch()
+
+
+def _restore_torch() -> None:
+    """Reset torch's defaults, where a module has imported it: number type, device, gradients, determinism."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        return
+    torch.set_default_dtype(torch.float32)
+    torch.set_default_device(None)
+    torch.set_grad_enabled(True)
+    if torch.are_deterministic_algorithms_enabled():  # to set it imports torch's compiler
+        torch.use_deterministic_algorithms(False)
+    torch.autograd.set_detect_anomaly(False)

@@ -3,21 +3,91 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from rlctl.dict_spaces import split_space
 from rlctl.errors import EpisodeFailed
-from rlctl.rollout.history import ActionHistory
 from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.seeds import EpisodeAddress, Stream
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
-from rlctl.train.space_monitor import SpaceMonitor
+from rlctl.train.progress import Progress
+
+MAX_BYTES = 2**28
+"""Memory for actions, 256 MB, of which each environment has its part. A longer episode cannot be replayed."""
+
+
+class ActionHistory:
+    """Stores the actions of each environment's running episode; `episodes` are those so far, shape (steps, ...)."""
+
+    def __init__(self, episodes: Iterable[NDArray[Any]]) -> None:
+        self._parts = [[actions] for actions in episodes]
+        self._bytes = [actions.nbytes for (actions,) in self._parts]
+
+    def add_segment(self, actions: NDArray[Any], ended: Iterable[tuple[int, int]]) -> None:
+        """Store a segment, shape (n_envs, steps, ...), in which episodes ended: (environment, row) each, by row."""
+        last = dict(ended)
+        for env, rows in enumerate(actions):
+            new = rows[last.get(env, -1) + 1 :].copy()
+            if env in last:
+                self._parts[env], self._bytes[env] = [], 0
+            self._bytes[env] += new.nbytes
+            if self._bytes[env] <= MAX_BYTES // len(actions):
+                self._parts[env].append(new)
+
+    def of(self, env: int) -> NDArray[Any] | None:
+        """Return the actions of an environment's episode so far, shape (steps, ...); None if they are too many."""
+        parts = self._parts[env]
+        return np.concatenate(parts) if sum(part.nbytes for part in parts) == self._bytes[env] else None
+
+    def all(self) -> list[NDArray[Any] | None]:
+        """Return `of` every environment."""
+        return [self.of(env) for env in range(len(self._parts))]
+
+
+class SpaceMonitor:
+    """Looks at what all environments observe."""
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        parts = split_space(space).items()
+        self._boxes = {key: part for key, part in parts if isinstance(part, spaces.Box) and part.dtype != np.uint8}
+        self._outside = 0
+        self._message = ""
+
+    def look(self, observations: Mapping[str, NDArray[Any]]) -> None:
+        """Count the observations that are outside; arrays of shape (observations, ...)."""
+        outside: Any = False  # of each observation, once there is one
+        for key, box in self._boxes.items():
+            values = observations[key]
+            wrong = (values < box.low) | (values > box.high)
+            if wrong.any():
+                outside |= wrong.reshape(len(values), -1).any(axis=1)
+                self._message = self._message or _describe(key, box, values, wrong)
+        self._outside += int(np.count_nonzero(outside))
+
+    def report(self, progress: Progress) -> str | None:
+        """Add what was counted since the last report to `progress`; return a warning the first time."""
+        warning = None
+        if self._outside and not progress.observations_outside:
+            warning = f"warning: {self._message}; such observations are counted, and taken as they are"
+        progress.observations_outside += self._outside
+        self._outside = 0
+        return warning
+
+
+def _describe(key: str, box: spaces.Box, values: NDArray[Any], wrong: NDArray[np.bool_]) -> str:
+    row = int(np.flatnonzero(wrong.reshape(len(values), -1).any(axis=1))[0])
+    element = int(np.flatnonzero(wrong[row])[0])
+    value, low, high = (each.ravel()[element] for each in (values[row], box.low, box.high))
+    name = f"observation {key!r}" if key else "observation"
+    return f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
 
 
 class WorkerVecEnv(VecEnv):

@@ -5,11 +5,17 @@ import os
 import pytest
 
 from rlctl.env_spec import EnvSpec
-from rlctl.rollout.child_process import LineReader, anonymous_file
+from rlctl.rollout.child_process import (
+    MAX_LINE_BYTES,
+    MAX_LINES_PER_S,
+    LineFilter,
+    LineReader,
+    anonymous_file,
+    replace_control_characters,
+)
 from rlctl.rollout.failures import FailedInEpisode, describe_failure
 from rlctl.rollout.messages import Attach, Build, Failure, Job, LoadPolicy, Play
 from rlctl.rollout.worker import Worker
-from rlctl.rollout.worker_output import MAX_LINE_BYTES, MAX_LINES_PER_S, LineFilter, replace_control_characters
 from tests.train import faulty_envs
 
 ENVS = faulty_envs.__file__

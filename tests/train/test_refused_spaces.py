@@ -8,7 +8,7 @@ from rlctl.errors import RecipeError
 from rlctl.run.recipe import Recipe
 from rlctl.run.recipe_sources import describe_rounding, fill_defaults
 from rlctl.train.algorithms import check_spaces
-from rlctl.train.process_state import preserve_process_state
+from rlctl.train.start import preserve_process_state
 
 BOX = spaces.Box(-1, 1, (2,))
 
