@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 
 import numpy as np
@@ -19,23 +18,13 @@ class Stream(enum.IntEnum):
     CHECK = 5
 
 
-@dataclasses.dataclass(frozen=True)
-class EpisodeAddress:
-    """Names one episode of one run; enough, with the actions, to reproduce it."""
-
-    run_seed: int
-    stream: Stream
-    env_index: int
-    episode: int
-
-    @property
-    def seed(self) -> int:
-        """The seed given to `env.reset`, in [0, 2**31)."""
-        sequence = np.random.SeedSequence(self.run_seed, spawn_key=(int(self.stream), self.env_index, self.episode))
-        # Some environments hand the seed to a 32-bit signed generator.
-        return int(sequence.generate_state(1)[0]) >> 1
+def episode_seed(run_seed: int, stream: Stream, env_index: int, episode: int) -> int:
+    """Return the seed that an episode's address gives to `env.reset`, in [0, 2**31)."""
+    sequence = np.random.SeedSequence(run_seed, spawn_key=(int(stream), env_index, episode))
+    # Some environments hand the seed to a 32-bit signed generator.
+    return int(sequence.generate_state(1)[0]) >> 1
 
 
 def episode_seeds(run_seed: int, stream: Stream, episodes: int) -> list[int]:
     """Return the seeds of a numbered list of episodes, the same whichever environment plays each of them."""
-    return [EpisodeAddress(run_seed, stream, 0, index).seed for index in range(episodes)]
+    return [episode_seed(run_seed, stream, 0, index) for index in range(episodes)]

@@ -30,7 +30,7 @@ from rlctl.rollout.failures import FailedInEpisode, describe_failure
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
 from rlctl.rollout.returned_values import ObservationWriter, compute_rewards
 from rlctl.rollout.running_episode import RunningEpisode
-from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
 from rlctl.run.acting import Player, PolicyPlayer
 from rlctl.run.env_info import EnvInfo, describe
@@ -257,7 +257,7 @@ class Worker:
 def _training_seeds(run_seed: int, env: int, episode: int) -> Iterator[int]:
     """Yield the seeds of an environment's training episodes, from a number on."""
     for number in itertools.count(episode):
-        yield EpisodeAddress(run_seed, Stream.TRAIN, env, number).seed
+        yield episode_seed(run_seed, Stream.TRAIN, env, number)
 
 
 def main(connection: Connection, job: dict[str, Any]) -> None:

@@ -111,16 +111,14 @@ def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Displa
     from rlctl.train.tensorboard import make_logger
 
     model = learner.rollouts.model
-    resumed_at = None if start.run is None else start.step
-    model.set_logger(make_logger(run.tensorboard, display.message, resumed_at))
+    model.set_logger(make_logger(run.tensorboard, display.message, None if start.run is None else start.step))
     checkpoints = Checkpoints(run, model, learner.rollouts.env, start.recipe.checkpoint.keep)
     for note in start.notes:
         display.message(note)
     if start.checkpoint is not None:
         display.message(_restore(start, checkpoints, learner))
-    if start.run is not None:
-        for note in cut_back(run, start.step, learner.progress):
-            display.message(note)
+    for warning in cut_back(run, start.step, learner.progress) if start.run else ():
+        display.message(warning)
     status.write_start(run, start)
     saver = Saver(run, checkpoints, display.message)
     saver.saved_step = start.step if start.checkpoint is not None else None

@@ -67,12 +67,10 @@ class Saver:
 
     def retry(self, write: Callable[[], bool]) -> bool:
         """Call `write` until it returns True, a few times: after the last checkpoint there is no next one."""
-        if write():
-            return True
-        for pause in PAUSES_S:
-            time.sleep(pause)
+        for pause in (*PAUSES_S, 0.0):
             if write():
                 return True
+            time.sleep(pause)
         return False
 
     def row(self, table: Table, row: dict[str, Any]) -> None:

@@ -10,11 +10,10 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 from rlctl import output, registry
 from rlctl.errors import Interrupted, RlctlError, UsageError
@@ -97,7 +96,7 @@ def _begin(request: TrainRequest, seeds: str) -> Group:
 
 def list_options(request: TrainRequest) -> list[str]:
     """Return the options of `rlctl train` that a request stands for, but for its task, seed and folder."""
-    options = [f"--set={key}={json.dumps(value)}" for key, value in _flatten(request.settings)]
+    options = [f"--set={key}={json.dumps(value)}" for key, value in request.settings.items()]
     options += [f"--config={request.config}"] if request.config is not None else []
     options += [f"--from={request.initial_policy}"] if request.initial_policy is not None else []
     options += [f"--record={request.record}"] if request.record else []
@@ -109,14 +108,6 @@ def list_options(request: TrainRequest) -> list[str]:
     ):
         options += [f"--{name}={value}"] if value != usual else []
     return options if request.check else [*options, "--no-check"]
-
-
-def _flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in settings.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _choose_jobs(group: Group, waiting: int, jobs: int | None) -> int:

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from rlctl.dict_spaces import split_space
 from rlctl.errors import EpisodeFailed
 from rlctl.rollout.messages import EpisodeResult, Play
-from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
@@ -112,7 +112,7 @@ class WorkerVecEnv(VecEnv):
         super().__init__(workers.n_envs, *workers.info.spaces())
 
     def _seed(self, env: int, episode: int) -> int:
-        return EpisodeAddress(self.run_seed, Stream.TRAIN, env, episode).seed
+        return episode_seed(self.run_seed, Stream.TRAIN, env, episode)
 
     def reset(self) -> Any:
         try:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rlctl.env_spec import EnvSpec
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import Play
-from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run.acting import Exploration
 from rlctl.run.policy import PolicyInfo
@@ -109,7 +109,7 @@ class _Player:
         self._begin()
 
     def _begin(self) -> None:
-        seeds = {env: EpisodeAddress(0, Stream.TRAIN, env, 0).seed for env in range(self.workers.n_envs)}
+        seeds = {env: episode_seed(0, Stream.TRAIN, env, 0) for env in range(self.workers.n_envs)}
         self._play(seeds)
 
     def _play(self, begin: dict[int, int]) -> None:

@@ -4,13 +4,13 @@ import dataclasses
 
 import pytest
 
-from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.rollout.seeds import Stream, episode_seed
 from tests.crash.contract import assert_quiet, assert_same_end
 from tests.crash.trials import ARGUMENTS, only_run, resume
 
 pytestmark = pytest.mark.crash
 
-SEED = EpisodeAddress(0, Stream.TRAIN, 1, 3).seed
+SEED = episode_seed(0, Stream.TRAIN, 1, 3)
 """Of the fourth episode of the second environment: its seventh step is the 37th, in the fifth rollout of eight."""
 
 SDE = [*ARGUMENTS["ppo, kept"], "--set", "algo_kwargs.use_sde=true"]

@@ -5,7 +5,7 @@ import pytest
 
 from rlctl.errors import EpisodeFailed
 from rlctl.rollout.messages import Play
-from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.run.acting import Exploration, PolicyPlayer
 from tests.rollout.policies import linear
 
@@ -16,7 +16,7 @@ WEIGHT = -0.1 * np.eye(2)
 
 
 def seed(env: int, episode: int) -> int:
-    return EpisodeAddress(3, Stream.TRAIN, env, episode).seed
+    return episode_seed(3, Stream.TRAIN, env, episode)
 
 
 def play(workers, segments, steps):

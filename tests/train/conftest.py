@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.rollout.seeds import EpisodeAddress, Stream
+from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.run import recipe
 from rlctl.run.directory import RunDirectory
 from rlctl.train import saving
@@ -11,7 +11,7 @@ from rlctl.train.request import TrainRequest, TrainResult, run_training
 
 ENVS = Path(__file__).with_name("envs.py")
 FAULTY = ENVS.with_name("faulty_envs.py")
-FAULTY_SEED = EpisodeAddress(0, Stream.TRAIN, 1, 3).seed
+FAULTY_SEED = episode_seed(0, Stream.TRAIN, 1, 3)
 """Of the fourth episode of the second environment: its seventh step is the 37th of them, in the third rollout."""
 
 SMALL = {

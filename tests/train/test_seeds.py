@@ -147,6 +147,6 @@ def test_the_options_of_a_request():
     settings = {"algo": "sac", "algo_kwargs": {"gamma": 0.97}, "task": {}, "n_envs": 2}
     request = TrainRequest("reach", settings=settings, check=True, initial_policy="reach", device="cuda")
     assert list_options(request) == [
-        '--set=algo="sac"', "--set=algo_kwargs.gamma=0.97", "--set=task={}", "--set=n_envs=2", "--from=reach",
+        '--set=algo="sac"', '--set=algo_kwargs={"gamma": 0.97}', "--set=task={}", "--set=n_envs=2", "--from=reach",
         "--device=cuda",
     ]  # fmt: skip
