@@ -145,19 +145,16 @@ class Workers:
     def reset(self, seeds: Mapping[int, int]) -> None:
         """Begin an episode in some environments: environment index -> seed."""
         nothing = self.arrays.segment.action[0, :0]
-        self._begin_episodes({env: (seed, nothing) for env, seed in seeds.items()}, "resetting")
+        self.replay_actions({env: (seed, nothing) for env, seed in seeds.items()}, doing="resetting")
 
-    def replay_actions(self, episodes: Mapping[int, RecordedActions], *, may_fail: bool = False) -> set[int]:
+    def replay_actions(
+        self, episodes: Mapping[int, RecordedActions], *, doing: str = "stepping", may_fail: bool = False
+    ) -> set[int]:
         """Begin episodes, environment index -> (seed, actions so far), and take those steps.
 
         Return the environments whose episode ended on the way: they are not where they were. With `may_fail` also those
-        in which it failed, which is an error otherwise.
+        in which it failed, which is an error otherwise. `doing` is what an error says of it.
         """
-        return self._begin_episodes(episodes, "replaying episodes" if may_fail else "stepping", may_fail=may_fail)
-
-    def _begin_episodes(
-        self, episodes: Mapping[int, RecordedActions], doing: str, *, may_fail: bool = False
-    ) -> set[int]:
         dtype = self.arrays.segment.action.dtype
         for worker, envs in self._by_worker(episodes).items():
             begun = {env: (episodes[env][0], episodes[env][1].astype(dtype).tobytes()) for env in envs}

@@ -44,7 +44,6 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         kind = "dictionaries" if isinstance(env.observation_space, spaces.Dict) else "images"
         raise RecipeError(f"{recipe.algo} cannot be used here: it has no network for {kind}")
     check_spaces(recipe.algo, env.observation_space, env.action_space)
-    _check_rollout(recipe, env.num_envs)
     _check_memory(recipe, env)
     keep_compiler_out()
     try:
@@ -135,12 +134,6 @@ def _policy_kwargs(recipe: Recipe) -> dict[str, Any]:
     if "activation_fn" in kwargs:
         kwargs["activation_fn"] = ACTIVATIONS[kwargs["activation_fn"]]
     return kwargs
-
-
-def _check_rollout(recipe: Recipe, n_envs: int) -> None:
-    kwargs: Mapping[str, Any] = recipe.algo_kwargs
-    if recipe.algo == "ppo" and int(kwargs["n_steps"]) * n_envs < 2:
-        raise RecipeError("algo_kwargs.n_steps: one environment needs at least 2 steps a rollout")
 
 
 def wrap_normalize(env: VecEnv, settings: Normalize | None, gamma: float) -> VecEnv:

@@ -121,12 +121,18 @@ class TrainingLoop:
             self.save_checkpoint()
 
     def _take_ended(self) -> None:
-        ended = self._env.take_ended()
-        self.progress.recent += ended
+        env, progress = self._env, self.progress
+        ended, env.ended = env.ended, []
+        progress.recent += ended
         self.curriculum.count(ended)
-        for warning in (self.curriculum.warning(), self._env.monitor.report(self.progress)):
-            if warning:
-                self._display.message(warning)
+        if warning := self.curriculum.warning():
+            self._display.message(warning)
+        if env.outside and not progress.observations_outside:
+            self._display.message(
+                f"warning: {env.outside_message}; such observations are counted, and taken as they are"
+            )
+        progress.observations_outside += env.outside
+        env.outside = 0
 
     def _begin_next_stage(self) -> None:
         self._env.workers.rebuild(self.curriculum.next_spec())

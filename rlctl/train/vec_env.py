@@ -18,7 +18,6 @@ from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
-from rlctl.train.progress import Progress
 
 MAX_BYTES = 2**28
 """Memory for actions, 256 MB, of which each environment has its part. A longer episode cannot be replayed."""
@@ -52,42 +51,22 @@ class ActionHistory:
         return [self.of(env) for env in range(len(self._parts))]
 
 
-class SpaceMonitor:
-    """Looks at what all environments observe."""
-
-    def __init__(self, space: spaces.Space[Any]) -> None:
-        parts = split_space(space).items()
-        self._boxes = {key: part for key, part in parts if isinstance(part, spaces.Box) and part.dtype != np.uint8}
-        self._outside = 0
-        self._message = ""
-
-    def look(self, observations: Mapping[str, NDArray[Any]]) -> None:
-        """Count the observations that are outside; arrays of shape (observations, ...)."""
-        outside: Any = False  # of each observation, once there is one
-        for key, box in self._boxes.items():
-            values = observations[key]
-            wrong = (values < box.low) | (values > box.high)
-            if wrong.any():
-                outside |= wrong.reshape(len(values), -1).any(axis=1)
-                self._message = self._message or _describe(key, box, values, wrong)
-        self._outside += int(np.count_nonzero(outside))
-
-    def report(self, progress: Progress) -> str | None:
-        """Add what was counted since the last report to `progress`; return a warning the first time."""
-        warning = None
-        if self._outside and not progress.observations_outside:
-            warning = f"warning: {self._message}; such observations are counted, and taken as they are"
-        progress.observations_outside += self._outside
-        self._outside = 0
-        return warning
-
-
-def _describe(key: str, box: spaces.Box, values: NDArray[Any], wrong: NDArray[np.bool_]) -> str:
-    row = int(np.flatnonzero(wrong.reshape(len(values), -1).any(axis=1))[0])
-    element = int(np.flatnonzero(wrong[row])[0])
-    value, low, high = (each.ravel()[element] for each in (values[row], box.low, box.high))
-    name = f"observation {key!r}" if key else "observation"
-    return f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
+def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
+    """Return how many observations, shape (n_envs, steps, ...), are outside their space, and what is wrong with one."""
+    outside: Any = False  # of each observation, once there is one
+    message = ""
+    for key, box in split_space(space).items():
+        if not isinstance(box, spaces.Box) or box.dtype == np.uint8:
+            continue
+        values = observations[key]
+        wrong = ((values < box.low) | (values > box.high)).reshape(*values.shape[:2], -1)
+        if wrong.any():
+            outside |= wrong.any(axis=2)
+            env, step, element = np.argwhere(wrong)[0].tolist()
+            value, low, high = (each.ravel()[element] for each in (values[env, step], box.low, box.high))
+            name = f"observation {key!r}" if key else "observation"
+            message = f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
+    return int(np.count_nonzero(outside)), message
 
 
 class WorkerVecEnv(VecEnv):
@@ -100,9 +79,10 @@ class WorkerVecEnv(VecEnv):
         """Per environment, how many episodes have begun: the next one's number."""
         self.history = ActionHistory(workers.arrays.segment.action[:, :0])
         """What was done in the running episodes."""
-        self.monitor = SpaceMonitor(workers.info.spaces()[0])
+        self.outside, self.outside_message = 0, ""
+        """Observations outside their space since it was set to 0, and what was wrong with one."""
         self.ended: list[EpisodeResult] = []
-        """Episodes that ended since the last `take_ended`."""
+        """Episodes that ended since it was emptied."""
         self.last_segment: SegmentArrays | None = None
         """What `finish` returned last; its arrays are overwritten by the next."""
         self.waited_s = 0.0
@@ -132,7 +112,8 @@ class WorkerVecEnv(VecEnv):
         """
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
-        ended = self.workers.replay_actions(dict(enumerate(zip(seeds, actions, strict=True))), may_fail=True)
+        episodes = dict(enumerate(zip(seeds, actions, strict=True)))
+        ended = self.workers.replay_actions(episodes, doing="replaying episodes", may_fail=True)
         self.history = ActionHistory(actions)
         return ended
 
@@ -159,8 +140,9 @@ class WorkerVecEnv(VecEnv):
             self.episodes_started[result.env] += 1
         self.history.add_segment(segment.action[:, :steps], [(each.env, each.row) for each in ended])
         self.ended += ended
-        seen = {key: rows[:, 1 : steps + 1].reshape(-1, *rows.shape[2:]) for key, rows in segment.observation.items()}
-        self.monitor.look(seen)
+        seen = {key: rows[:, 1 : steps + 1] for key, rows in segment.observation.items()}
+        count, message = _count_outside(self.observation_space, seen)
+        self.outside, self.outside_message = self.outside + count, self.outside_message or message
         self.last_segment = segment.first(steps, ended)
         return self.last_segment
 
@@ -178,11 +160,6 @@ class WorkerVecEnv(VecEnv):
 
     def step_wait(self) -> Any:
         raise NotImplementedError("workers play segments; nothing steps them one by one")
-
-    def take_ended(self) -> list[EpisodeResult]:
-        """Return the episodes that ended since the last call."""
-        ended, self.ended = self.ended, []
-        return ended
 
     def close(self) -> None:
         self.workers.close()
