@@ -117,11 +117,11 @@ class CWriter:
         """Write a part of the observation as features: one-hot, normalised or as it is."""
         if isinstance(layer, OneHot):
             for number, count in enumerate(layer.sizes.ravel().tolist()):
-                element = f"{target}[{_add(feature)}]"
+                element = f"{target}[{_offset(feature)}]"
                 self.loop(count, f"{element} = (int){source}[{start + number}] == i ? 1.0f : 0.0f;")
                 feature += count
             return
-        value = f"{source}[{_add(start)}]"
+        value = f"{source}[{_offset(start)}]"
         if isinstance(layer, Normalize):
             # In float64, as `Normalize` computes it.
             deviation = self.constant("deviation", np.sqrt(layer.variance + layer.epsilon), "double")
@@ -129,7 +129,7 @@ class CWriter:
             if np.isfinite(layer.clip):
                 value = f"bound({value}, {write_number(-layer.clip, 'double')}, {write_number(layer.clip, 'double')})"
             value = f"(float)({value})"
-        self.loop(size, f"{target}[{_add(feature)}] = {value};")
+        self.loop(size, f"{target}[{_offset(feature)}] = {value};")
 
     def _write_layers(self, layers: Iterable[Layer], value: str, size: int) -> tuple[str, int]:
         for layer in layers:
@@ -218,7 +218,7 @@ def _count_features(layer: Layer, size: int) -> int:
     return int(layer.sizes.sum()) if isinstance(layer, OneHot) else size
 
 
-def _add(offset: int) -> str:
+def _offset(offset: int) -> str:
     return f"{offset} + i" if offset else "i"
 
 

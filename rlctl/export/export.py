@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
-from rlctl.export.report import CReport, ExportReport, OnnxReport, Port, format_agreement, format_closed_loop
+from rlctl.export.report import ExportReport, format_agreement, format_closed_loop
 from rlctl.output import print_notes
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import files, lookup, onnx_file
@@ -101,18 +101,30 @@ def _export_onnx(job: _Export, target: Path, model: onnx.ModelProto) -> ExportRe
     def write(part: Path) -> None:
         part.write_bytes(onnx_file.encode(model))
         exported = OnnxPolicy.load(part)
+        ports = {"inputs": exported.session.get_inputs(), "outputs": exported.session.get_outputs()}
+        opset, size = model.opset_import[0].version, part.stat().st_size
         reports.append(
-            OnnxReport(
+            ExportReport(
                 **_verify(job, target, exported, part, "the ONNX file", 1000),
-                size=part.stat().st_size,
-                opset=model.opset_import[0].version,
-                inputs=_list_ports(exported.session.get_inputs()),
-                outputs=_list_ports(exported.session.get_outputs()),
+                size=size,
+                written=f"{target} ({size / 1000:,.1f} kB, opset {opset})",
+                interface=[(kind, ", ".join(map(_format_port, each))) for kind, each in ports.items()],
+                next=f"rlctl eval {target} --task {job.info.spec.task}",
+                details={"opset": opset} | {kind: [_describe_port(one) for one in ports[kind]] for kind in ports},
             )
         )
 
     files.write_with(target, write)
     return reports[0]
+
+
+def _describe_port(port: Any) -> dict[str, Any]:
+    return {"name": port.name, "dtype": port.type.removeprefix("tensor(").removesuffix(")"), "shape": port.shape}
+
+
+def _format_port(port: Any) -> str:
+    name, dtype, shape = _describe_port(port).values()
+    return f"{name} {dtype}[{', '.join(map(str, shape))}]"
 
 
 def _export_c(job: _Export, target: Path, code: CSource) -> ExportReport:
@@ -131,7 +143,14 @@ def _export_c(job: _Export, target: Path, code: CSource) -> ExportReport:
     files.write_text(header, code.header)
     files.write_text(target, code.source)
     size = len(code.source.encode()) + len(code.header.encode())
-    return CReport(**seen, size=size, header=header, prototype=code.prototype, compiler=(compiler or [""])[0])
+    return ExportReport(
+        **seen,
+        size=size,
+        written=f"{target} and {header.name} ({size / 1000:,.1f} kB, C99)",
+        interface=[("function", code.prototype)],
+        next=f"cc -std=c99 -O3 -c {target}",
+        details={"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0]},
+    )
 
 
 def _describe(job: _Export, target: Path) -> dict[str, Any]:
@@ -171,7 +190,3 @@ def _explain_failure(job: _Export, target: Path, what: str, seen: Verification) 
         )
     numbers = f"{format_agreement(seen.agreement)}\n{format_closed_loop(seen.closed_loop)}"
     return f"{target}: not verified, not kept: {why}\n{numbers}"
-
-
-def _list_ports(found: Any) -> list[Port]:
-    return [Port(each.name, each.type[len("tensor(") : -1], tuple(each.shape)) for each in found]

@@ -3,23 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rlctl import output
 from rlctl.export.verify import MAX_DIFFERENCE, Agreement, ClosedLoop, Latency
-
-
-@dataclasses.dataclass(frozen=True)
-class Port:
-    """An input or output of the graph."""
-
-    name: str
-    dtype: str
-    shape: tuple[int | str, ...]
-
-    def __str__(self) -> str:
-        return f"{self.name} {self.dtype}[{', '.join(str(size) for size in self.shape)}]"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,6 +22,14 @@ class ExportReport:
     training_steps: int
     size: int
     """[bytes]"""
+    written: str
+    """What was written, for people."""
+    interface: list[tuple[str, str]]
+    """What goes in and comes out, for people: a word and a text each."""
+    next: str
+    """A command to go on with."""
+    details: Mapping[str, Any]
+    """What is known of a file of this format alone."""
     agreement: Agreement | None = None
     closed_loop: ClosedLoop | None = None
     latency: Latency | None = None
@@ -41,7 +38,9 @@ class ExportReport:
 
     def as_json(self) -> dict[str, Any]:
         """Return what is written as JSON."""
-        result = {**dataclasses.asdict(self), "verified": not self.not_verified}
+        result = {**dataclasses.asdict(self), **self.details, "verified": not self.not_verified}
+        for name in ("written", "interface", "next", "details"):
+            del result[name]
         if self.agreement and self.latency:
             result |= {name: getattr(self.agreement, name) for name in ("max_difference", "observations")}
             result["latency"]["speedup"] = self.latency.speedup
@@ -49,12 +48,10 @@ class ExportReport:
 
     def list_rows(self) -> list[tuple[str, str]]:
         """Return the lines of the report: a word and a text each."""
-        rows = [
-            ("policy", f"{self.algo} for {self.task}, {self.training_steps:,} steps, from {self.policy}"),
-            *self._list_interface(),
-        ]
+        policy = f"{self.algo} for {self.task}, {self.training_steps:,} steps, from {self.policy}"
+        rows = [("exported", self.written), ("policy", policy), *self.interface]
         if self.not_verified or not (self.agreement and self.closed_loop and self.latency):
-            return [*rows, ("not verified", self.not_verified)]
+            return [*rows, ("not verified", self.not_verified), ("next", self.next)]
         latency = self.latency
         times = f"{latency.exported_us:.1f} us for one observation; SB3 {latency.sb3_us:.1f} us, {latency.speedup:.1f}x"
         return [
@@ -62,46 +59,8 @@ class ExportReport:
             ("verified", format_agreement(self.agreement)),
             ("closed loop", format_closed_loop(self.closed_loop)),
             ("latency", times),
+            ("next", self.next),
         ]
-
-    def _list_interface(self) -> list[tuple[str, str]]:
-        raise NotImplementedError
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class OnnxReport(ExportReport):
-    """An ONNX file."""
-
-    opset: int
-    inputs: list[Port]
-    outputs: list[Port]
-
-    def list_rows(self) -> list[tuple[str, str]]:
-        """Return the lines of the report."""
-        written = ("exported", f"{self.path} ({self.size / 1000:,.1f} kB, opset {self.opset})")
-        return [written, *super().list_rows(), ("next", f"rlctl eval {self.path} --task {self.task}")]
-
-    def _list_interface(self) -> list[tuple[str, str]]:
-        return [("inputs", ", ".join(map(str, self.inputs))), ("outputs", ", ".join(map(str, self.outputs)))]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CReport(ExportReport):
-    """A C source file and its header."""
-
-    header: Path
-    prototype: str
-    """Declaration of the function that acts."""
-    compiler: str
-    """What it was compiled with to verify it; empty if it was not."""
-
-    def list_rows(self) -> list[tuple[str, str]]:
-        """Return the lines of the report."""
-        written = ("exported", f"{self.path} and {self.header.name} ({self.size / 1000:,.1f} kB, C99)")
-        return [written, *super().list_rows(), ("next", f"cc -std=c99 -O3 -c {self.path}")]
-
-    def _list_interface(self) -> list[tuple[str, str]]:
-        return [("function", self.prototype)]
 
 
 def show(reports: list[ExportReport], json: str | None) -> None:

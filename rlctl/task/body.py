@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -87,10 +87,6 @@ class Body(Motors):
     def link_names(self) -> list[str]:
         """Names of all links but the base."""
         return list(self._links)
-
-    def find_joints(self, joints: Iterable[str]) -> list[int]:
-        """Return the indices of joints in joint arrays; raises `TaskError` for a name that the file does not have."""
-        return self._find_joints(list(joints))
 
     def _read_joints(self) -> Any:
         raw = self._cache.get("raw joints")

@@ -16,7 +16,7 @@ from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
 from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.sim import Sim
-from rlctl.task.task import Task, check_methods, check_parameters, has_compute_reward, has_success
+from rlctl.task.task import Task, check_methods, check_parameters
 
 
 class TaskEnv(gymnasium.Env[Observation, Any]):
@@ -47,8 +47,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.render_mode = render_mode
         self.reward_weights = _merge_weights(task, reward_weights or {})
         self.events = (events or EventSettings()).apply(task.events)
-        self.has_success = has_success(task)
-        if has_compute_reward(task):
+        self.has_success = type(task).is_success is not Task.is_success
+        if type(task).compute_reward is not Task.compute_reward:
             # Only then: whatever relabels goals looks whether an environment has it.
             self.compute_reward = task.compute_reward
         self.max_steps = task.max_steps

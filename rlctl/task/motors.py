@@ -78,7 +78,7 @@ class Motors(Properties):
     def _plan_motors(
         self, joints: Sequence[str], max_speed: Sequence[float] | None, max_force: Sequence[float] | None, gain: float
     ) -> _Plan:
-        chosen = self._find_joints(joints)
+        chosen = self.find_joints(joints)
         links = [self.joint_indices[joint] for joint in chosen]
         speeds = self.joint_max_speed[chosen].tolist() if max_speed is None else max_speed
         # Only the call for one joint takes a speed; the motor keeps it when the call for all sets the targets.
@@ -96,7 +96,7 @@ class Motors(Properties):
 
         A velocity of 0 is a brake of that force.
         """
-        chosen = self._find_joints(joints)
+        chosen = self.find_joints(joints)
         self._forget_torques(chosen)
         pybullet.setJointMotorControlArray(
             self.id,
@@ -118,7 +118,7 @@ class Motors(Properties):
 
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
         """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves it."""
-        links = [self.joint_indices[joint] for joint in self._find_joints(joints)]
+        links = [self.joint_indices[joint] for joint in self.find_joints(joints)]
         count = len(links)
         pybullet.setJointMotorControlArray(
             self.id,
@@ -135,7 +135,7 @@ class Motors(Properties):
 
         For joints whose motors are disabled: see `disable_motors`.
         """
-        chosen = self._find_joints(joints)
+        chosen = self.find_joints(joints)
         given = self._apply_strength(torques.tolist(), chosen)
         if self._commanded is None:
             self._commanded = np.full(len(self.joint_indices), np.nan)
@@ -165,7 +165,7 @@ class Motors(Properties):
 
         A kind of limit that the file leaves out for one of them, 0 or without an end, is left out for all.
         """
-        chosen = self._find_joints(joints)
+        chosen = self.find_joints(joints)
         low, high = self.joint_low[chosen], self.joint_high[chosen]
         speed, torque = self.joint_max_speed[chosen], self.joint_max_force[chosen]
         bounded = bool((low < high).all() and np.isfinite([low, high]).all())

@@ -103,8 +103,8 @@ class Properties:
         check_name(link, self._links, f"{self.file.name} has no link", TaskError, none=base)
         return self._links[link]
 
-    def _find_joints(self, joints: Sequence[str] = ()) -> list[int]:
-        # Their indices in joint arrays.
+    def find_joints(self, joints: Sequence[str] = ()) -> list[int]:
+        """Return the indices of joints, or of all, in joint arrays; raises `TaskError` for a name that is not there."""
         for joint in joints:
             if joint not in self.joint_names:  # asked here, too: tasks may name joints at every step
                 check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
@@ -155,11 +155,11 @@ class Properties:
     def scale_joint_damping(self, factor: float, joints: Sequence[str] = ()) -> None:
         """Set the joints' damping to `factor` times the built world's values, until the next reset."""
         nominal = self._damping
-        self._set_damping({index: factor * nominal[index] for index in self._find_joints(joints)})
+        self._set_damping({index: factor * nominal[index] for index in self.find_joints(joints)})
 
     def set_joint_damping(self, damping: float, joints: Sequence[str] = ()) -> None:
         """Set the joints' damping [N m s/rad or N s/m], until the next reset."""
-        self._set_damping(dict.fromkeys(self._find_joints(joints), damping))
+        self._set_damping(dict.fromkeys(self.find_joints(joints), damping))
 
     def _set_damping(self, values: dict[int, float]) -> None:
         _ = self._damping  # nominal values are read before the first change
@@ -179,7 +179,7 @@ class Properties:
         """Let the joints' motors give `factor` times the force they are asked for, until the next reset."""
         built = np.ones(len(self.joint_indices)) if self._built_strength is None else self._built_strength
         strength = built.copy() if self.motor_strength is None else self.motor_strength.copy()
-        indices = self._find_joints(joints)
+        indices = self.find_joints(joints)
         strength[indices] = factor * built[indices]
         self.motor_strength = strength
 

@@ -141,13 +141,3 @@ def check_methods(task: type[Task]) -> None:
 
 
 _REQUIRED = ("build", "act", "observe", "rewards")
-
-
-def has_success(task: Task) -> bool:
-    """Say whether the task defines success."""
-    return type(task).is_success is not Task.is_success
-
-
-def has_compute_reward(task: Task) -> bool:
-    """Say whether the task defines `compute_reward`."""
-    return type(task).compute_reward is not Task.compute_reward

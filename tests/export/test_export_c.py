@@ -113,11 +113,11 @@ def test_export_is_verified(algo, frames, small, train, write, tmp_path):
     assert report.agreement.agrees
     assert report.closed_loop.agrees
     assert not report.not_verified
-    assert report.size == report.path.stat().st_size + report.header.stat().st_size
+    assert report.size == report.path.stat().st_size + report.details["header"].stat().st_size
     assert report.as_json()["verified"] is True
     assert report.latency.exported_us > 0  # a fifth of ONNX Runtime's or less, on an idle machine
-    assert "policy_state *state" in report.prototype
-    header = report.header.read_text()
+    assert "policy_state *state" in report.details["prototype"]
+    header = report.details["header"].read_text()
     assert "#define POLICY_OBSERVATION_SIZE 3" in header
     assert ("frames[9]" in header) == (frames == 3)
 
@@ -127,7 +127,7 @@ def test_without_a_compiler_it_is_not_verified(small, train, write, monkeypatch)
     path = write(train("ppo", small(), steps=0), "ppo", small())
     (report,) = export_policy(str(path), ["c"], checkpoint="best", output=path.with_name("my policy-2.c"))
     assert report.path.is_file()
-    assert report.header.name == "my_policy_2.h"
+    assert report.details["header"].name == "my_policy_2.h"
     assert report.as_json()["verified"] is False
     assert ("not verified", "no C compiler (cc, or $CC) on this machine") in report.list_rows()
 
