@@ -117,12 +117,13 @@ def print_table(
 ) -> None:
     """Print a table of results, its columns aligned right but for those in `left`. What is in a cell is no markup.
 
+    Where no column has a name there is no header.
     Where the terminal is too narrow, cells are folded; if that suffices, only those of texts after the first column.
     """
     from rich.table import Table
     from rich.text import Text
 
-    table = [[Text(name, style="bold") for name in columns]]
+    table = [[Text(name, style="bold") for name in columns]] if any(columns) else []
     table += [[cell if isinstance(cell, Text) else Text(cell) for cell in row] for row in rows]
     widths = [max(cell.cell_len for cell in column) for column in itertools.zip_longest(*table, fillvalue=Text())]
     if sum(widths) + len(gap) * len(widths) > out().width:

@@ -76,19 +76,13 @@ class Measurements:
         add("control_error", "gauge", "Largest difference of a joint from its command.", ("", self.control_error))
         if self.spread is not None:
             add("action_spread", "gauge", "Mean standard deviation of the policy's actions.", ("", self.spread))
-        add("process_cpu_seconds_total", "counter", "Processor time.", ("", read_cpu_s()))
+        add("process_cpu_seconds_total", "counter", "Processor time.", ("", time.process_time()))
         add("process_resident_memory_bytes", "gauge", "Memory.", ("", read_memory()))
         return "\n".join(lines) + "\n"
 
 
 def _escape(text: str) -> str:
     return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
-
-
-def read_cpu_s() -> float:
-    """Return the processor time of this process [s]."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
 
 
 def read_memory() -> int:

@@ -28,27 +28,22 @@ class ObservationLayout:
 
     def __init__(self, info: EnvInfo) -> None:
         self.space, _ = info.spaces()
-        self._keys = split_space(self.space)
+        shape, sizes = self.space.shape or (), info.observation_sizes
+        parts = split_space(self.space)
+        self.shapes: dict[str, tuple[int, ...]] = {key: part.shape or () for key, part in parts.items()}
+        """The shape of each named observation."""
+        if SINGLE in parts:
+            # With stacked observations the names are those of one of them.
+            named = len(shape) == 1 and sum(sizes.values()) == shape[0]
+            self.shapes = {name: (size,) for name, size in sizes.items()} if named else {WHOLE: shape}
+        self._dtypes = {name: np.dtype(parts.get(name, self.space).dtype) for name in self.shapes}
         self.slices: dict[str, slice] = {}
         """Where each named observation is in the flat vector; pictures are not in it."""
-        self.shapes: dict[str, tuple[int, ...]] = {}
-        """The shape of each named observation."""
-        if isinstance(self.space, spaces.Dict):
-            start = 0
-            for key, part in self._keys.items():
-                self.shapes[key] = part.shape or ()
-                if not _is_picture(part):
-                    self.slices[key] = slice(start, start := start + math.prod(part.shape or ()))
-            self.size = start
-            return
-        self.size = math.prod(self.space.shape or ())
-        sizes = info.observation_sizes
-        # With stacked observations the names are those of one of them.
-        self._named = len(self.space.shape or ()) == 1 and sum(sizes.values()) == self.size
-        start = 0
-        for name, size in sizes.items() if self._named else [(WHOLE, self.size)]:
-            self.slices[name] = slice(start, start := start + size)
-            self.shapes[name] = (size,) if self._named else (self.space.shape or ())
+        self.size = 0
+        for name, part in self.shapes.items():
+            if SINGLE in parts or not _is_picture(parts[name]):
+                self.slices[name] = slice(self.size, self.size + math.prod(part))
+                self.size += math.prod(part)
 
     def read(self, given: Any) -> Any:
         """Return an observation as the policy takes it, from names and values or the flat vector.
@@ -62,7 +57,7 @@ class ObservationLayout:
             return np.concatenate([parts[name].ravel() for name in self.slices]).reshape(self.space.shape or ())
         if isinstance(self.space, spaces.Dict):
             raise ObservationError(f"this policy takes observations by name: {', '.join(self.shapes)}")
-        return _convert(given, WHOLE, self.space.shape or (), self._dtype(SINGLE))
+        return _convert(given, WHOLE, self.space.shape or (), np.dtype(self.space.dtype))
 
     def _read_names(self, given: dict[Any, Any]) -> dict[str, Array]:
         known = self.shapes
@@ -74,14 +69,7 @@ class ObservationLayout:
             problems.append(f"missing: {_list(missing)}")
         if problems:
             raise ObservationError(f"observation names {'; '.join(problems)}")
-        keyed = isinstance(self.space, spaces.Dict)
-        return {
-            name: _convert(given[name], name, shape, self._dtype(name if keyed else SINGLE))
-            for name, shape in known.items()
-        }
-
-    def _dtype(self, key: str) -> np.dtype[Any]:
-        return np.dtype(self._keys[key].dtype)
+        return {name: _convert(given[name], name, shape, self._dtypes[name]) for name, shape in known.items()}
 
     def flatten(self, observation: Any) -> NDArray[np.float64]:
         """Return the numbers of an observation that are not pictures, shape (size,)."""

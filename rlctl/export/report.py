@@ -73,18 +73,13 @@ def show(reports: list[ExportReport], json: str | None) -> None:
         output.write_result_json(json, by_format if len(reports) > 1 else reports[0].as_json())
     if json == "-":
         return
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
     for number, report in enumerate(reports):
         if number:
-            table.add_row("", "")
-        for name, text in report.list_rows():
-            table.add_row(name, Text(text))
-    output.out().print(table)
+            output.out().print()
+        rows = [(Text(name, style="bold"), text) for name, text in report.list_rows()]
+        output.print_table(("", ""), rows, left=("",))
 
 
 def format_agreement(agreement: Agreement) -> str:

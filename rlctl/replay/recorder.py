@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -72,6 +72,18 @@ def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
         return env
 
 
+class _Step(NamedTuple):
+    # What an environment returned for an action; what it may go on writing into is copied.
+    action: Any
+    observation: Any
+    reward: float
+    raw: list[float]
+    """Reward terms, by the names of the weights."""
+    weighted: list[float]
+    success: bool | None
+    events: dict[str, dict[str, float]]
+
+
 def play_episode(
     env: Env,
     spec: EnvSpec,
@@ -87,21 +99,95 @@ def play_episode(
     With `draw` the rollout has a scene, and `draw` receives why parts of it are missing. Raises `TaskError`, with
     seed and step, for whatever the environment raises.
     """
-    recorder = EpisodeRecorder(env, seed)
+    about, space = describe(env), env.observation_space
     reader = make_reader(env, draw) if draw is not None else None
     looks = [watch] if reader is None else [reader.read, watch]
-    with _locate_errors(spec.task, recorder):
+    steps: list[_Step] = []
+    terminated = truncated = False
+    with _locate_errors(spec.task, seed, 0):
         observation, info = env.reset(seed=seed)
-        recorder.begin(observation, info)
+        first, drawn = copy_observation(observation, space), _find_events(info, about)
     for look in looks:
         look(0)
-    while not recorder.over and (action := choose(observation, recorder.step)) is not None:
-        with _locate_errors(spec.task, recorder):
+    while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
+        with _locate_errors(spec.task, seed, len(steps) + 1):
             observation, reward, terminated, truncated, info = env.step(_cast_action(action, env.action_space))
-            recorder.add_step(action, observation, float(reward), bool(terminated), bool(truncated), info)
+            steps.append(_read_step(action, copy_observation(observation, space), float(reward), info, about))
         for look in looks:
-            look(recorder.step)
-    return recorder.rollout(spec, policy, Scene() if reader is None else reader.scene())
+            look(len(steps))
+    ended = bool(terminated or truncated)
+    log = [LogEntry(0, f"reset with seed {seed}"), *_log_events(0, drawn), *_log_steps(steps)]
+    log += _log_end(steps, terminated) if ended else [LogEntry(len(steps), "the recorded actions end here", "WARN")]
+    successes = [step.success for step in steps if step.success is not None]
+    return Rollout(
+        env=about,
+        episode=_make_episode(spec, seed, policy, about, first, steps, env.action_space),
+        weighted_terms=_stack_terms([step.weighted for step in steps], about),
+        successes=np.array(successes, np.bool_) if steps and len(successes) == len(steps) else None,
+        ended=ended,
+        log=log,
+        dt=frame_time(env),
+        scene=Scene() if reader is None else reader.scene(),
+    )
+
+
+def _read_step(action: Any, observation: Any, reward: float, info: dict[str, Any], about: EnvInfo) -> _Step:
+    if not math.isfinite(reward):
+        raise ValueError(f"reward is {reward}")
+    names = list(about.reward_weights)
+    raw, weighted = ([float(info[key][name]) for name in names] for key in ("metrics", "reward_terms"))
+    success = None if (given := info.get("is_success")) is None else bool(given)
+    return _Step(np.array(action), observation, reward, raw, weighted, success, _find_events(info, about))
+
+
+def _find_events(info: dict[str, Any], about: EnvInfo) -> dict[str, dict[str, float]]:
+    found: dict[str, dict[str, float]] = info.get("events", {}) if about.events else {}
+    return found  # of a plain environment it may be anything
+
+
+def _make_episode(
+    spec: EnvSpec, seed: int, policy: str, about: EnvInfo, first: Any, steps: list[_Step], space: spaces.Space[Any]
+) -> RecordedEpisode:
+    rewards = [step.reward for step in steps]
+    info = EpisodeInfo(
+        spec=spec,
+        seed=seed,
+        policy=policy,
+        success=steps[-1].success if steps else None,
+        total_reward=sum(rewards, 0.0),
+        term_names=list(about.reward_weights),
+        versions=current_versions(spec.task),
+    )
+    actions = np.array([step.action for step in steps]) if steps else np.zeros((0, *(space.shape or ())))
+    observations = dict_spaces.stack([first, *(step.observation for step in steps)])
+    raw = _stack_terms([step.raw for step in steps], about)
+    return RecordedEpisode(info, actions, observations, np.array(rewards, np.float64), raw)
+
+
+def _stack_terms(rows: list[list[float]], about: EnvInfo) -> NDArray[np.float64]:
+    return np.array(rows, np.float64).reshape(len(rows), len(about.reward_weights))
+
+
+def _log_steps(steps: Iterable[_Step]) -> Iterator[LogEntry]:
+    """Yield what was drawn in each step, and where the goal was reached or lost."""
+    held = False
+    for number, step in enumerate(steps, start=1):
+        yield from _log_events(number, step.events)
+        if bool(step.success) != held:
+            held = not held
+            yield LogEntry(number, "goal reached") if held else LogEntry(number, "goal lost", "WARN")
+
+
+def _log_end(steps: Sequence[_Step], terminated: bool) -> Iterator[LogEntry]:
+    yield LogEntry(len(steps), "terminated" if terminated else "truncated: time limit")
+    if (success := steps[-1].success) is not None:
+        yield LogEntry(len(steps), "success") if success else LogEntry(len(steps), "no success", "WARN")
+
+
+def _log_events(step: int, events: Mapping[str, Mapping[str, float]]) -> Iterator[LogEntry]:
+    for name, drawn in events.items():
+        values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
+        yield LogEntry(step, f"event {name}: {values}", "DEBUG")
 
 
 def frame_time(env: Env) -> float | None:
@@ -135,7 +221,7 @@ def _cast_action(action: Any, space: spaces.Space[Any]) -> Any:
 
 
 @contextlib.contextmanager
-def _locate_errors(task: str, recorder: EpisodeRecorder) -> Iterator[None]:
+def _locate_errors(task: str, seed: int, step: int) -> Iterator[None]:
     """Add the task, the episode and the step to whatever an environment raises, `SystemExit` included."""
     try:
         yield
@@ -144,112 +230,10 @@ def _locate_errors(task: str, recorder: EpisodeRecorder) -> Iterator[None]:
     except BaseException as error:
         ours = isinstance(error, RlctlError)
         what = str(error) if ours else describe_exception(error)
-        where = f"in the episode with seed {recorder.seed}, step {recorder.next_step}"
+        where = f"in the episode with seed {seed}, step {step}"
         details = None if ours else format_plugin_traceback(error) or None
         message = f"task {task!r}: {what}\n{where}; to see it alone: rlctl check-env {task}"
         raise TaskError(message, details=details) from error
-
-
-class EpisodeRecorder:
-    """Collects what an episode is made of, step by step."""
-
-    def __init__(self, env: Env, seed: int) -> None:
-        self.seed = seed
-        self.over = False
-        self._env = env
-        self._info = describe(env)
-        self._terms = list(self._info.reward_weights)
-        self._observations: list[Any] = []
-        self._actions: list[Any] = []
-        self._rewards: list[float] = []
-        self._raw: list[list[float]] = []
-        self._weighted: list[list[float]] = []
-        self._successes: list[bool | None] = []
-        self._log = [LogEntry(0, f"reset with seed {seed}")]
-
-    @property
-    def step(self) -> int:
-        """Number of steps done."""
-        return len(self._rewards)
-
-    @property
-    def next_step(self) -> int:
-        """Number of the step that is under way; an environment that fails at its reset fails at step 0."""
-        return self.step + 1 if self._observations else 0
-
-    def begin(self, observation: Any, info: dict[str, Any]) -> None:
-        """Add what a reset returned."""
-        self._observations.append(copy_observation(observation, self._env.observation_space))
-        self._log_events(0, info)
-
-    def add_step(
-        self, action: Any, observation: Any, reward: float, terminated: bool, truncated: bool, info: dict[str, Any]
-    ) -> None:
-        """Add an action and what the step returned."""
-        if not math.isfinite(reward):
-            raise ValueError(f"reward is {reward}")
-        copied = copy_observation(observation, self._env.observation_space)
-        self._actions.append(np.array(action))
-        self._observations.append(copied)
-        self._rewards.append(reward)
-        if self._terms:
-            self._raw.append([float(info["metrics"][name]) for name in self._terms])
-            self._weighted.append([float(info["reward_terms"][name]) for name in self._terms])
-        self._log_events(self.step, info)
-        success = info.get("is_success")
-        self._add_success(None if success is None else bool(success))
-        self.over = terminated or truncated
-        if self.over:
-            self._log_end(terminated)
-
-    def rollout(self, spec: EnvSpec, policy: str, scene: Scene) -> Rollout:
-        """Return the episode as played so far."""
-        steps, terms = self.step, len(self._terms)
-        if not self.over:
-            self._add_log("the recorded actions end here", "WARN")
-        info = EpisodeInfo(
-            spec=spec,
-            seed=self.seed,
-            policy=policy,
-            success=self._successes[-1] if steps else None,
-            total_reward=sum(self._rewards, 0.0),
-            term_names=self._terms,
-            versions=current_versions(spec.task),
-        )
-        actions = np.array(self._actions) if steps else np.zeros((0, *(self._env.action_space.shape or ())))
-        rewards, raw = np.array(self._rewards, np.float64), np.array(self._raw, np.float64).reshape(steps, terms)
-        known = [success for success in self._successes if success is not None]
-        return Rollout(
-            env=self._info,
-            episode=RecordedEpisode(info, actions, dict_spaces.stack(self._observations), rewards, raw),
-            weighted_terms=np.array(self._weighted, np.float64).reshape(steps, terms),
-            successes=np.array(known, np.bool_) if steps and len(known) == steps else None,
-            ended=self.over,
-            log=self._log,
-            dt=frame_time(self._env),
-            scene=scene,
-        )
-
-    def _add_log(self, text: str, level: str = "INFO") -> None:
-        self._log.append(LogEntry(self.step, text, level))
-
-    def _log_events(self, step: int, info: dict[str, Any]) -> None:
-        for name, drawn in info.get("events", {}).items():
-            values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
-            self._log.append(LogEntry(step, f"event {name}: {values}", "DEBUG"))
-
-    def _add_success(self, success: bool | None) -> None:
-        before = bool(self._successes and self._successes[-1])
-        self._successes.append(success)
-        if success and not before:
-            self._add_log("goal reached")
-        elif before and not success:
-            self._add_log("goal lost", "WARN")
-
-    def _log_end(self, terminated: bool) -> None:
-        self._add_log("terminated" if terminated else "truncated: time limit")
-        if self._successes[-1] is not None:
-            self._add_log(*(("success", "INFO") if self._successes[-1] else ("no success", "WARN")))
 
 
 def copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rlctl import output
 from rlctl.eval.score import describe_score
 from rlctl.run.policy import PolicyInfo
 from rlctl.run.stages import Stage
 from rlctl.tasks.description import Description
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 Row = tuple[str, ...]
 Json = Mapping[str, Any]
@@ -31,24 +28,24 @@ def show(description: Description, json: str | None) -> None:
 
     out, recipe = output.out(), description.recipe
     out.print(Text.assemble((content["task"], "bold"), f"  {content['summary']}".rstrip()))
-    _print_rows(out, _list_facts(content), indent=0)
+    _print_rows(_list_facts(content))
     definition = content["definition"]
     parts = _list_quantities(content["observations"])
-    _print_section(out, f"observation  {_shorten(content['observation_space'])}", parts)
-    _print_section(out, f"action  {_shorten(content['action_space'])}", _list_actions(content))
+    _print_section(f"observation  {_shorten(content['observation_space'])}", parts)
+    _print_section(f"action  {_shorten(content['action_space'])}", _list_actions(content))
     parameters = _list_parameters(content["parameters"], recipe.task)
-    _print_section(out, "parameters  --set task.NAME=VALUE", parameters, none="none")
+    _print_section("parameters  --set task.NAME=VALUE", parameters, none="none")
     if definition is not None:
-        _print_section(out, "reward terms", _list_rewards(definition["rewards"]))
-        _print_section(out, "events", [_format_event(each) for each in definition["events"]], none="none")
+        _print_section("reward terms", _list_rewards(definition["rewards"]))
+        _print_section("events", [_format_event(each) for each in definition["events"]], none="none")
         if definition["model_faults"]:
-            _print_section(out, "model files", [(fault,) for fault in definition["model_faults"]])
+            _print_section("model files", [(fault,) for fault in definition["model_faults"]])
     if recipe.stages:
-        _print_section(out, "stages", [_format_stage(number, each) for number, each in enumerate(recipe.stages, 1)])
-    _print_section(out, f"recipe  {content['recipe_file'] or 'none packaged; the defaults'}", ())
+        _print_section("stages", [_format_stage(number, each) for number, each in enumerate(recipe.stages, 1)])
+    _print_section(f"recipe  {content['recipe_file'] or 'none packaged; the defaults'}", ())
     for line in recipe.to_yaml().splitlines():
         out.print(Text(f"  {line}"))
-    _print_section(out, f"shipped policy  {content['policy_file'] or 'none'}", _list_scores(description.policy))
+    _print_section(f"shipped policy  {content['policy_file'] or 'none'}", _list_scores(description.policy))
 
 
 def _list_scores(info: PolicyInfo | None) -> list[Row]:
@@ -62,33 +59,19 @@ def _list_scores(info: PolicyInfo | None) -> list[Row]:
     return [(name, *describe_score(score).split(", ")) for name, score in scores.items()]
 
 
-def _print_section(out: Console, title: str, rows: Iterable[Row], none: str = "") -> None:
+def _print_section(title: str, rows: Iterable[Row], none: str = "") -> None:
     from rich.text import Text
 
     name, _, rest = title.partition("  ")
-    found = list(rows)
+    out, found = output.out(), list(rows)
     out.print()
     out.print(Text.assemble((name, "bold"), f"  {rest if found or not none else none}".rstrip()))
-    _print_rows(out, found, indent=2)
+    _print_rows(found, indent="  ")
 
 
-def _print_rows(out: Console, rows: list[Row], indent: int) -> None:
-    """Print a table without a head: in columns that fold on a terminal, and as lines without an end elsewhere."""
-    from rich.padding import Padding
-    from rich.table import Table
-    from rich.text import Text
-
-    if not out.is_terminal:
-        widths = [max(len(row[at]) for row in rows) for at in range(len(rows[0]))] if rows else []
-        for row in rows:
-            cells = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-            out.print(Text(" " * indent + cells.rstrip()))
-        return
-    table = Table(box=None, pad_edge=False, show_header=False)
-    for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
+def _print_rows(rows: list[Row], indent: str = "") -> None:
     if rows:
-        out.print(Padding(table, (0, 0, 0, indent)))
+        output.print_table([""] * len(rows[0]), [(indent + row[0], *row[1:]) for row in rows], left=("",))
 
 
 def _list_facts(content: Json) -> list[Row]:
