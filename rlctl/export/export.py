@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import onnx
 
     from rlctl.export.c_source import CSource
-    from rlctl.export.verify import Verification
+    from rlctl.export.verify import Agreement, ClosedLoop
     from rlctl.run.torch_policy import TorchPolicy
 
 Format = Literal["onnx", "c"]
@@ -170,23 +170,18 @@ def _verify(
     """Return what a report says of a verified file."""
     from rlctl.export.verify import measure_latency, verify
 
-    seen = verify(job.policy, exported, job.tensors, file, job.workers, min_observations)
-    if not seen.passed:
-        raise AnswerIsNo(_explain_failure(job, target, what, seen))
-    return {
-        **_describe(job, target),
-        "agreement": seen.agreement,
-        "closed_loop": seen.closed_loop,
-        "latency": measure_latency(job.policy, exported),
-    }
+    agreement, loop = verify(job.policy, exported, job.tensors, file, job.workers, min_observations)
+    if not (agreement.agrees and loop.agrees):
+        raise AnswerIsNo(_explain_failure(job, target, what, agreement, loop))
+    latency = measure_latency(job.policy, exported)
+    return {**_describe(job, target), "agreement": agreement, "closed_loop": loop, "latency": latency}
 
 
-def _explain_failure(job: _Export, target: Path, what: str, seen: Verification) -> str:
+def _explain_failure(job: _Export, target: Path, what: str, agreement: Agreement, loop: ClosedLoop) -> str:
     why = f"{what} does not act as {job.file} does"
-    if seen.agreement.agrees:
+    if agreement.agrees:
         why = (
             "every action agrees, but the episodes do not: the environment is not reproducible, or magnifies "
-            f"differences of {seen.agreement.max_difference:.0e}; see rlctl check-env {job.info.spec.task}"
+            f"differences of {agreement.max_difference:.0e}; see rlctl check-env {job.info.spec.task}"
         )
-    numbers = f"{format_agreement(seen.agreement)}\n{format_closed_loop(seen.closed_loop)}"
-    return f"{target}: not verified, not kept: {why}\n{numbers}"
+    return f"{target}: not verified, not kept: {why}\n{format_agreement(agreement)}\n{format_closed_loop(loop)}"

@@ -37,18 +37,18 @@ _WARM_UP = 30
 _CALLS = 10  # of a C function within one measurement
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Agreement:
     """How close two policies came on the same observations."""
 
-    observations: int
-    max_difference: float
+    observations: int = 0
+    max_difference: float = 0.0
     """Largest |difference| of an action element, in the action's own units."""
-    beyond_limit: int
+    beyond_limit: int = 0
     """Actions that differ by more than the limit; for discrete actions, that differ at all."""
-    near_ties: int
+    near_ties: int = 0
     """Discrete actions that differ because their logits agree within the limit: either choice is right."""
-    batch_sizes: tuple[int, ...]
+    batch_sizes: list[int] = dataclasses.field(default_factory=lambda: [1])
     """How many observations the exported policy was given at once."""
 
     @property
@@ -61,12 +61,8 @@ class Comparison:
     """Collects how far apart actions are. `add` right after the torch policy has acted: its logits are looked at."""
 
     def __init__(self, torch_policy: TorchPolicy) -> None:
-        self.observations = 0
-        self.batch_sizes = {1}
+        self.found = Agreement()
         self._space = torch_policy.action_space
-        self._max_difference = 0.0
-        self._beyond_limit = 0
-        self._near_ties = 0
         self._logits: NDArray[np.float32]
         if not isinstance(self._space, spaces.Box):
             network: Any = torch_policy.network
@@ -85,10 +81,10 @@ class Comparison:
         if not isinstance(self._space, spaces.Box):
             for row in np.flatnonzero(differs).tolist():
                 if self._is_near_tie(row, expected[row], actions[row]):
-                    self._near_ties += 1
+                    self.found.near_ties += 1
                     differs[row], difference[row] = False, 0.0
-        self._max_difference = max(self._max_difference, float(difference.max()))
-        self._beyond_limit += int(differs.sum())
+        self.found.max_difference = max(self.found.max_difference, float(difference.max()))
+        self.found.beyond_limit += int(differs.sum())
 
     def _is_near_tie(self, row: int, expected: NDArray[Any], action: NDArray[Any]) -> bool:
         return all(
@@ -96,12 +92,10 @@ class Comparison:
             for margin, size in _list_margins(self._space, self._logits[row], expected, action)
         )
 
-    def result(self) -> Agreement:
-        """Return what was seen, and stop looking."""
+    def close(self) -> None:
+        """Stop looking at logits."""
         if not isinstance(self._space, spaces.Box):
             self._hook.remove()
-        batch_sizes = tuple(sorted(self.batch_sizes))
-        return Agreement(self.observations, self._max_difference, self._beyond_limit, self._near_ties, batch_sizes)
 
 
 def _list_margins(
@@ -151,18 +145,6 @@ class Latency:
         return self.sb3_us / self.exported_us
 
 
-@dataclasses.dataclass(frozen=True)
-class Verification:
-    """The result of comparing two policies."""
-
-    agreement: Agreement
-    closed_loop: ClosedLoop
-
-    @property
-    def passed(self) -> bool:
-        return self.agreement.agrees and self.closed_loop.agrees
-
-
 def verify(
     torch_policy: TorchPolicy,
     exported: Policy,
@@ -170,7 +152,7 @@ def verify(
     file: Path,
     workers: Workers,
     min_observations: int = MIN_OBSERVATIONS,
-) -> Verification:
+) -> tuple[Agreement, ClosedLoop]:
     """Play the same episodes with both; on every observation of either, ask torch and the exported policy.
 
     `tensors` are the policy file's; `file` is the exported one, an ONNX file or a compiled library.
@@ -184,18 +166,19 @@ def verify(
     if isinstance(exported, OnnxPolicy):
         _compare_batch(torch_policy, exported, expected, comparison)
     played = EPISODES
-    while comparison.observations < min_observations:
-        missing = min_observations / comparison.observations - 1.0
+    while comparison.found.observations < min_observations:
+        missing = min_observations / comparison.found.observations - 1.0
         total = played + max(1, round(1.1 * missing * played))
         more = play_episodes(workers, episode_seeds(0, Stream.VERIFY, total)[played:], record=True)
         _compare_actions(torch_policy, exported, more, comparison)
         played = total
     workers.set_other_policy(str(file.resolve()))
     done = play_episodes(workers, seeds, record=True)
-    compared = comparison.observations
+    compared = comparison.found.observations
     _compare_actions(torch_policy, exported, done, comparison)
-    comparison.observations = compared  # those of one policy's rollouts are counted
-    return Verification(comparison.result(), compare_episodes(expected, done))
+    comparison.found.observations = compared  # those of one policy's rollouts are counted
+    comparison.close()
+    return comparison.found, compare_episodes(expected, done)
 
 
 def _compare_actions(
@@ -212,7 +195,7 @@ def _compare_actions(
             some = map_parts(operator.itemgetter(slice(low, low + rows)), observations)
             actions = [exported.predict(take_row(some, row)) for row in range(rows)]
             comparison.add(torch_policy.act(some), np.stack(actions))
-        comparison.observations += length
+        comparison.found.observations += length
 
 
 def _compare_batch(
@@ -222,7 +205,7 @@ def _compare_batch(
     first = stack([take_row(each.trajectory.observations, 0) for each in episodes if each.trajectory is not None])
     torch_policy.reset()
     comparison.add(torch_policy.act(first), exported.start_episodes(first))
-    comparison.batch_sizes.add(len(episodes))
+    comparison.found.batch_sizes.append(len(episodes))
 
 
 def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> ClosedLoop:

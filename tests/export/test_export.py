@@ -116,10 +116,10 @@ def test_other_weights_are_noticed(small, train, write, tmp_path):
     exported = export(write(model, "ppo", small(), name="other")).path
     with Workers(small(), 10) as workers:
         tensors = read_policy(original)[1]
-        seen = verify(TorchPolicy.load(original), OnnxPolicy.load(exported), tensors, exported, workers)
-    assert not seen.passed
-    assert seen.agreement.max_difference == pytest.approx(0.001, rel=0.01)
-    assert seen.agreement.beyond_limit > 1000
+        agreement, _ = verify(TorchPolicy.load(original), OnnxPolicy.load(exported), tensors, exported, workers)
+    assert not agreement.agrees
+    assert agreement.max_difference == pytest.approx(0.001, rel=0.01)
+    assert agreement.beyond_limit > 1000
 
 
 def logits_policy(train, write, small, action, logits):
@@ -147,7 +147,7 @@ def test_only_near_ties_may_be_chosen_differently(action, logits, other, near_ti
     comparison = Comparison(policy)
     expected = policy.act(np.zeros((1, 3), np.float32))
     comparison.add(expected, np.array(other))
-    seen = comparison.result()
+    seen = comparison.found
     assert (seen.near_ties, seen.beyond_limit) == ((1, 0) if near_tie else (0, 1))
     assert seen.agrees == near_tie
 
@@ -155,7 +155,7 @@ def test_only_near_ties_may_be_chosen_differently(action, logits, other, near_ti
 def test_not_a_number_is_beyond_the_limit(small, train, write):
     comparison = Comparison(TorchPolicy.load(write(train("ppo", small(), steps=0), "ppo", small())))
     comparison.add(np.zeros((2, 2), np.float32), np.array([[np.nan, 0.0], [0.0, 0.0]], np.float32))
-    assert comparison.result().beyond_limit == 1
+    assert comparison.found.beyond_limit == 1
 
 
 def test_episodes_are_compared_in_numbers():
