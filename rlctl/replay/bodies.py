@@ -7,9 +7,9 @@ import rerun as rr
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rlctl.replay.curves import Timelines
 from rlctl.replay.mjcf import Shape
 from rlctl.replay.scene import BodyMotion, Scene, Warn
-from rlctl.replay.timelines import Timelines
 from rlctl.task.bullet import pybullet
 
 _MARKER_COLORS = [(40, 200, 90), (70, 150, 255), (240, 120, 200), (250, 180, 40)]

@@ -1,10 +1,10 @@
-"""Sends the numbers of an episode as curves, each with a name and a colour."""
+"""Sends the columns of a recording: the numbers of an episode as curves, each with a name and a colour."""
 
 from __future__ import annotations
 
 import colorsys
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from rlctl.replay.recorder import Rollout
 from rlctl.replay.scene import Scene, encode_jpeg
-from rlctl.replay.timelines import Timelines
 
 Color = tuple[int, int, int]
 # Distinct on the viewer's dark and light background; the first eight also to colour-blind eyes.
@@ -23,6 +22,33 @@ _PALETTE: list[Color] = [
 ]  # fmt: skip
 _TOTAL_COLOR: Color = (150, 150, 150)
 _MOST_SERIES = 64
+
+
+class Timelines:
+    """Sends whole columns: one call per entity is a hundred times faster than one per row."""
+
+    def __init__(self, stream: rr.RecordingStream, dt: float | None) -> None:
+        self.stream = stream
+        self.dt = dt
+
+    @property
+    def default(self) -> str:
+        """The timeline that the viewer opens with."""
+        return "step" if self.dt is None else "sim_time"
+
+    def send(
+        self, entity: str, steps: Sequence[int] | NDArray[np.int64], columns: Iterable[rr.ComponentColumn]
+    ) -> None:
+        """Send a row per element of `steps` to an entity."""
+        if len(steps) == 0:
+            return
+        sequence = np.asarray(steps, np.int64)
+        indexes = [rr.TimeColumn("step", sequence=sequence)]
+        if self.dt is not None:
+            # Floating-point times are cut off by Rerun, not rounded: two rows a nanosecond apart would result.
+            nanoseconds = np.round(sequence * self.dt * 1e9).astype("timedelta64[ns]")
+            indexes.append(rr.TimeColumn("sim_time", duration=nanoseconds))
+        self.stream.send_columns(entity, indexes, columns)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,10 +16,9 @@ import rerun.blueprint as rrb
 from rlctl import registry
 from rlctl.errors import ArtifactError
 from rlctl.replay.bodies import bounds, draw_scene, start_bounds
-from rlctl.replay.curves import Plot, send_curves
+from rlctl.replay.curves import Plot, Timelines, send_curves
 from rlctl.replay.recorder import Rollout
 from rlctl.replay.scene import Scene, Warn
-from rlctl.replay.timelines import Timelines
 from rlctl.run import files
 from rlctl.run.episode import RecordedEpisode
 
