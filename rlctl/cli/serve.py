@@ -37,14 +37,13 @@ def serve(
     """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""
     claim_stdout()
     from rlctl import output
-    from rlctl.deploy.serve import make_server, run_server
+    from rlctl.deploy.serve import ServerSettings, make_server, run_server
     from rlctl.run.lookup import find_policy
 
     chosen = choose_checkpoint(checkpoint, pretrained)
     found = find_policy(run, chosen)
     output.print_notes(found.notes)
-    server = make_server(
-        found.file,
+    settings = ServerSettings(
         host=host,
         port=0 if self_test else port,
         limits=limits,
@@ -54,6 +53,7 @@ def serve(
         max_clients=max_clients,
         watchdog=not self_test,  # a simulation does not keep real time
     )
+    server = make_server(found.file, settings)
     if self_test:
         from rlctl.eval.evaluate import EvalRequest
         from rlctl.eval.self_test import run_self_test

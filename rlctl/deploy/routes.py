@@ -35,8 +35,7 @@ class _Routes:
         self.page = (Path(__file__).parent / "page.html").read_text("utf-8")
 
     def make_app(self) -> web.Application:
-        settings = self.server.settings
-        check = make_access_check(settings.host, settings.api_key, self._note_refused)
+        check = make_access_check(self.server.settings.host, self.server.api_key, self._note_refused)
         app = web.Application(middlewares=[check], client_max_size=_LARGEST_POLICY)
         app.add_routes(
             [

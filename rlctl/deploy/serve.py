@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import errno
 import gc
 import os
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rlctl.deploy.limits import read_limits
+from rlctl.deploy.limits import Limits, read_limits
 from rlctl.deploy.served_policy import load_served_policy
 from rlctl.errors import ArtifactError, RlctlError, UsageError
 
@@ -23,35 +24,39 @@ KEY_VARIABLE = "RLCTL_API_KEY"
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
-def make_server(
-    file: Path,
-    *,
-    host: str = "127.0.0.1",
-    port: int = 8000,
-    limits: Path | None = None,
-    log: Path | None = None,
-    rerun: Path | None = None,
-    key_file: Path | None = None,
-    max_clients: int = 64,
-    watchdog: bool = True,
-) -> PolicyServer:
+@dataclasses.dataclass(frozen=True)
+class ServerSettings:
+    """What a server is started with; paths are of files."""
+
+    host: str = "127.0.0.1"
+    port: int = 8000
+    limits: Path | None = None
+    log: Path | None = None
+    rerun: Path | None = None
+    """Of a Rerun recording."""
+    key_file: Path | None = None
+    max_clients: int = 64
+    watchdog: bool = True
+
+
+def make_server(file: Path, settings: ServerSettings) -> PolicyServer:
     """Load a policy and make its server; raises `RlctlError` for whatever would be wrong with it."""
     try:
         import uvloop  # noqa: F401
 
-        from rlctl.deploy.server import PolicyServer, ServerSettings
+        from rlctl.deploy.server import PolicyServer
     except ModuleNotFoundError as error:
         raise UsageError(f"rlctl serve needs {error.name}: pip install 'rlctl[serve]'") from None
-    key = _read_key(key_file)
-    if host not in LOOPBACK and key is None:
+    key = _read_key(settings.key_file)
+    if settings.host not in LOOPBACK and key is None:
         raise UsageError(
-            f"--host {host}: others can reach this server, and could move the robot; give a key: "
+            f"--host {settings.host}: others can reach this server, and could move the robot; give a key: "
             f"--key-file FILE, or {KEY_VARIABLE} in the environment"
         )
-    settings = ServerSettings(
-        host, port, None if limits is None else read_limits(limits), log, rerun, key, max_clients, watchdog
-    )
-    return PolicyServer(load_served_policy(file), settings)
+    limits = Limits() if settings.limits is None else read_limits(settings.limits)
+    if not settings.watchdog:
+        limits = limits.model_copy(update={"watchdog_periods": 0.0})
+    return PolicyServer(load_served_policy(file), settings, limits, key)
 
 
 def _read_key(file: Path | None) -> str | None:

@@ -23,6 +23,7 @@ from rlctl.deploy.measurements import Measurements
 from rlctl.deploy.observation import ObservationLayout
 from rlctl.deploy.rerun_log import RerunLog
 from rlctl.deploy.safety_events import SafetyEvent
+from rlctl.deploy.serve import ServerSettings
 from rlctl.deploy.served_policy import ServedPolicy, load_served_policy
 from rlctl.deploy.session import Session
 from rlctl.errors import RlctlError, short_repr
@@ -32,26 +33,11 @@ _AT_ONCE_S = 20e-6
 _SHORTEST_TICK_S = 0.01
 
 
-@dataclasses.dataclass(frozen=True)
-class ServerSettings:
-    """What a server is started with."""
-
-    host: str = "127.0.0.1"
-    port: int = 8000
-    limits: Limits | None = None
-    log: Path | None = None
-    rerun: Path | None = None
-    """File of a Rerun recording."""
-    api_key: str | None = None
-    max_clients: int = 64
-    watchdog: bool = True
-
-
 class PolicyServer:
     """Serves one policy to many clients; each WebSocket connection is an episode with a filter of its own."""
 
-    def __init__(self, policy: ServedPolicy, settings: ServerSettings) -> None:
-        self.settings = settings
+    def __init__(self, policy: ServedPolicy, settings: ServerSettings, limits: Limits, api_key: str | None) -> None:
+        self.settings, self.api_key = settings, api_key
         self.policy = policy
         self.measurements = Measurements()
         self._log = EventLog(settings.log)
@@ -63,8 +49,7 @@ class PolicyServer:
         """The action by hand."""
         self._order: str | None = None
         """What an operator ordered, for clients that come later too; None: to act."""
-        limits = settings.limits or Limits()
-        self._limits = limits if settings.watchdog else limits.model_copy(update={"watchdog_periods": 0.0})
+        self._limits = limits
         numbers = sum(map(math.prod, ObservationLayout(policy.info.env).shapes.values()))
         self.largest_message = 64 * numbers + 64 * 1024  # as text, and with names
         """Size of a request beyond which it is not read [bytes]."""

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlctl.deploy.client import PolicyClient
-from rlctl.deploy.serve import make_loop, make_server, serve_until
+from rlctl.deploy.serve import ServerSettings, make_loop, make_server, serve_until
 from rlctl.env_spec import EnvSpec
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.policy import PolicyInfo, save_policy
@@ -55,7 +55,7 @@ class RunningServer:
     """A server in a thread of this process."""
 
     def __init__(self, file, **settings):
-        self.server = make_server(file, port=0, **settings)
+        self.server = make_server(file, ServerSettings(port=0, **settings))
         self._end = asyncio.Event()
         self._started = threading.Event()
         self._thread = threading.Thread(target=self._run)

@@ -74,10 +74,10 @@ def test_a_server_that_is_not_there_or_of_another_task(reach_server):
 
 
 def test_self_test(tmp_path):
-    from rlctl.deploy.serve import make_server
+    from rlctl.deploy.serve import ServerSettings, make_server
     from rlctl.run.lookup import find_policy
 
-    server = make_server(find_policy("reach", PRETRAINED).file, port=0, watchdog=False)
+    server = make_server(find_policy("reach", PRETRAINED).file, ServerSettings(port=0, watchdog=False))
     result = run_self_test(server, EvalRequest("reach", checkpoint=PRETRAINED, episodes=2, n_envs=1))
     assert result.served.returns == result.direct.returns
     assert result.requests == sum(each.result.length for each in result.served.episodes)

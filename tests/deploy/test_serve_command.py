@@ -10,7 +10,7 @@ import urllib.request
 
 import pytest
 
-from rlctl.deploy.serve import make_server
+from rlctl.deploy.serve import ServerSettings, make_server
 from rlctl.errors import RlctlError
 from tests.deploy.serving import write_policy
 
@@ -63,7 +63,7 @@ def test_errors(tmp_path, monkeypatch, settings, code, error):
     (tmp_path / "limits.yaml").write_text("limits: {elbo: {action: [0, 1]}}")
     paths = {key: value if key == "host" else tmp_path / value for key, value in settings.items()}
     with pytest.raises(RlctlError) as problem:
-        make_server(file, **paths)
+        make_server(file, ServerSettings(**paths))
     assert problem.value.exit_code == code
     assert error in str(problem.value)
 
@@ -81,9 +81,9 @@ def test_starts_without_what_takes_long_to_import(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
     code = (
         "import pathlib, sys\n"
-        "from rlctl.deploy.serve import make_server\n"
+        "from rlctl.deploy.serve import ServerSettings, make_server\n"
         "from rlctl.deploy.routes import make_app\n"
-        f"make_app(make_server(pathlib.Path({str(file)!r})))\n"
+        f"make_app(make_server(pathlib.Path({str(file)!r}), ServerSettings()))\n"
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rlctl.deploy.client import PolicyClient
-from rlctl.deploy.serve import make_server
+from rlctl.deploy.serve import ServerSettings, make_server
 from rlctl.errors import ArtifactError, PolicyError, UsageError
 from tests.deploy.serving import (
     FLAT,
@@ -157,14 +157,14 @@ def test_pages_of_other_sites_are_refused(serve):
 def test_others_reach_a_server_with_a_key_only(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
     with pytest.raises(UsageError, match="give a key"):
-        make_server(file, host="0.0.0.0")
+        make_server(file, ServerSettings(host="0.0.0.0"))
     with pytest.raises(ArtifactError, match="the key cannot be read"):
-        make_server(file, host="0.0.0.0", key_file=tmp_path / "none")
+        make_server(file, ServerSettings(host="0.0.0.0", key_file=tmp_path / "none"))
 
 
 def test_a_port_in_use(serve):
     first = serve()
-    server = make_server(first.server.policy.file, port=first.port)
+    server = make_server(first.server.policy.file, ServerSettings(port=first.port))
     import asyncio
 
     from rlctl.deploy.serve import run_server
@@ -272,4 +272,4 @@ def test_each_connection_is_an_episode(serve, tmp_path):
 def test_a_file_that_is_not_a_policy(tmp_path):
     (tmp_path / "policy.onnx").write_bytes(b"onnx")
     with pytest.raises(ArtifactError, match="damaged, or not an ONNX file"):
-        make_server(tmp_path / "policy.onnx")
+        make_server(tmp_path / "policy.onnx", ServerSettings())
