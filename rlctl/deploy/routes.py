@@ -19,6 +19,7 @@ from rlctl.deploy.serve import LOOPBACK
 from rlctl.deploy.server import PolicyServer
 from rlctl.errors import RlctlError
 
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 _LARGEST_POLICY = 64 * 2**20  # [bytes]
 _BODY_TIMEOUT_S = 10.0
 _ORDERS = ("stop", "home", "hold", "resume")
@@ -144,9 +145,6 @@ async def _read_body(request: web.Request, largest: int) -> bytes:
 
 def _refuse(status: int, text: str) -> web.Response:
     return web.json_response({"error": text}, status=status)
-
-
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 def make_access_check(host: str, key: str | None, on_refused: Callable[[], None]) -> Middleware:

@@ -13,13 +13,7 @@ from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import UsageError
 from rlctl.eval.evaluate import LoadedPolicy, load_player
 from rlctl.replay.film import check_file, film_episodes, make_filmable
-from rlctl.replay.recorder import (
-    Choose,
-    Rollout,
-    make_drawable,
-    play_episode,
-    recorded_actions,
-)
+from rlctl.replay.recorder import Choose, Rollout, make_drawable, play_episode, recorded_actions
 from rlctl.replay.report import ReplayedEpisode, ReplayResult
 from rlctl.replay.reproduce import print_warning, record_episode, verify_episode
 from rlctl.replay.scene import Env
@@ -33,6 +27,8 @@ from rlctl.run.env_info import describe
 from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import find_owner, find_policy, locate_task
 from rlctl.run.policy import load_policy
+
+_EPISODES_TO_CHOOSE_FROM = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,9 +65,6 @@ def select(results: Sequence[EpisodeResult], choice: Choice) -> list[EpisodeResu
     left = [result for result in results if choice.kind != "failures" or not result.success]
     left.sort(key=lambda result: (bool(result.success), result.total_reward), reverse=choice.kind == "best")
     return left[: choice.count]
-
-
-_EPISODES_TO_CHOOSE_FROM = 100
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,6 +21,7 @@ from rlctl.task.env import TaskEnv
 
 Picture = NDArray[np.uint8]
 
+_WIDTH, _HEIGHT = 240, 180  # [pixels], of a report's pictures
 _EYE_DIRECTION = np.array([1.0, -0.9, 0.55])  # from the right of a robot that looks along x, from above
 _FIELD_OF_VIEW = 45.0  # [degrees]
 _CLOSEST, _FARTHEST = 0.8, 8.0  # [m]; the renderer draws nothing beyond 10 m
@@ -106,9 +107,6 @@ def _find_bounds(bodies: Sequence[Any], markers: Sequence[NDArray[Any]]) -> tupl
         wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
         corners += [] if wide else list(itertools.chain(*boxes))
     return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
-
-
-_WIDTH, _HEIGHT = 240, 180  # [pixels]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,6 +22,9 @@ from rlctl.rollout.child_process import ChildProcess
 _TRIALS = 12  # per unknown, and as many again
 _STARTS = 3
 _EVALUATIONS, _LAST_EVALUATIONS = 12, 25
+_STEP = 0.004
+"""Of a position in [0, 1], for derivatives: above what contacts and solvers make uneven."""
+_TOLERANCE = 1e-5
 _LONGEST_DELAY = 50  # steps that the search may go to from the longest that is tried first
 
 
@@ -181,11 +184,6 @@ def _choose_starts(ranked: list[dict[str, Any]]) -> list[dict[str, Any]]:
     firsts = [trial for trial in ranked if trial in firsts][:_STARTS]
     others = [trial for trial in ranked if trial not in firsts]
     return [*firsts, *others[: max(0, _STARTS - len(firsts))]]
-
-
-_STEP = 0.004
-"""Of a position in [0, 1], for derivatives: above what contacts and solvers make uneven."""
-_TOLERANCE = 1e-5
 
 
 def main(connection: Connection, spec: dict[str, Any]) -> None:
