@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -103,7 +103,7 @@ class Properties:
         check_name(link, self._links, f"{self.file.name} has no link", TaskError, none=base)
         return self._links[link]
 
-    def find_joints(self, joints: Sequence[str] = ()) -> list[int]:
+    def find_joints(self, joints: Collection[str] = ()) -> list[int]:
         """Return the indices of joints, or of all, in joint arrays; raises `TaskError` for a name that is not there."""
         for joint in joints:
             if joint not in self.joint_names:  # asked here, too: tasks may name joints at every step
