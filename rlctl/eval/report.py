@@ -160,14 +160,14 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         ),
         "episodes": [
             {
-                "index": episode.index,
-                "seed": episode.seed,
+                "index": index,
+                "seed": episode.result.seed,
                 "success": episode.result.success,
                 "return": episode.result.total_reward,
                 "length": episode.result.length,
                 "terms": episode.result.terms,
                 "final_distance": episode.result.final_distance,
             }
-            for episode in result.episodes
+            for index, episode in enumerate(result.episodes)
         ],
     }

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import Observations, join
+from rlctl.dict_spaces import Observations, join, split
 from rlctl.errors import EpisodeFailed
 from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.workers import Workers
@@ -39,8 +39,6 @@ class Trajectory:
 class Episode:
     """The episode of one seed in a list: its result and, where asked for, its trajectory."""
 
-    index: int
-    seed: int
     result: EpisodeResult
     trajectory: Trajectory | None = None
 
@@ -97,7 +95,7 @@ def play_episodes(
                 play(env, -1)
                 continue
             del running[env]
-            episodes[recorder.index] = Episode(recorder.index, result.seed, result, recorder.finish())
+            episodes[recorder.index] = Episode(result, recorder.finish())
             if on_episode:
                 on_episode(len(episodes))
             begin(env)
@@ -109,36 +107,34 @@ class _Recorder:
 
     def __init__(self, index: int, record: bool) -> None:
         self.index = index
+        """Of the episode in the list."""
         self._record = record
         self._steps = 0
-        self._observations: list[dict[str, NDArray[Any]]] = []
-        self._actions: list[NDArray[Any]] = []
-        self._rewards: list[NDArray[np.float64]] = []
-        self._terms: list[NDArray[np.float64]] = []
+        self._parts: list[Trajectory] = []
 
     def add(self, workers: Workers, env: int, steps: int) -> None:
         """Copy the first steps of an environment's segment."""
         self._steps += steps
-        if not self._record:
-            return
-        segment = workers.arrays.segment
-        first = 1 if self._observations else 0  # the last observation of the segment before
-        self._observations.append(
-            {key: rows[env, first : steps + 1].copy() for key, rows in segment.observation.items()}
-        )
-        self._actions.append(segment.action[env, :steps].copy())
-        self._rewards.append(segment.reward[env, :steps].copy())
-        self._terms.append(segment.terms[env, :steps].copy())
+        if self._record:
+            segment = workers.arrays.segment
+            first = 1 if self._parts else 0  # the last observation of the segment before
+            seen = {key: rows[env, first : steps + 1].copy() for key, rows in segment.observation.items()}
+            rows = (segment.action, segment.reward, segment.terms)
+            self._parts.append(Trajectory(seen, *(each[env, :steps].copy() for each in rows)))
 
     def failed_actions(self, workers: Workers, error: EpisodeFailed) -> NDArray[Any]:
         """Return the actions up to that of the step that failed."""
-        segment = workers.arrays.segment
-        return np.concatenate([*self._actions, segment.action[error.env, : error.step - self._steps]])
+        last = workers.arrays.segment.action[error.env, : error.step - self._steps]
+        return np.concatenate([*(part.actions for part in self._parts), last])
 
     def finish(self) -> Trajectory | None:
         """Return the whole episode, if it was to be recorded."""
         if not self._record:
             return None
-        parts = {key: np.concatenate([each[key] for each in self._observations]) for key in self._observations[0]}
-        actions, rewards, terms = (np.concatenate(each) for each in (self._actions, self._rewards, self._terms))
-        return Trajectory(join(parts), actions, rewards, terms)
+        parts = self._parts
+        seen = {
+            key: np.concatenate([split(part.observations)[key] for part in parts])
+            for key in split(parts[0].observations)
+        }
+        names = ("actions", "rewards", "terms")
+        return Trajectory(join(seen), *(np.concatenate([getattr(part, name) for part in parts]) for name in names))

@@ -129,7 +129,7 @@ class EpisodeKeeper:
         spec = self.spec
         info = EpisodeInfo(
             spec=spec,
-            seed=episode.seed,
+            seed=episode.result.seed,
             policy=f"{_POLICY}{steps}",
             success=episode.result.success,
             total_reward=episode.result.total_reward,

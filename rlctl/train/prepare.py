@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
 from rlctl.check_env.check import Report, check
@@ -43,14 +44,16 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
     with contextlib.ExitStack() as stack:
         # The workers build their environments, and the check runs, while this process imports torch.
         workers = stack.enter_context(_make_workers(specs[start.stage - 1], recipe.n_envs, start, display))
-        precheck = _Precheck(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
+        checked = None
+        if request.check and start.run is None:
+            checked = _begin_check(specs[-1], request.env_timeout_s)
         from rlctl.train.evaluation import Evaluator
         from rlctl.train.loop import TrainingLoop
 
         learner = _build_learner(start, specs, workers, display)
-        if precheck is not None:
+        if checked is not None:
             display.phase("checking the environment")
-            precheck.refuse_errors(display)
+            _refuse_errors(checked.result(), display)
         run = start.run or directory.create(start.task, recipe.seed, request.root)
         lock = start.lock or stack.enter_context(run.lock())
         if not lock.keeps_out:
@@ -139,51 +142,43 @@ def _restore(start: Start, checkpoints: Checkpoints, learner: Learner) -> str:
     return f"going on at step {start.step:,}, {exactness}"
 
 
-class _Precheck:
-    """Checks an environment in a child process, watched by a thread of this one."""
+def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[Report]:
+    """Check an environment in a child process, watched by a thread of this one."""
+    future: Future[Report] = Future()
 
-    def __init__(self, spec: EnvSpec, env_timeout_s: float) -> None:
-        self._spec = spec
-        self._env_timeout_s = env_timeout_s
-        self._report: Report | None = None
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._check, daemon=True)  # the child ends with this process
-        self._thread.start()
-
-    def _check(self) -> None:
+    def run() -> None:
         try:
-            self._report = check(
-                self._spec,
+            report = check(
+                spec,
                 rules=find_rules(_EXPERIMENTS),
                 only=_EXPERIMENTS,
                 budget_s=_CHECK_BUDGET_S,
-                env_timeout_s=self._env_timeout_s,
+                env_timeout_s=env_timeout_s,
                 show_progress=False,
             )
+            future.set_result(report)
         except BaseException as error:  # raised again where somebody waits for it
-            self._error = error
+            future.set_exception(error)
 
-    def refuse_errors(self, display: Display) -> None:
-        """Wait for the end of the check; raises `AnswerIsNo` if it found an error."""
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-        report = self._report
-        if report is None or report.records.built is None:
-            return  # the workers build it too, and report what is wrong
-        task, found = self._spec.task, report.verdict.findings
-        for name in report.verdict.crashed:
-            display.message(f"check before training: {name} crashed, a bug in rlctl; what it would find is not known")
-        errors = [finding for finding in found if finding.severity is Severity.ERROR]
-        if errors:
-            text = "; ".join(f"{each.rule} {each.name} ({each.message})" for each in errors)
-            count = f"{len(errors)} error{'s' if len(errors) > 1 else ''}"
-            raise AnswerIsNo(
-                f"the check before training found {count}: {text}\n"
-                f"rlctl check-env {task} shows details; --no-check trains anyway."
-            )
-        warnings = [finding.rule for finding in found if finding.severity is Severity.WARNING]
-        if warnings:
-            display.message(
-                f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} shows details"
-            )
+    threading.Thread(target=run, daemon=True).start()  # the child ends with this process
+    return future
+
+
+def _refuse_errors(report: Report, display: Display) -> None:
+    """Raise `AnswerIsNo` if the check found an error, and show its warnings."""
+    if report.records.built is None:
+        return  # the workers build it too, and report what is wrong
+    task, found = report.task, report.verdict.findings
+    for name in report.verdict.crashed:
+        display.message(f"check before training: {name} crashed, a bug in rlctl; what it would find is not known")
+    errors = [finding for finding in found if finding.severity is Severity.ERROR]
+    if errors:
+        text = "; ".join(f"{each.rule} {each.name} ({each.message})" for each in errors)
+        count = f"{len(errors)} error{'s' if len(errors) > 1 else ''}"
+        raise AnswerIsNo(
+            f"the check before training found {count}: {text}\n"
+            f"rlctl check-env {task} shows details; --no-check trains anyway."
+        )
+    warnings = [finding.rule for finding in found if finding.severity is Severity.WARNING]
+    if warnings:
+        display.message(f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} shows details")

@@ -69,7 +69,7 @@ def test_an_episode_does_not_depend_on_what_runs_beside_it(reach_run, evaluation
     assert [episode.result.total_reward for episode in alone.episodes] == [
         episode.result.total_reward for episode in evaluation.episodes
     ]
-    assert len({episode.seed for episode in evaluation.episodes}) == 6
+    assert len({episode.result.seed for episode in evaluation.episodes}) == 6
 
 
 def test_evaluations_of_a_training_say_how_far_bodies_overlap(reach_run):

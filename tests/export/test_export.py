@@ -161,7 +161,7 @@ def test_not_a_number_is_beyond_the_limit(small, train, write):
 def test_episodes_are_compared_in_numbers():
     def episodes(*results):
         return [
-            Episode(index, index, EpisodeResult(0, index, total, length, success, {}, None))
+            Episode(EpisodeResult(0, index, total, length, success, {}, None))
             for index, (total, length, success) in enumerate(results)
         ]
 
