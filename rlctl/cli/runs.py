@@ -41,9 +41,9 @@ def list_runs(
 def show_run(run: Run = None, json: Json = None) -> None:
     """Show a run: its recipe, curve, evaluations, warnings and files."""
     from rlctl.run.lookup import find_run
-    from rlctl.runs.show import describe, show
+    from rlctl.runs.show import RunDescription, show
 
-    show(describe(find_run(run)), json)
+    show(RunDescription(find_run(run)), json)
 
 
 @app.command("report")

@@ -13,7 +13,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.eval.statistics import summarize
 from rlctl.rollout.messages import EpisodeResult
-from rlctl.run.robustness import Interval, Outcome, PushLevel, PushTest
+from rlctl.run.robustness import Interval, PushLevel, PushTest
 
 if TYPE_CHECKING:
     from rlctl.eval.vary import CellPlayer
@@ -105,7 +105,10 @@ def measure_push(player: CellPlayer, spec: EnvSpec, unpushed: Sequence[EpisodeRe
         duration_s=pushed.duration_s,
         mass=pushed.mass,
         measure=measure,
-        levels=[_describe_level(impulse, outcomes[impulse], held[impulse]) for impulse in impulses],
+        levels=[
+            PushLevel(**outcomes[impulse].model_dump(), impulse=impulse, held=float(held[impulse].mean()))
+            for impulse in impulses
+        ],
         threshold=threshold,
         threshold_interval=interval,
         verdict=_judge(pushed, measure, held, threshold, interval),
@@ -155,10 +158,6 @@ def _cross(impulses: Sequence[float], rates: NDArray[np.float64]) -> float | Non
     before, after = falling[index - 1], falling[index]
     part = (before - 0.5) / (before - after)
     return float(impulses[index - 1] + part * (impulses[index] - impulses[index - 1]))
-
-
-def _describe_level(impulse: float, outcome: Outcome, held: NDArray[np.bool_]) -> PushLevel:
-    return PushLevel(**outcome.model_dump(), impulse=impulse, held=float(held.mean()))
 
 
 def _judge(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rlctl import output
-from rlctl.run.robustness import Axis, Cell, Outcome, PushTest, Robustness, RobustnessMap
+from rlctl.run.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -62,11 +61,8 @@ def _show_map(found: RobustnessMap, worst: Cell | None) -> None:
     elif columns <= _MOST_COLUMNS and rows <= _MOST_ROWS:
         _show_grid(found, worst)
     else:
-        out.print(f"{_name_axes(found.axes)}: {len(found.cells):,} cells, too many to draw; --json has them all")
-
-
-def _name_axes(axes: Sequence[Axis]) -> str:
-    return " x ".join(axis.name for axis in axes)
+        names = " x ".join(axis.name for axis in found.axes)
+        out.print(f"{names}: {len(found.cells):,} cells, too many to draw; --json has them all")
 
 
 def _show_list(found: RobustnessMap, worst: Cell | None) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rlctl import output
-from rlctl.env_spec import EnvChanges, EnvSpec
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval import axes as axes_of
 from rlctl.eval.evaluate import NO_GATES, EvalRequest, Gates, LoadedPolicy, choose_specs, load_player, start_workers
@@ -112,7 +112,7 @@ def _play_maps(player: CellPlayer, spec: EnvSpec, maps: Sequence[Sequence[Axis]]
 
 def _play_cells(player: CellPlayer, spec: EnvSpec, axes: Sequence[Axis], on_cell: Callable[[], None]) -> list[Cell]:
     places = list(itertools.product(*(axis.values for axis in axes)))
-    specs = [_combine(axes, values).apply(spec) for values in places]
+    specs = [_place(spec, axes, values) for values in places]
     cells: dict[int, Cell] = {}
     # Another parameter of the task means other worlds: cells that share it are played one after the other.
     for index in sorted(range(len(places)), key=lambda index: sorted(specs[index].parameters.items(), key=repr)):
@@ -124,13 +124,10 @@ def _play_cells(player: CellPlayer, spec: EnvSpec, axes: Sequence[Axis], on_cell
     return [cells[index] for index in range(len(places))]
 
 
-def _combine(axes: Sequence[Axis], values: Sequence[float]) -> EnvChanges:
-    changes = [axes_of.change(axis, value) for axis, value in zip(axes, values, strict=True)]
-    events: dict[str, dict[str, object]] = {}
-    for each in changes:
-        for name, parameters in each.events.items():
-            events.setdefault(name, {}).update(parameters)
-    return EnvChanges({name: value for each in changes for name, value in each.parameters.items()}, events=events)
+def _place(spec: EnvSpec, axes: Sequence[Axis], values: Sequence[float]) -> EnvSpec:
+    for axis, value in zip(axes, values, strict=True):
+        spec = axes_of.change(axis, value).apply(spec)
+    return spec
 
 
 def _is_nominal(axes: Sequence[Axis], values: Sequence[float]) -> bool:

@@ -266,6 +266,11 @@ def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
+def find_mixed(recipes: Sequence[Recipe]) -> list[str]:
+    """Return the dotted keys in which several recipes are not the same."""
+    return sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})
+
+
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in values.items():
         if isinstance(value, Mapping) and value:

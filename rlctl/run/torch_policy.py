@@ -173,8 +173,9 @@ class TorchPolicy(Policy):
     def __init__(self, info: PolicyInfo, network: BasePolicy, tensors: Mapping[str, NDArray[Any]]) -> None:
         super().__init__(info)
         self.network = network
+        clip = float(info.clip_observation or np.inf)
         self._normalize = {
-            key: Normalize("", *_read_statistics(tensors, key), float(info.clip_observation or np.inf))
+            key: Normalize("", tensors[f"normalize/{key}/mean"], tensors[f"normalize/{key}/var"], clip)
             for key in info.normalized_keys
         }
         self.is_recurrent = info.algo == "recurrent_ppo"
@@ -233,7 +234,3 @@ class TorchPolicy(Policy):
     def reset(self) -> None:
         """Begin an episode: forget the recurrent state."""
         self._state = None
-
-
-def _read_statistics(tensors: Mapping[str, NDArray[Any]], key: str) -> tuple[NDArray[Any], NDArray[Any]]:
-    return tensors[f"normalize/{key}/mean"], tensors[f"normalize/{key}/var"]

@@ -20,7 +20,7 @@ from rlctl.eval.evaluate import EvalRequest, Evaluation, run_evaluation
 from rlctl.run.directory import RunDirectory, is_group
 from rlctl.run.group import read_group
 from rlctl.run.lookup import find_run
-from rlctl.run.recipe import Recipe, find_difference
+from rlctl.run.recipe import find_difference, find_mixed
 from rlctl.runs.statistics import (
     Difference,
     Verdict,
@@ -128,8 +128,12 @@ def compare(texts: Sequence[str], request: EvalRequest, threshold: float | None 
     task = _common_task([run for group in groups for run in group], request.task)
     recipes = [[run.recipe() for run in group] for group in groups]
     sides = [
-        Side(_name(text, group), [_evaluate(run, request, threshold) for run in group], _find_mixed(mixed))
-        for text, group, mixed in zip(texts, groups, recipes, strict=True)
+        Side(
+            name=text.rstrip("/") if len(group) > 1 else str(group[0].path),
+            runs=[_evaluate(run, request, threshold) for run in group],
+            mixed=find_mixed(own),
+        )
+        for text, group, own in zip(texts, groups, recipes, strict=True)
     ]
     baseline, *others = sides
     of_recipes = len(groups[0]) > 1
@@ -165,10 +169,6 @@ def find_group(text: str) -> list[RunDirectory]:
     return [find_run(text)]
 
 
-def _name(text: str, group: list[RunDirectory]) -> str:
-    return text.rstrip("/") if len(group) > 1 else str(group[0].path)
-
-
 def _refuse_unequal(texts: Sequence[str], groups: list[list[RunDirectory]]) -> None:
     sizes = {len(group) > 1 for group in groups}
     if len(sizes) > 1:
@@ -190,10 +190,6 @@ def _common_task(runs: list[RunDirectory], task: str | None) -> str:
     if len(tasks) > 1:
         raise UsageError(f"these runs are of different tasks ({', '.join(tasks)}); --task TASK evaluates all on one")
     return tasks[0]
-
-
-def _find_mixed(recipes: list[Recipe]) -> list[str]:
-    return sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})
 
 
 def _evaluate(run: RunDirectory, request: EvalRequest, threshold: float | None) -> EvaluatedRun:
@@ -222,11 +218,10 @@ def _differences(baseline: Side, side: Side, of_recipes: bool) -> dict[Quantity,
     quantities: list[Quantity] = ["success", "return"] if baseline.has_success and side.has_success else ["return"]
     if of_recipes:
         return {each: seed_difference(baseline.scores(each), side.scores(each)) for each in quantities}
-    return {each: _between_policies(baseline, side, each) for each in quantities}
-
-
-def _between_policies(baseline: Side, side: Side, quantity: Quantity) -> Difference:
-    one, two = (each.runs[0].values(quantity) for each in (baseline, side))
-    known = np.isfinite(one) & np.isfinite(two)
-    differ = success_difference if quantity == "success" else return_difference
-    return differ(one[known], two[known])
+    differences = {}
+    for each in quantities:
+        one, two = baseline.runs[0].values(each), side.runs[0].values(each)
+        known = np.isfinite(one) & np.isfinite(two)
+        differ = success_difference if each == "success" else return_difference
+        differences[each] = differ(one[known], two[known])
+    return differences

@@ -23,14 +23,10 @@ def show(result: Comparison, json: str | None) -> None:
         _show_seeds(result)
     else:
         out.print(f"policies on {result.task}: the unit is the episode, the same {result.episodes} for each")
-        _show_policies(result)
+        rows = [(side.name, *_format_scores(side.runs[0])) for side in result.sides]
+        output.print_table(("policy", "success", "return"), rows, left=("policy",))
     for candidate in result.candidates:
         _show_candidate(result, candidate)
-
-
-def _show_policies(result: Comparison) -> None:
-    rows = [(side.name, *_format_scores(side.runs[0])) for side in result.sides]
-    output.print_table(("policy", "success", "return"), rows, left=("policy",))
 
 
 def _show_seeds(result: Comparison) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -14,48 +13,33 @@ from rlctl.errors import ArtifactError
 from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
 from rlctl.run.robustness import Robustness
-from rlctl.runs.diagnosis import Finding, diagnose
+from rlctl.runs.diagnosis import diagnose
 from rlctl.runs.diagnosis import show as diagnosis
+from rlctl.runs.diagnosis.history import History
 from rlctl.runs.listing import as_json
-from rlctl.runs.summary import Rows, RunSummary, list_points, read_table, summarize
+from rlctl.runs.summary import Rows, list_points, summarize
 
 _EVALUATIONS_SHOWN = 12
 _PLOT_SIZE = (90, 13)
 """Columns and lines of a curve."""
 
 
-@dataclasses.dataclass(frozen=True)
-class RunDescription:
-    """Everything that is shown of a run."""
+class RunDescription(History):
+    """Everything that is shown of a run: its records and what they show."""
 
-    run: RunDirectory
-    summary: RunSummary
-    metrics: Rows
-    evaluations: Rows
-    findings: list[Finding]
-    """What its records show."""
-    warnings: list[str]
-    robustness: Robustness | None
-    """What `rlctl eval --vary` or `--push` measured."""
-
-
-def describe(run: RunDirectory) -> RunDescription:
-    """Read a run; raises `ArtifactError` if it is damaged."""
-    status, measured, warnings = run.status(), None, []
-    if run.robustness_file.is_file():
-        try:
-            measured = robustness.read(run.robustness_file)
-        except ArtifactError as error:
-            warnings.append(str(error))
-    return RunDescription(
-        run=run,
-        summary=summarize(run.path),
-        metrics=read_table(run.metrics_file),
-        evaluations=read_table(run.evals_file),
-        findings=diagnose(run),
-        warnings=[*_list_warnings(status), *warnings],
-        robustness=measured,
-    )
+    def __init__(self, run: RunDirectory) -> None:
+        """Read a run; raises `ArtifactError` if its `run.json` is damaged."""
+        super().__init__(run)
+        self.warnings = list(_list_warnings(run.status()))
+        self.summary = summarize(run.path)
+        self.findings = diagnose(self)
+        self.robustness: Robustness | None = None
+        """What `rlctl eval --vary` or `--push` measured."""
+        if run.robustness_file.is_file():
+            try:
+                self.robustness = robustness.read(run.robustness_file)
+            except ArtifactError as error:
+                self.warnings.append(str(error))
 
 
 def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
@@ -93,7 +77,7 @@ def _measure_sizes(run: RunDirectory) -> dict[str, int]:
 def show(run: RunDescription, json: str | None) -> None:
     """Print the description, or JSON alone for `-`."""
     out, summary, sizes = output.out(), run.summary, _measure_sizes(run.run)
-    source = run.run.status().get("from")
+    source = run.status.get("from")
     if json is not None:
         content = {**as_json(summary), "evaluations": run.evaluations, "metrics": run.metrics}
         found = {"warnings": run.warnings, "findings": diagnosis.as_json(run.findings)}

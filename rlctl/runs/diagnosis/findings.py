@@ -77,9 +77,9 @@ def list_signs() -> dict[str, signs.Sign]:
     }
 
 
-def diagnose(run: RunDirectory) -> list[Finding]:
-    """Return what a run's records show, warnings first; never raises for what is in the folder."""
-    history = History(run)
+def diagnose(run: RunDirectory | History) -> list[Finding]:
+    """Return what the records of a run show, warnings first; never raises for what is in the folder."""
+    history = run if isinstance(run, History) else History(run)
     functions = list_signs()
 
     @functools.cache

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,33 +64,33 @@ class History:
     """Reads a run when it is asked; what is missing or damaged is empty."""
 
     def __init__(self, run: RunDirectory) -> None:
-        self._run = run
+        self.run = run
 
     @functools.cached_property
     def status(self) -> Mapping[str, Any]:
         try:
-            return self._run.status()
+            return self.run.status()
         except (RlctlError, OSError):
             return {}
 
     def name_run(self, text: str) -> str:
         """Put the run and its task into a command."""
-        return text.replace("RUN", str(self._run.path)).replace("TASK", str(self.status.get("task", "TASK")))
+        return text.replace("RUN", str(self.run.path)).replace("TASK", str(self.status.get("task", "TASK")))
 
     @functools.cached_property
     def recipe(self) -> Mapping[str, Any]:
         try:
-            return recipe_sources.read(self._run.recipe_file)
+            return recipe_sources.read(self.run.recipe_file)
         except (RlctlError, OSError):
             return {}
 
     @functools.cached_property
     def metrics(self) -> Rows:
-        return read_table(self._run.metrics_file)
+        return read_table(self.run.metrics_file)
 
     @functools.cached_property
     def evaluations(self) -> Rows:
-        return read_table(self._run.evals_file)
+        return read_table(self.run.evals_file)
 
     def curve(self, name: str) -> Curve:
         """Return a column of `metrics.csv`."""
@@ -134,7 +134,7 @@ class History:
     @functools.cached_property
     def env(self) -> EnvInfo | None:
         """What the policy was trained in."""
-        for file in (self._run.last_policy, self._run.best_policy):
+        for file in (self.run.last_policy, self.run.best_policy):
             try:
                 return read_policy(file)[0].env
             except (RlctlError, OSError):
@@ -145,18 +145,11 @@ class History:
     def episodes(self) -> list[RecordedEpisode]:
         """The newest recorded episodes of evaluations, at most `EPISODES`."""
         found: list[RecordedEpisode] = []
-        files = [file for file in self._run.episodes.glob("*.npz") if file.stem.isdecimal()]
+        files = [file for file in self.run.episodes.glob("*.npz") if file.stem.isdecimal()]
         for file in sorted(files, reverse=True)[:EPISODES]:
-            if (episode := _load(file)) is not None and len(episode.rewards):
-                found.append(episode)
-        return found
-
-
-def _load(file: Path) -> RecordedEpisode | None:
-    try:
-        return load_episode(file)
-    except (RlctlError, OSError):
-        return None
+            with contextlib.suppress(RlctlError, OSError):
+                found.append(load_episode(file))
+        return [episode for episode in found if len(episode.rewards)]
 
 
 def _curve(rows: Rows, name: str) -> Curve:

@@ -11,13 +11,11 @@ from rlctl.runs.diagnosis.findings import Finding, Grade
 
 def format_finding(finding: Finding) -> list[str]:
     """Return a finding with its evidence, its meaning and what to try."""
-    settings = [f"  {format_setting(each.name, each.value)}: {each.advice}" for each in finding.settings]
+    settings = [
+        f"  {each.name} is {'not set' if each.value is None else each.value}: {each.advice}"
+        for each in finding.settings
+    ]
     return [finding.line, f"  {finding.meaning}", *(f"  try: {each}" for each in finding.advice), *settings]
-
-
-def format_setting(name: str, value: Any) -> str:
-    """Return a parameter with what the recipe has."""
-    return f"{name} is {value}" if value is not None else f"{name} is not set"
 
 
 def format_end(findings: Sequence[Finding], run: str) -> list[str]:

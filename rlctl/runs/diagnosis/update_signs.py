@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
@@ -51,35 +53,37 @@ def _largest_value(run: History) -> float | None:
 
 def policy_hardly_changes(run: History) -> str | None:
     """Updates change nothing, before a schedule has lowered the learning rate."""
-    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
-    if len(kl) < LEAST_ROWS or np.median(kl.values) > 1e-4 or np.median(clipped.values) > 1e-3:
-        return None
-    return f"approx_kl {np.median(kl.values):.1e}, clip fraction {np.median(clipped.values):.1%} (medians)"
-
-
-def _early(curve: Curve) -> Curve:
-    """Return the first two thirds, in which schedules still have an effect."""
-    count = (2 * len(curve) + 2) // 3
-    return Curve(curve.steps[:count], curve.values[:count])
+    change = _read_change(run)
+    return change.describe(".1e") if change and change.kl <= 1e-4 and change.clipped <= 1e-3 else None
 
 
 def policy_jumps(run: History) -> str | None:
     """Updates change the policy several times as much as PPO is made for."""
-    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
-    if len(kl) < LEAST_ROWS or not len(clipped):
-        return None
-    median_kl, median_clipped = float(np.median(kl.values)), float(np.median(clipped.values))
-    if median_kl < 0.2 and median_clipped < 0.55:
-        return None
-    return f"approx_kl {median_kl:.2g}, clip fraction {median_clipped:.0%} (medians)"
+    change = _read_change(run)
+    return change.describe() if change and (change.kl >= 0.2 or change.clipped >= 0.55) else None
 
 
 def policy_is_replaced(run: History) -> str | None:
     """Each update makes another policy of it, and none of them is good."""
-    kl, clipped = _early(run.curve("approx_kl")), _early(run.curve("clip_fraction"))
-    if len(kl) < LEAST_ROWS or run.is_good or np.median(kl.values) < 1 or np.median(clipped.values) < 0.7:
-        return None
-    return f"approx_kl {np.median(kl.values):.2g}, clip fraction {np.median(clipped.values):.0%} (medians)"
+    change = _read_change(run)
+    return change.describe() if change and not run.is_good and change.kl >= 1 and change.clipped >= 0.7 else None
+
+
+class _Change(NamedTuple):
+    """How much updates change the policy: medians of the first two thirds, in which schedules still have an effect."""
+
+    kl: float
+    clipped: float
+
+    def describe(self, form: str = ".2g") -> str:
+        """Return the medians as text."""
+        return f"approx_kl {self.kl:{form}}, clip fraction {self.clipped:.1%} (medians)"
+
+
+def _read_change(run: History) -> _Change | None:
+    curves = [run.curve(name).values for name in ("approx_kl", "clip_fraction")]
+    early = [values[: (2 * len(values) + 2) // 3] for values in curves]
+    return _Change(*(float(np.median(values)) for values in early)) if min(map(len, early)) >= LEAST_ROWS else None
 
 
 def exploration_gone(run: History) -> str | None:

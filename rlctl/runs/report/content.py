@@ -12,11 +12,10 @@ import numpy as np
 
 from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.run.episode import RecordedEpisode
-from rlctl.run.recipe import find_difference
+from rlctl.run.recipe import find_mixed
 from rlctl.runs.comparison import find_group
 from rlctl.runs.diagnosis import Finding
-from rlctl.runs.diagnosis.history import History
-from rlctl.runs.show import RunDescription, describe
+from rlctl.runs.show import RunDescription
 from rlctl.runs.summary import Rows, list_points
 
 
@@ -47,7 +46,7 @@ def collect(texts: Sequence[str]) -> Report:
     Raises `ArtifactError` for a damaged run and one that has nothing yet, `UsageError` for runs of several tasks.
     """
     found = {run.path.resolve(): run for text in texts for run in find_group(text)}
-    runs = [describe(run) for run in found.values()]
+    runs = [RunDescription(run) for run in found.values()]
     for each in runs:
         if each.summary.state == "damaged":
             raise ArtifactError(f"{each.run.path}: damaged: {each.summary.reason}")
@@ -72,7 +71,7 @@ def _find_notes(runs: Sequence[RunDescription]) -> list[str]:
         recipes = [each.run.recipe() for each in runs]
     except RlctlError as error:
         return [*notes, f"a recipe cannot be read: {error}"]
-    keys = sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})
+    keys = find_mixed(recipes)
     return [*notes, f"the recipes differ: {', '.join(keys)}"] if keys else notes
 
 
@@ -117,7 +116,7 @@ def list_commands(report: Report) -> list[str]:
             f"{key}={value if isinstance(value, str) else json.dumps(value)}"
             for key, value in each.summary.changes.items()
         ]
-        source = each.run.status().get("from")
+        source = each.status.get("from")
         start = ["--from", str(source.get("policy"))] if isinstance(source, dict) else []
         options = (*start, *(part for change in changes for part in ("--set", change)))
         seeds.setdefault(options, []).append(each.summary.seed or 0)
@@ -132,8 +131,7 @@ def list_commands(report: Report) -> list[str]:
 
 def choose_episodes(report: Report) -> list[tuple[str, RecordedEpisode]]:
     """Return the best and the worst recorded episode of the best evaluation there are episodes of, with their names."""
-    run = max(report.runs, key=lambda each: each.summary.score).run
-    episodes = History(run).episodes
+    episodes = max(report.runs, key=lambda each: each.summary.score).episodes
     steps = max((_trained_steps(each) for each in episodes), default=-1)
     last = [each for each in episodes if _trained_steps(each) == steps]
     if not last:
