@@ -13,7 +13,8 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.eval.statistics import summarize
 from rlctl.rollout.messages import EpisodeResult
-from rlctl.run.robustness import Interval, PushLevel, PushTest
+from rlctl.run.robustness import PushLevel, PushTest
+from rlctl.run.shipped import Interval
 
 if TYPE_CHECKING:
     from rlctl.eval.vary import CellPlayer

@@ -75,13 +75,7 @@ def load_episode(path: Path) -> RecordedEpisode:
     observed = any(key.startswith("observations") for key in arrays)
     if not observed or not {"info", "actions", "rewards", "terms"} <= arrays.keys():
         raise ArtifactError(f"{path}: not an episode of rlctl: it has no info, actions, rewards and terms")
-    try:
-        data = untrusted.parse_json(str(arrays["info"]))
-        if isinstance(data.get("format"), int) and data["format"] > FORMAT:
-            raise ArtifactError(f"{path}: episode format {data['format']} is newer than this rlctl can read ({FORMAT})")
-        info = EpisodeInfo.model_validate(data)
-    except (ValueError, AttributeError, pydantic.ValidationError) as error:
-        raise ArtifactError(f"{path}: its description is damaged: {untrusted.explain_error(error)}") from None
+    info = untrusted.parse_model(str(arrays["info"]), EpisodeInfo, path, "episode")
     prefix = "observations/"
     parts = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
     observations: Observations = parts or arrays["observations"]

@@ -163,16 +163,7 @@ def parse_info(text: str | None, path: Path) -> PolicyInfo:
     """Check the metadata of a policy; `path` is for the error."""
     if text is None:
         raise ArtifactError(f"{path}: not an rlctl policy: its metadata has no 'rlctl' entry")
-    try:
-        data = untrusted.parse_json(text)
-        if isinstance(data, dict) and isinstance(data.get("format"), int) and data["format"] > FORMAT:
-            raise ArtifactError(
-                f"{path}: policy format {data['format']} is newer than this rlctl {rlctl.__version__} can read "
-                f"({FORMAT}); upgrade rlctl"
-            )
-        return PolicyInfo.model_validate(data)
-    except (ValueError, pydantic.ValidationError) as error:
-        raise ArtifactError(f"{path}: its rlctl metadata is damaged: {untrusted.explain_error(error)}") from None
+    return untrusted.parse_model(text, PolicyInfo, path, "policy")
 
 
 class Policy(abc.ABC):

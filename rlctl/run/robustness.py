@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 import pydantic
 
-from rlctl.errors import ArtifactError
 from rlctl.run import files, untrusted
 from rlctl.run.shipped import Interval
 
@@ -138,11 +137,5 @@ def write(path: Path, result: Robustness) -> None:
 
 
 def read(path: Path) -> Robustness:
-    """Read a result; raises `ArtifactError` if it is missing, damaged, not ours or of another format."""
-    content = files.read_json(path)
-    if isinstance(content, dict) and content.get("format") != FORMAT:
-        raise ArtifactError(f"{path}: robustness format {content.get('format')!r}, this rlctl reads {FORMAT}")
-    try:
-        return Robustness.model_validate(content)
-    except pydantic.ValidationError as error:
-        raise ArtifactError(f"{path}: damaged: {untrusted.explain_error(error)}") from None
+    """Read a result; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
+    return untrusted.parse_model(untrusted.read_bytes(path, untrusted.JSON_LIMIT), Robustness, path, "robustness")

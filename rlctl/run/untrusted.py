@@ -9,15 +9,19 @@ import stat
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 from rich.filesize import decimal as format_bytes
 
+from rlctl import __version__
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.run import memory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from pydantic import BaseModel
+
+Model = TypeVar("Model", bound="BaseModel")
 
 JSON_LIMIT = 16 * 2**20  # [bytes]
 _ALWAYS_READ = 1_000_000  # [bytes]
@@ -81,7 +85,21 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("nested too deeply") from None
 
 
-def explain_error(error: Exception) -> str:
+def parse_model(text: str | bytes, model: type[Model], path: Path, what: str) -> Model:
+    """Read JSON as a model with a `format`; raises `ArtifactError` for what is damaged, or newer than this rlctl."""
+    newest = model.model_fields["format"].default
+    try:
+        content = parse_json(text)
+        found = content.get("format") if isinstance(content, dict) else None
+        if isinstance(found, int) and found > newest:
+            known = f"this rlctl {__version__} can read ({newest}); upgrade rlctl"
+            raise ArtifactError(f"{path}: {what} format {found} is newer than {known}")
+        return model.model_validate(content)
+    except ValueError as error:  # pydantic's is one
+        raise ArtifactError(f"{path}: damaged: {_explain_error(error)}") from None
+
+
+def _explain_error(error: ValueError) -> str:
     """Return in a line what is wrong with a description; of pydantic's report the first problem, with its place."""
     import pydantic
 

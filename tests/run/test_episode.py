@@ -70,7 +70,9 @@ def rewrite(path, info):
 
 def test_a_newer_format(path):
     rewrite(path, json.dumps({"format": 99, "who": "knows"}))
-    with pytest.raises(ArtifactError, match=r"000000.npz: episode format 99 is newer than this rlctl can read \(1\)$"):
+    with pytest.raises(
+        ArtifactError, match=r"000000.npz: episode format 99 is newer than this rlctl .* can read \(1\)"
+    ):
         load_episode(path)
 
 
@@ -79,7 +81,7 @@ def test_a_newer_format(path):
 )
 def test_a_damaged_description(path, info):
     rewrite(path, info)
-    with pytest.raises(ArtifactError, match=r"000000.npz: its description is damaged: "):
+    with pytest.raises(ArtifactError, match=r"000000.npz: damaged: "):
         load_episode(path)
 
 

@@ -141,8 +141,8 @@ def test_an_honest_archive_of_pictures(tmp_path):
         ({"actions": np.full((3, 2), np.nan)}, "actions are not all finite"),
         ({"observations": np.zeros((3, 5))}, "observations are float64 of shape (3, 5), not 4 of them"),
         ({"observations": np.array(0.0)}, "observations are float64 of shape (), not 4 of them"),
-        ({"info": np.array("[" * 100_000)}, "its description is damaged: nested too deeply"),
-        ({"info": np.zeros((2, 2))}, "its description is damaged: "),
+        ({"info": np.array("[" * 100_000)}, "damaged: nested too deeply"),
+        ({"info": np.zeros((2, 2))}, "damaged: "),
     ],
 )
 def test_an_episode_whose_parts_do_not_fit(changes, message, episode):

@@ -131,7 +131,7 @@ def test_a_state_without_measure(write):
 
 def test_a_description_that_is_none(write):
     tanh = [node("Tanh", "obs")]
-    assert "its rlctl metadata is damaged: nested too deeply" in refused(write(tanh, description="[" * 100_000))
+    assert "damaged: nested too deeply" in refused(write(tanh, description="[" * 100_000))
     info = json.loads(INFO.model_dump_json())
     info["env"]["observation_space"]["shape"] = [10**12]
     assert "1,000,000,000,000 elements, at most 10,000,000 are supported" in refused(

@@ -138,11 +138,11 @@ def test_a_space_that_cannot_be(space, message, changed, described):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[" * 100_000, "its rlctl metadata is damaged: nested too deeply"),
-        ('{"format": ' + "9" * 10_000 + "}", "its rlctl metadata is damaged: Exceeds the limit"),
-        ("", "its rlctl metadata is damaged: Expecting value"),
-        ("null", "its rlctl metadata is damaged: it: Input should be a valid dictionary"),
-        ('{"format": "x"}', "its rlctl metadata is damaged: format: Input should be a valid integer"),
+        ("[" * 100_000, "damaged: nested too deeply"),
+        ('{"format": ' + "9" * 10_000 + "}", "damaged: Exceeds the limit"),
+        ("", "damaged: Expecting value"),
+        ("null", "damaged: it: Input should be a valid dictionary"),
+        ('{"format": "x"}', "damaged: format: Input should be a valid integer"),
     ],
 )
 def test_a_description_that_is_none(text, message, changed):

@@ -138,7 +138,7 @@ def test_a_newer_format(path):
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"format": 1, "algo": 3}'])
 def test_damaged_metadata(path, text):
     rewrite(path, {"rlctl": text})
-    with pytest.raises(ArtifactError, match=r"policy.safetensors: its rlctl metadata is damaged: "):
+    with pytest.raises(ArtifactError, match=r"policy.safetensors: damaged: "):
         rlctl.load_policy(path)
 
 
