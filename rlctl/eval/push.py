@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal
@@ -52,8 +53,7 @@ def find_pushed(spec: EnvSpec) -> PushedBody:
     """
     from rlctl.task.env import TaskEnv
 
-    env = spec.make()
-    try:
+    with contextlib.closing(spec.make()) as env:
         inner = env.unwrapped
         if not isinstance(inner, TaskEnv):
             raise UsageError(
@@ -74,8 +74,6 @@ def find_pushed(spec: EnvSpec) -> PushedBody:
             duration_s=max(1, round(_DURATION_S / dt)) * dt,
             every_s=(steps // 2 + 1) * dt,
         )
-    finally:
-        env.close()
 
 
 def measure_push(player: CellPlayer, spec: EnvSpec, unpushed: Sequence[EpisodeResult]) -> PushTest:

@@ -127,28 +127,12 @@ def compute_digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
 
 def read_info(path: Path) -> PolicyInfo:
     """Read what a policy file says of its policy, without its numbers; raises `ArtifactError` as `read_policy` does."""
-    from safetensors import SafetensorError, safe_open
-
-    untrusted.check_safetensors(path)
-    try:
-        with safe_open(path, framework="numpy") as file:
-            return parse_info((file.metadata() or {}).get("rlctl"), path)
-    except (SafetensorError, OSError) as error:
-        raise ArtifactError(f"{path}: damaged, or not a .safetensors file: {error}") from None
+    return _read_file(path, tensors=False)[1]
 
 
 def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
     """Read a policy file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
-    from safetensors import SafetensorError, safe_open
-
-    untrusted.check_safetensors(path)
-    try:
-        with safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            info = parse_info(metadata.get("rlctl"), path)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
-        raise ArtifactError(f"{path}: damaged, or not a .safetensors file: {error}") from None
+    metadata, info, tensors = _read_file(path)
     if "sha256" not in metadata:
         raise ArtifactError(f"{path}: damaged: its metadata has no sha256, which every policy of rlctl has")
     if metadata["sha256"] != compute_digest(metadata["rlctl"], tensors):
@@ -157,6 +141,19 @@ def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
         if not np.isfinite(values).all():
             raise ArtifactError(f"{path}: damaged: {short_repr(name)} is not finite")
     return info, tensors
+
+
+def _read_file(path: Path, tensors: bool = True) -> tuple[dict[str, str], PolicyInfo, dict[str, NDArray[Any]]]:
+    from safetensors import SafetensorError, safe_open
+
+    untrusted.check_safetensors(path)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            info = parse_info(metadata.get("rlctl"), path)
+            return metadata, info, {name: file.get_tensor(name) for name in (file.keys() if tensors else ())}
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
+        raise ArtifactError(f"{path}: damaged, or not a .safetensors file: {error}") from None
 
 
 def parse_info(text: str | None, path: Path) -> PolicyInfo:

@@ -54,27 +54,25 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
         size = os.fstat(file.fileno()).st_size
         if limit is not None and size > limit:
             raise ArtifactError(f"{path}: too large: {format_bytes(size)}, at most {format_bytes(limit)} are read")
-        if (problem := explain_size(size)) is not None:
-            raise ArtifactError(f"{path}: too large: {problem}")
+        _check_size(path, size)
         try:
             return file.read()
         except OSError as error:
             raise ArtifactError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def explain_size(size: int) -> str | None:
-    """Say why so many bytes are not read into memory; None if they may be: up to half of what is there."""
+def _check_size(path: Path, size: int, what: str = "") -> None:
+    """Raise `ArtifactError` for more bytes than are read into memory: half of what is there."""
     # To ask costs as much as to read a small file, of which `rlctl runs` reads thousands.
-    if size <= _ALWAYS_READ or (there := memory.available()) is None or size <= there // 2:
-        return None
-    return f"it needs {format_bytes(size)} of memory, and {format_bytes(there)} are free"
+    if size > _ALWAYS_READ and (there := memory.available()) is not None and size > there // 2:
+        needs = f"{what}it needs {format_bytes(size)} of memory, and {format_bytes(there)} are free"
+        raise ArtifactError(f"{path}: too large: {needs}")
 
 
 def check_safetensors(path: Path) -> None:
     """Raise `ArtifactError` for what is not a regular file, or would take more memory than a policy may."""
     with open_file(path) as file:
-        if (problem := explain_size(os.fstat(file.fileno()).st_size)) is not None:
-            raise ArtifactError(f"{path}: too large: {problem}")
+        _check_size(path, os.fstat(file.fileno()).st_size)
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -125,8 +123,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         for each in members:
             if not each.filename.endswith(".npy") or each.compress_type not in _PACKED:
                 raise ValueError(f"{each.filename!r} is not an array, or not packed as numpy does it")
-        if (problem := explain_size(sum(each.file_size for each in members))) is not None:
-            raise ArtifactError(f"{path}: too large: unpacked {problem}")
+        _check_size(path, sum(each.file_size for each in members), "unpacked ")
         arrays: dict[str, NDArray[Any]] = dict(np.load(path, allow_pickle=False))
     for name, content in arrays.items():
         if not isinstance(content, np.ndarray):  # numpy gives back the bytes of what has no header

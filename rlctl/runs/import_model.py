@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -73,11 +74,8 @@ def import_model(
 
 
 def _describe_env(spec: EnvSpec) -> EnvInfo:
-    env = spec.make()
-    try:
+    with contextlib.closing(spec.make()) as env:
         return describe(env)
-    finally:
-        env.close()
 
 
 def _has_time_feature(model: SavedModel, env: EnvInfo) -> bool:

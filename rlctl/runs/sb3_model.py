@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import dataclasses
 import io
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -74,30 +75,33 @@ def read_model(path: Path, algo: str | None = None) -> SavedModel:
 
     `algo` is for models whose algorithm does not follow from the file: A2C beside PPO, DDPG beside TD3.
     """
-    try:
-        with untrusted.open_file(path) as file, zipfile.ZipFile(file) as archive:
-            data = json.loads(_read_member(archive, "data"))
-            if not isinstance(data, dict):
-                raise NotPlainData("its data is not a mapping")
-            tensors = read_tensors(_read_member(archive, "policy.pth"))
-            names = archive.namelist()
-            version = _read_member(archive, _VERSION).decode() if _VERSION in names else ""
+    with _explain_errors(path, "a model"), untrusted.open_file(path) as file, zipfile.ZipFile(file) as archive:
+        data = json.loads(_read_member(archive, "data"))
+        if not isinstance(data, dict):
+            raise NotPlainData("its data is not a mapping")
         found = _find_algorithm(data)
         return SavedModel(
             algo=algo or found,
             observation_space=read_space(_decode(data, "observation_space")),
             action_space=read_space(_decode(data, "action_space")),
             policy_kwargs=_read_policy_kwargs(data),
-            tensors=tensors,
+            tensors=read_tensors(_read_member(archive, "policy.pth")),
             training_steps=int(data.get("num_timesteps") or 0),
-            version=version.strip(),
+            version=_read_member(archive, _VERSION).decode().strip() if _VERSION in archive.namelist() else "",
         )
+
+
+@contextlib.contextmanager
+def _explain_errors(path: Path, what: str) -> Iterator[None]:
+    """Make `ArtifactError` of whatever reading a file raises that nobody has checked."""
+    try:
+        yield
     except NotPlainData as error:
-        raise ArtifactError(f"{path}: it holds what is not read from a model: {error}") from None
+        raise ArtifactError(f"{path}: it holds what is not read from {what}: {error}") from None
     except zipfile.BadZipFile:
-        raise ArtifactError(f"{path}: not a zip archive, so not a model of Stable-Baselines3") from None
+        raise ArtifactError(f"{path}: not a zip archive, so not {what} of Stable-Baselines3") from None
     except (KeyError, ValueError, TypeError, AttributeError, OSError, RecursionError, NotImplementedError) as error:
-        raise ArtifactError(f"{path}: not a model of Stable-Baselines3, or damaged: {error}") from None
+        raise ArtifactError(f"{path}: not {what} of Stable-Baselines3, or damaged: {error}") from None
 
 
 _VERSION = "_stable_baselines3_version"
@@ -183,7 +187,7 @@ def _split_object(value: Any, *modules: str) -> tuple[str, dict[str, Any]]:
 
 def read_normalization(path: Path) -> SavedNormalization | None:
     """Read a vecnormalize.pkl; None if it does not normalise observations. Raises `ArtifactError` as `read_model`."""
-    try:
+    with _explain_errors(path, "a VecNormalize"):
         content = untrusted.read_bytes(path, LARGEST_MEMBER)
         kind, state = _split_object(pickle_data.read(content), "stable_baselines3.common.vec_env.vec_normalize.")
         if kind != "VecNormalize":
@@ -203,10 +207,6 @@ def read_normalization(path: Path) -> SavedNormalization | None:
             var={key: read_array(each["var"]).astype(np.float64) for key, each in fields.items()},
             clip=float(state["clip_obs"]),
         )
-    except NotPlainData as error:
-        raise ArtifactError(f"{path}: it holds what is not read from a VecNormalize: {error}") from None
-    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise ArtifactError(f"{path}: not a VecNormalize of Stable-Baselines3, or damaged: {error}") from None
 
 
 def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
