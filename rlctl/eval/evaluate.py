@@ -132,11 +132,16 @@ def run_evaluations(request: EvalRequest, gates: Gates = NO_GATES) -> list[Evalu
     """Find the policy and evaluate it as `run_evaluation` does, in every stage that was asked for, with equal seeds."""
     if request.baseline is not None:
         return [_evaluate(load_baseline(request), choose_task(request), request, gates)]
+    _, policy, specs = find_player(request)
+    return [_evaluate(policy, spec, request, gates) for spec in specs]
+
+
+def find_player(request: EvalRequest) -> tuple[lookup.FoundPolicy, LoadedPolicy, list[EnvSpec]]:
+    """Find and read the policy of a request, and what it is to be evaluated on."""
     found = lookup.find_policy(request.run, request.checkpoint)
     output.print_notes(found.notes)
     policy = load_player(found.file, request.deterministic)
-    specs = [found.locate(spec) for spec in choose_specs(policy.info, request)]
-    return [_evaluate(policy, spec, request, gates) for spec in specs]
+    return found, policy, [found.locate(spec) for spec in choose_specs(policy.info, request)]
 
 
 @dataclasses.dataclass(frozen=True)

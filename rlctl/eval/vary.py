@@ -15,7 +15,7 @@ from rlctl import output
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval import axes as axes_of
-from rlctl.eval.evaluate import NO_GATES, EvalRequest, Gates, LoadedPolicy, choose_specs, load_player, start_workers
+from rlctl.eval.evaluate import NO_GATES, EvalRequest, Gates, LoadedPolicy, find_player, start_workers
 from rlctl.eval.push import measure_push
 from rlctl.eval.statistics import summarize
 from rlctl.registry import is_task
@@ -23,7 +23,7 @@ from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
-from rlctl.run import lookup, robustness
+from rlctl.run import robustness
 from rlctl.run.acting import Exploration
 from rlctl.run.policy import collect_versions
 from rlctl.run.robustness import Axis, Cell, Robustness, RobustnessMap
@@ -65,12 +65,9 @@ def measure_robustness(
         raise UsageError("--stage all: --vary and --push measure one stage")
     if request.changes.randomize is None:
         request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
-    found = lookup.find_policy(request.run, request.checkpoint)
-    output.print_notes(found.notes)
-    policy = load_player(found.file, request.deterministic)
-    (spec,) = [found.locate(each) for each in choose_specs(policy.info, request)]
+    found, policy, (spec,) = find_player(request)
     maps = axes_of.read_axes(vary, spec) if vary else []
-    axes_of.count_cells(maps)  # which are too many to be played?
+    cells = axes_of.count_cells(maps)  # raises for too many, before one is played
     with start_workers(spec, request) as workers:
         policy.give_to(workers)
         player = CellPlayer(workers, policy, request)
@@ -78,8 +75,10 @@ def measure_robustness(
         episodes = player.play(spec)
         nominal = summarize(episodes)
         gates.check_possible(nominal.success_rate is not None)
-        _ask(axes_of.count_cells(maps), time.monotonic() - start, yes)
-        measured = _play_maps(player, spec, maps)
+        _ask(cells, time.monotonic() - start, yes)
+        with output.show_progress("varying", cells) as show:
+            done = itertools.count(1)
+            measured = [_play_map(player, spec, axes, lambda: show(next(done))) for axes in maps]
         pushed = measure_push(player, spec, episodes) if push else None
     result = Robustness(
         task=spec.task,
@@ -101,18 +100,9 @@ def measure_robustness(
     return result
 
 
-def _play_maps(player: CellPlayer, spec: EnvSpec, maps: Sequence[Sequence[Axis]]) -> list[RobustnessMap]:
-    done = itertools.count(1)
-    with output.show_progress("varying", axes_of.count_cells(maps)) as show:
-        return [
-            RobustnessMap(axes=list(axes), cells=_play_cells(player, spec, axes, lambda: show(next(done))))
-            for axes in maps
-        ]
-
-
-def _play_cells(player: CellPlayer, spec: EnvSpec, axes: Sequence[Axis], on_cell: Callable[[], None]) -> list[Cell]:
+def _play_map(player: CellPlayer, spec: EnvSpec, axes: list[Axis], on_cell: Callable[[], None]) -> RobustnessMap:
     places = list(itertools.product(*(axis.values for axis in axes)))
-    specs = [_place(spec, axes, values) for values in places]
+    specs = [_apply(axes, values, spec) for values in places]
     cells: dict[int, Cell] = {}
     # Another parameter of the task means other worlds: cells that share it are played one after the other.
     for index in sorted(range(len(places)), key=lambda index: sorted(specs[index].parameters.items(), key=repr)):
@@ -121,10 +111,10 @@ def _play_cells(player: CellPlayer, spec: EnvSpec, axes: Sequence[Axis], on_cell
             **outcome.model_dump(), values=list(places[index]), nominal=_is_nominal(axes, places[index])
         )
         on_cell()
-    return [cells[index] for index in range(len(places))]
+    return RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(places))])
 
 
-def _place(spec: EnvSpec, axes: Sequence[Axis], values: Sequence[float]) -> EnvSpec:
+def _apply(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> EnvSpec:
     for axis, value in zip(axes, values, strict=True):
         spec = axes_of.change(axis, value).apply(spec)
     return spec

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -90,8 +89,12 @@ def plot_robustness(result: RobustnessMap) -> str:
 
 def _plot_varied(result: RobustnessMap, quantity: str) -> str:
     (axis,) = result.axes
+    intervals = [each.success_interval if quantity == "success" else each.return_interval for each in result.cells]
+    low, high = np.array(intervals, np.float64).T
+    means = [_value(cell, quantity) for cell in result.cells]
+    curve = {"steps": axis.values, "mean": means, "low": low, "high": high, "count": len(means)}
     figure, axes = _make_figure()
-    _draw_intervals(axes, axis.values, result.cells, quantity)
+    _draw_curve(axes, curve, quantity, {"marker": "o", "ms": 3})
     if axis.nominal is not None:
         axes.axvline(axis.nominal, linestyle=":", color="gray", label="nominal")
         axes.legend(loc="best", **_LEGEND)
@@ -106,15 +109,6 @@ def plot_push(test: PushTest) -> str:
         axes.axvline(test.threshold, linestyle=":", color="gray")
     axes.set_ylim(-0.03, 1.03)
     return _finish(figure, axes, "push [N s]", test.measure, f"{test.measure} by push")
-
-
-def _draw_intervals(axes: Axes, places: Sequence[float], cells: Sequence[Any], quantity: str) -> None:
-    values = [_value(cell, quantity) for cell in cells]
-    (line,) = axes.plot(places, values, marker="o", ms=3)
-    intervals = [cell.success_interval if quantity == "success" else cell.return_interval for cell in cells]
-    if all(each is not None for each in intervals):
-        low, high = np.array(intervals).T
-        axes.fill_between(places, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
 
 
 def _value(cell: Any, quantity: str) -> float:
