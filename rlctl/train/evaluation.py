@@ -31,13 +31,20 @@ _POLICY = "training step "
 
 
 class Evaluator:
-    """Plays the evaluation episodes of a run; nothing of the training changes by it."""
+    """Plays the evaluation episodes of a run, and writes some; nothing of the training changes by it.
 
-    def __init__(self, recipe: Recipe, make_workers: Callable[[], Workers]) -> None:
+    `goal` is what the environments are in which it evaluates.
+    """
+
+    def __init__(self, recipe: Recipe, make_workers: Callable[[], Workers], saver: Saver, goal: EnvInfo) -> None:
         self._recipe = recipe
         self._make_workers = make_workers
+        self._saver = saver
+        self._goal = goal
         # They build their environments beside the first updates, which leave a core idle.
         self._workers: Workers | None = make_workers()
+        self._spec = self._workers.spec
+        self._latest: list[RecordedEpisode] = []
 
     def run(self, info: PolicyInfo, tensors: Tensors, check: Callable[[], None]) -> list[Episode]:
         """Return the episodes of a policy.
@@ -62,17 +69,6 @@ class Evaluator:
             self._workers.close()
         self._workers = None
 
-
-class EpisodeKeeper:
-    """Writes episodes into a run folder; `spec` and `info` are what evaluations are played in."""
-
-    def __init__(self, saver: Saver, spec: EnvSpec, info: EnvInfo) -> None:
-        self.run = saver.run
-        self._saver = saver
-        self.spec = spec
-        self.info = info
-        self._latest: list[RecordedEpisode] = []
-
     def keep(self, episodes: list[Episode], steps: int) -> None:
         """Write the first and the worst of an evaluation; remember all of it for `record`."""
         self._latest = recorded = [self._recorded(episode, steps) for episode in episodes]
@@ -90,7 +86,7 @@ class EpisodeKeeper:
 
             path = self._write(episode)
             recording = path.with_suffix(".rrd")
-            title = f"{self.run.path.name} / episode {path.stem}"
+            title = f"{self._saver.run.path.name} / episode {path.stem}"
             record_episode(episode, recording, title=title, several=count > 1)
             recordings.append(recording)
         return recordings
@@ -112,28 +108,28 @@ class EpisodeKeeper:
         )
         nothing = np.zeros(0)
         # Of a reset that failed there is no action to take the shape from.
-        actions = np.asarray(error.actions).reshape(-1, *(self.info.spaces()[1].shape or ()))
+        actions = np.asarray(error.actions).reshape(-1, *(self._goal.spaces()[1].shape or ()))
         episode = RecordedEpisode(info, actions, nothing, nothing, nothing.reshape(0, 0))
-        files: list[Path] = []
-        self._saver.attempt("failed episode", lambda: files.append(self._write(episode)))
-        return error.with_hint(f"to reproduce it: rlctl replay {files[0]}") if files else error
+        written: list[Path] = []
+        self._saver.attempt("failed episode", lambda: written.append(self._write(episode)))
+        return error.with_hint(f"to reproduce it: rlctl replay {written[0]}") if written else error
 
     def _write(self, episode: RecordedEpisode) -> Path:
-        path = self.run.episode_file(self.run.next_episode_number())
+        run = self._saver.run
+        path = run.episode_file(run.next_episode_number())
         save_episode(path, episode)
         return path
 
     def _recorded(self, episode: Episode, steps: int) -> RecordedEpisode:
         trajectory = episode.trajectory
         assert trajectory is not None  # evaluations record
-        spec = self.spec
         info = EpisodeInfo(
-            spec=spec,
+            spec=self._spec,
             seed=episode.result.seed,
             policy=f"{_POLICY}{steps}",
             success=episode.result.success,
             total_reward=episode.result.total_reward,
-            term_names=list(self.info.reward_weights),
+            term_names=list(self._goal.reward_weights),
             versions=collect_versions(),
         )
         return RecordedEpisode(info, trajectory.actions, trajectory.observations, trajectory.rewards, trajectory.terms)

@@ -20,7 +20,7 @@ from rlctl.runs.diagnosis import Grade, diagnose
 from rlctl.train import measurements, status
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
-from rlctl.train.evaluation import EpisodeKeeper, Evaluator
+from rlctl.train.evaluation import Evaluator
 from rlctl.train.pack import pack
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Rollouts
@@ -55,7 +55,6 @@ class TrainingLoop:
         self._env = learner.rollouts.env
         self._evaluator = evaluator
         self._display = display
-        self._episodes = EpisodeKeeper(saver, learner.curriculum.goal_spec, learner.curriculum.goal)
         self._reported: set[str] = set()
         """The findings that were shown."""
         self._stop_announced = False
@@ -219,7 +218,7 @@ class TrainingLoop:
         progress, steps = self.progress, self.steps
         progress.failed_evaluations += 1
         progress.first_failure = progress.first_failure or f"at step {steps:,}: {error}"
-        error = self._episodes.keep_failed(error, self.curriculum.goal_spec, steps)
+        error = self._evaluator.keep_failed(error, self.curriculum.goal_spec, steps)
         self._display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
 
     def _note_evaluation(self, episodes: list[Episode], packed: Packed) -> None:
@@ -245,7 +244,7 @@ class TrainingLoop:
         if success is not None:
             logger.record("eval/success_rate", success)
         logger.dump(steps)
-        self.saver.attempt("episodes", lambda: self._episodes.keep(episodes, steps))
+        self.saver.attempt("episodes", lambda: self._evaluator.keep(episodes, steps))
         self._display.evaluation(steps, success, mean, better)
 
     def _pack(self) -> Packed:
@@ -270,7 +269,7 @@ class TrainingLoop:
 
     def _explain_fault(self, error: TaskError) -> TaskError:
         """Keep the actions of the training episode that failed, and return the error with what to do next."""
-        lines = [str(self._episodes.keep_failed(error, self._env.workers.spec))]
+        lines = [str(self._evaluator.keep_failed(error, self._env.workers.spec))]
         if step := self.saver.saved_step:  # at step 0 there is nothing to keep
             lines.append(
                 f"the checkpoint of step {step:,} stands; go on with: rlctl train --resume {self.saver.run.path}"
@@ -283,4 +282,4 @@ class TrainingLoop:
             self._display.message(f"warning: {count:,} observations were outside their space")
         write = lambda: status.write_end(self.saver.run, self.steps, self.progress)  # noqa: E731
         self.saver.retry(lambda: self.saver.attempt("run.json", write))
-        return self._episodes.record(recordings)
+        return self._evaluator.record(recordings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -60,7 +61,8 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
             display.message(f"warning: {run.path}: no locks on this file system: let no second process write this run")
         saver = _open_run(run, start, learner, display)
         n_envs = min(recipe.eval.episodes, available_cores())
-        evaluator = Evaluator(recipe, lambda: _make_workers(specs[-1], n_envs, start, display))
+        make_workers = functools.partial(_make_workers, specs[-1], n_envs, start, display)
+        evaluator = Evaluator(recipe, make_workers, saver, learner.curriculum.goal)
         stack.callback(evaluator.close)
         display.run_folder(run)
         try:
