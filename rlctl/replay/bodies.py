@@ -19,12 +19,12 @@ _GROUND_COLOR = (70, 74, 82)
 _MESHES = {".obj", ".stl", ".dae", ".glb", ".gltf"}
 
 
-def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> str | None:
+def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> tuple[str, BodyMotion] | None:
     """Draw everything under `world/`; `warn` receives what could not be drawn as it should be.
 
-    Returns the entity that the camera is to follow: the trunk of the first robot that has one, if it was drawn.
+    Returns the entity that the camera is to follow, the trunk of the first robot that has one, if it was drawn.
     """
-    trunks: list[str] = []
+    trunks: list[tuple[str, BodyMotion]] = []
     timelines.stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for body in scene.bodies:
         if body.ground_height is not None:
@@ -35,7 +35,7 @@ def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> str | None:
             drawn = draw_shapes(body, timelines, warn)
             if body.trunk is not None:
                 trunk = _entity("world", body.name, body.links[body.trunk]) + "/"
-                trunks += [entity for entity in drawn if entity.startswith(trunk)]
+                trunks += [(entity, body) for entity in drawn if entity.startswith(trunk)]
         _draw_path(body, timelines)
     for number, (name, positions) in enumerate(scene.markers.items()):
         _draw_marker(name, positions, _MARKER_COLORS[number % len(_MARKER_COLORS)], timelines)
@@ -101,23 +101,6 @@ def bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     paths = [body.positions.reshape(-1, 3) for body in scene.bodies if body.ground_height is None]
     points = np.concatenate([*paths, *scene.markers.values(), np.zeros((0, 3))])
     return (points.min(axis=0), points.max(axis=0)) if len(points) else (-np.ones(3), np.ones(3))
-
-
-def start_bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what `bounds` does for the first robot with a trunk alone, as it stands at the reset."""
-    drawn = {body.name: {shape.link for shape in body.shapes} for body in scene.bodies}
-    bodies = (body for body in scene.bodies if body.trunk is not None and body.links[body.trunk] in drawn[body.name])
-    body = next(bodies, None)
-    if body is None:
-        return bounds(scene)
-    low, high = [], []
-    for link, name in enumerate(body.links):
-        shapes = [shape for shape in body.shapes if shape.link == name]
-        for shape, center in zip(shapes, shape_centers(body, link)[:, 0], strict=True):
-            reach = 0.0 if shape.mesh else max(shape.size, default=0.0) / 2  # a mesh has a scale instead of a size
-            low.append(center - reach)
-            high.append(center + reach)
-    return np.min(low, axis=0), np.max(high, axis=0)
 
 
 def _draw_path(body: BodyMotion, timelines: Timelines) -> None:

@@ -15,12 +15,15 @@ import rerun.blueprint as rrb
 
 from rlctl import registry
 from rlctl.errors import ArtifactError
-from rlctl.replay.bodies import bounds, draw_scene, start_bounds
+from rlctl.replay.bodies import bounds, draw_scene
 from rlctl.replay.curves import Plot, Timelines, send_curves
 from rlctl.replay.recorder import Rollout
-from rlctl.replay.scene import Scene, Warn
+from rlctl.replay.scene import BodyMotion, Scene, Warn
 from rlctl.run import files
 from rlctl.run.episode import RecordedEpisode
+
+Followed = tuple[str, BodyMotion] | None
+"""What the camera follows: an entity, and the body that it is of."""
 
 _LEVEL_COLORS = {"INFO": 0xB0D0FFFF, "WARN": 0xFFC060FF, "DEBUG": 0xB0B0B0FF}
 _EYE_DIRECTION = np.array([1.0, 0.75, 0.5])  # from the front left, looking down
@@ -113,10 +116,8 @@ def _send_log(rollout: Rollout, timelines: Timelines) -> None:
     timelines.send("goal", changes, rr.StateChange.columns(state=states))
 
 
-def _layout(
-    rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: str | None, several: bool
-) -> rrb.Blueprint:
-    """Return the layout: the world on the left, its numbers on the right; the camera follows the entity `followed`."""
+def _layout(rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: Followed, several: bool) -> rrb.Blueprint:
+    """Return the layout: the world on the left, its numbers on the right; the camera follows `followed`."""
     scene = rollout.scene
     left: list[rrb.Container | rrb.View] = []
     if scene.bodies or scene.markers:
@@ -160,11 +161,12 @@ def _plot(plot: Plot) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(name=plot.title, origin=f"/{plot.entity}", plot_legend=legend)
 
 
-def _world(scene: Scene, followed: str | None) -> rrb.Spatial3DView:
-    low, high = bounds(scene) if followed is None else start_bounds(scene)
+def _world(scene: Scene, followed: Followed) -> rrb.Spatial3DView:
+    entity, body = followed or (None, None)
+    low, high = bounds(scene) if body is None else body.box
     center, size = (low + high) / 2, float(np.linalg.norm(high - low))
     distances = [1.0, 1.15 * size]
-    if followed is not None:
+    if body is not None:
         # What is followed is in the middle of the picture: its feet are far below, and a goal is to one side.
         goals = [float(np.linalg.norm(positions[0] - center)) for positions in scene.markers.values()]
         distances = [1.0, 1.5 * size, *(_GOAL_MARGIN * goal for goal in goals)]
@@ -178,6 +180,6 @@ def _world(scene: Scene, followed: str | None) -> rrb.Spatial3DView:
         overrides={
             rr.new_entity_path(["world", "paths", body.name]): rrb.VisibleTimeRanges(so_far) for body in scene.robots()
         },
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=center, eye_up=(0, 0, 1), tracking_entity=followed),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=center, eye_up=(0, 0, 1), tracking_entity=entity),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, plane=rr.components.Plane3D.XY),
     )

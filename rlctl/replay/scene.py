@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,8 @@ class BodyMotion:
     shapes: list[Shape]
     trunk: int | None
     """Index in `links` of what moves about: a free base, or what sliding joints without limits carry; else None."""
+    box: tuple[Array, Array]
+    """Lowest and highest corner [m] at the reset."""
     chain: bool
     """Whether the links follow each other in one line, as those of an arm do."""
 
@@ -82,6 +85,19 @@ def make_reader(env: Env, warn: Warn) -> SceneReader | Camera:
     """Return what reads the world of a task, or takes the pictures of any other environment."""
     inner = env.unwrapped
     return SceneReader(inner) if isinstance(inner, TaskEnv) else Camera(env, warn)
+
+
+def find_bounds(bodies: Sequence[Body], markers: Sequence[Array] = ()) -> tuple[Array, Array]:
+    """Return the lowest and the highest corner [m] now of bodies that are not the ground, and of markers."""
+    corners = list(markers)
+    for body in bodies:
+        boxes = [
+            np.array(pybullet.getAABB(body.id, link, physicsClientId=body.client))
+            for link in range(-1, len(body.link_names))
+        ]
+        wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
+        corners += [] if wide else list(itertools.chain(*boxes))
+    return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
 
 
 class SceneReader:
@@ -128,6 +144,7 @@ class _BodyReader:
         inertial = pybullet.getDynamicsInfo(body.id, -1, physicsClientId=self.client)[_INERTIAL_POSE]
         # PyBullet's base pose is that of the centre of mass.
         self._base_in_inertial = pybullet.invertTransform(*inertial)
+        self._box = find_bounds([body])
         self._joint_positions: list[Array] = []
         self._joint_velocities: list[Array] = []
         self._poses: list[list[tuple[tuple[float, ...], tuple[float, ...]]]] = []
@@ -161,6 +178,7 @@ class _BodyReader:
             orientations=np.array([[pose[1] for pose in poses] for poses in self._poses], np.float64),
             shapes=shapes,
             trunk=self._trunk(),
+            box=self._box,
             chain=self._is_chain(),
         )
 

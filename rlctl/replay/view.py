@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +10,9 @@ from numpy.typing import NDArray
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.replay.difference import find_difference
 from rlctl.replay.recorder import play_episode, recorded_actions
-from rlctl.replay.scene import Env, encode_jpeg
+from rlctl.replay.scene import Env, encode_jpeg, find_bounds
 from rlctl.run.episode import RecordedEpisode
 from rlctl.task import Sim
-from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
 
 Picture = NDArray[np.uint8]
@@ -25,7 +21,6 @@ _WIDTH, _HEIGHT = 240, 180  # [pixels], of a report's pictures
 _EYE_DIRECTION = np.array([1.0, -0.9, 0.55])  # from the right of a robot that looks along x, from above
 _FIELD_OF_VIEW = 45.0  # [degrees]
 _CLOSEST, _FARTHEST = 0.8, 8.0  # [m]; the renderer draws nothing beyond 10 m
-_GROUND_SIZE = 8.0  # [m]; what is wider both ways is not looked at
 
 
 def look_at(env: Env, width: int, height: int) -> _World | _Pictures:
@@ -76,10 +71,10 @@ class _World:
         self._followed = trunks[0] if trunks else None
         markers = [np.asarray(position) for position in self._env.task.markers().values()]
         if self._followed is None:
-            low, high = _find_bounds(bodies, markers)
+            low, high = find_bounds(bodies, markers)
             self._target, distance = (low + high) / 2, 1.15 * float(np.linalg.norm(high - low))
         else:
-            low, high = _find_bounds([self._followed[0]], [])
+            low, high = find_bounds([self._followed[0]], [])
             self._target, distance = (low + high) / 2, 1.6 * float(np.linalg.norm(high - low))
             for marker in markers:
                 distance = max(distance, 2.5 * float(np.linalg.norm(marker - self._target)))
@@ -94,19 +89,6 @@ class _World:
         return self._env.sim.render(
             *self._size, eye=eye.tolist(), target=self._target.tolist(), field_of_view=_FIELD_OF_VIEW
         )
-
-
-def _find_bounds(bodies: Sequence[Any], markers: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the lowest and the highest corner [m] of bodies that are not the ground, and of markers."""
-    corners = list(markers)
-    for body in bodies:
-        boxes = [
-            np.array(pybullet.getAABB(body.id, link, physicsClientId=body.client))
-            for link in range(-1, len(body.link_names))
-        ]
-        wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
-        corners += [] if wide else list(itertools.chain(*boxes))
-    return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
 
 
 @dataclasses.dataclass(frozen=True)
