@@ -145,9 +145,10 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         found, damage = checkpoint.read_newest(run)
         if found is not None and request.settings:
             found = _reopen(found, before, recipe)
-        notes = tuple(f"warning: {each}; going on from step {found.state.step:,}" for each in damage if found)
-        notes = notes if found else ("no checkpoint yet: the training begins at its first step",)
-        return Start(request, task, recipe, run, lock, found, notes, status.get("from"), tuple(changes))
+        notes = ["no checkpoint yet: the training begins at its first step"]
+        if found is not None:
+            notes = [f"warning: {each}; going on from step {found.state.step:,}" for each in damage]
+        return Start(request, task, recipe, run, lock, found, tuple(notes), status.get("from"), tuple(changes))
     except BaseException:
         lock.release()
         raise
