@@ -61,14 +61,16 @@ def out() -> Console:
 @functools.cache
 def err() -> Console:
     """Return the console for progress, logs and errors."""
-    return _make_console(sys.stderr)
+    return _make_console(None)
 
 
-def _make_console(stream: TextIO) -> Console:
+def _make_console(stream: TextIO | None) -> Console:
+    """Return a console for a stream, or for what stderr is whenever it writes: a notebook may replace it."""
     from rich.console import Console
 
-    width = None if stream.isatty() else _PIPED_WIDTH
-    return Console(file=stream, highlight=False, width=width, soft_wrap=not stream.isatty())
+    terminal = (stream or sys.stderr).isatty()
+    width = None if terminal else _PIPED_WIDTH
+    return Console(file=stream, stderr=stream is None, highlight=False, width=width, soft_wrap=not terminal)
 
 
 def is_utf8() -> bool:
