@@ -97,7 +97,7 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
     assert written.provenance == report.provenance
     assert written.provenance.run == "reach/2026-01-01_00-00-00_s3"
     assert written.provenance.git_commit == "abc"
-    assert written.provenance.recipe["total_timesteps"] == 80_000
+    assert written.provenance.recipe["total_timesteps"] == 120_000
     scores = {"policy": written.provenance.score, **written.provenance.baselines}
     assert all(each.episodes == 3 and each.seed == 0 and each.ended_early == 0.0 for each in scores.values())
     assert scores["zero"].action_change == 0.0

@@ -80,7 +80,7 @@ def test_a_bundled_task_on_a_page(rlctl):
         "joint_positions 7 rad unbounded",
         "tolerance float 0.05",
         "distance -1",
-        "total_timesteps: 80000",
+        "total_timesteps: 120000",
     ):
         assert line in shown
     assert "\x1b" not in result.stdout

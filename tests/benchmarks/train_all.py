@@ -65,13 +65,16 @@ def train(task: str, seeds: str, root: Path) -> int:
 
 
 def read_scores(group: Group) -> dict[str, Any]:
-    """Return the scores of a group, from its file if that is newer than its runs; else they are measured."""
+    """Return the scores of a group, from its file if that has the same runs and is newer; else they are measured."""
     runs = [run for seed in group.seeds if (run := group.find_run(seed)) is not None]
     file = group.scores_file
     newest = max((run.status_file.stat().st_mtime for run in runs), default=0.0)
-    if not file.is_file() or file.stat().st_mtime < newest:
-        files.write_json(file, as_json(evaluate_group(group, EvalRequest(None))))
-    content: dict[str, Any] = json.loads(file.read_text())
+    content: dict[str, Any] = {}
+    if file.is_file() and file.stat().st_mtime >= newest:
+        content = json.loads(file.read_text())
+    if not content or [each["seed"] for each in content["seeds"]] != group.seeds:
+        content = as_json(evaluate_group(group, EvalRequest(None)))
+        files.write_json(file, content)
     return content
 
 
