@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rlctl import registry
-
 _RUNS = Path("runs")
 _MOST = 50
 
 
 def complete_task(incomplete: str) -> list[str]:
     """Return the installed tasks that begin so, and the Python files here."""
+    from rlctl import registry  # only here: every command's help imports this module
+
     names = [entry.name for entry in registry.list_installed() if entry.problem is None]
     return [each for each in (*dict.fromkeys(names), *_list_paths(incomplete, "*.py")) if each.startswith(incomplete)]
 
