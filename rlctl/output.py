@@ -153,15 +153,19 @@ def print_table(
     out().print(lines, end="", soft_wrap=True)
 
 
-def write_result_json(target: str, content: Any) -> None:
-    """Write a result, of plain data, dataclasses and paths, as JSON to a file, or to stdout for `-`."""
+def write_result_json(target: str, content: Any) -> bool:
+    """Write a result, of plain data, dataclasses and paths, as JSON to a file, or to stdout for `-`.
+
+    Return whether stdout has it: then nothing else belongs there.
+    """
     from pydantic_core import to_jsonable_python
 
     content = to_jsonable_python(content)
     if target == "-":
         results().write(json.dumps(content, indent=2, allow_nan=False) + "\n")
         results().flush()
-        return
+        return True
     from rlctl.run import files
 
     files.write_json(Path(target), content)
+    return False

@@ -20,10 +20,10 @@ def show_all(results: Sequence[Evaluation], json: str | None) -> None:
     if len(results) == 1:
         show(results[0], json)
         return
-    if json is not None:
-        output.write_result_json(json, {"stages": [as_json(result) for result in results]})
-    if json != "-":
-        _show_stages(results)
+    content = {"stages": [as_json(result) for result in results]}
+    if json is not None and output.write_result_json(json, content):
+        return
+    _show_stages(results)
 
 
 def _show_stages(results: Sequence[Evaluation]) -> None:
@@ -58,9 +58,7 @@ def _describe_changes(spec: EnvSpec, specs: Sequence[EnvSpec]) -> str:
 
 def show(result: Evaluation, json: str | None) -> None:
     """Print the numbers, or JSON alone for `-`."""
-    if json is not None:
-        output.write_result_json(json, as_json(result))
-    if json == "-":
+    if json is not None and output.write_result_json(json, as_json(result)):
         return
     out = output.out()
     _show_head(result)

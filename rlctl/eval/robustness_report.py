@@ -17,9 +17,7 @@ _NOMINAL, _WORST = "*", "<"
 
 def show(result: Robustness, json: str | None) -> None:
     """Print the maps and the push, or JSON alone for `-`."""
-    if json is not None:
-        output.write_result_json(json, result.model_dump(mode="json"))
-    if json == "-":
+    if json is not None and output.write_result_json(json, result.model_dump(mode="json")):
         return
     out = output.out()
     out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})", markup=False)

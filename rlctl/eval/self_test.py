@@ -113,9 +113,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
 
 def show(result: SelfTest, json: str | None) -> None:
     """Print a self-test, or JSON alone for `-`."""
-    if json is not None:
-        output.write_result_json(json, as_json(result))
-    if json == "-":
+    if json is not None and output.write_result_json(json, as_json(result)):
         return
     out, direct, served = output.out(), result.direct, result.served
     out.print(f"{direct.spec.task}: {direct.name}, {len(served.episodes)} episodes, through a server", markup=False)

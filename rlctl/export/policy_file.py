@@ -60,9 +60,7 @@ def export_actor(run: str | None, *, checkpoint: str, target: Path, episodes: in
 
 def show(report: PolicyFileReport, json: str | None) -> None:
     """Print a report, or JSON alone for `-`."""
-    if json is not None:
-        output.write_result_json(json, as_json(report))
-    if json == "-":
+    if json is not None and output.write_result_json(json, as_json(report)):
         return
     out, info, provenance = output.out(), report.info, report.provenance
     out.print(f"exported {report.path} ({format_bytes(report.size)}): the actor of {provenance.run}", markup=False)

@@ -70,9 +70,8 @@ def show(reports: list[ExportReport], json: str | None) -> None:
     """
     if json is not None:
         by_format = {each.path.suffix[1:]: each.as_json() for each in reports}
-        output.write_result_json(json, by_format if len(reports) > 1 else reports[0].as_json())
-    if json == "-":
-        return
+        if output.write_result_json(json, by_format if len(reports) > 1 else reports[0].as_json()):
+            return
     from rich.text import Text
 
     for number, report in enumerate(reports):

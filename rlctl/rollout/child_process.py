@@ -32,7 +32,7 @@ _BOOTSTRAP = (
     "import json, sys; job = json.loads(sys.argv[1]); sys.path[:] = job['sys_path']; "
     "from rlctl.rollout.child_process import run_main; run_main(job)"
 )
-_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -130,7 +130,7 @@ def run_main(job: dict[str, Any]) -> None:
 @contextlib.contextmanager
 def _block_signals() -> Iterator[None]:
     """Hold back signals that ask to stop: a child that is started meanwhile takes them when it is ready for them."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         yield
     finally:

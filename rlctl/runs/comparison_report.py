@@ -13,9 +13,7 @@ from rlctl.runs.statistics import ALPHA, Difference, SeedDifference, Verdict, in
 
 def show(result: Comparison, json: str | None) -> None:
     """Print which question is answered, the scores, the differences and the verdicts; or JSON alone for `-`."""
-    if json is not None:
-        output.write_result_json(json, as_json(result))
-    if json == "-":
+    if json is not None and output.write_result_json(json, as_json(result)):
         return
     out = output.out()
     if result.of_recipes:

@@ -154,9 +154,10 @@ def show(result: ImportedPolicy, json: str | None) -> None:
             "normalizes": normalizes,
             "time_feature": info.spec.time_feature,
         }
-        output.write_result_json(json, {**content, "training_steps": info.training_steps, "versions": info.versions})
-    if json == "-":
-        return
+        if output.write_result_json(
+            json, {**content, "training_steps": info.training_steps, "versions": info.versions}
+        ):
+            return
     out = output.out()
     normalization = "with" if normalizes else "without"
     out.print(f"{result.file}: {info.algo}, step {info.training_steps:,}, {normalization} observation normalisation")

@@ -82,9 +82,8 @@ def show(run: RunDescription, json: str | None) -> None:
         content = {**as_json(summary), "evaluations": run.evaluations, "metrics": run.metrics}
         found = {"warnings": run.warnings, "findings": diagnosis.as_json(run.findings)}
         measured = None if run.robustness is None else run.robustness.model_dump(mode="json")
-        output.write_result_json(json, {**content, **found, "robustness": measured, "bytes": sizes})
-    if json == "-":
-        return
+        if output.write_result_json(json, {**content, **found, "robustness": measured, "bytes": sizes}):
+            return
     out.print(f"[bold]{summary.name}[/bold]: {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}")
     out.print(f"{summary.steps or 0:,} steps in {(summary.seconds or 0) / 60:.1f} minutes, started {summary.started}")
     if summary.best_return is not None:

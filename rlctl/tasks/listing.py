@@ -54,9 +54,7 @@ def show(listed: list[ListedTask], json: str | None) -> None:
     """Print the table, or JSON alone for `-`."""
     from rlctl import output
 
-    if json is not None:
-        output.write_result_json(json, {"tasks": [_to_json(each) for each in listed]})
-    if json == "-":
+    if json is not None and output.write_result_json(json, {"tasks": [_to_json(each) for each in listed]}):
         return
     if not listed:
         output.out().print("no tasks are installed")

@@ -68,9 +68,8 @@ def show(plugin: NewPlugin, json: str | None) -> None:
     if json is not None:
         files = [str(plugin.folder / file) for file in plugin.files]
         content = {"name": plugin.name, "folder": str(plugin.folder), "target": plugin.target, "files": files}
-        output.write_result_json(json, content)
-    if json == "-":
-        return
+        if output.write_result_json(json, content):
+            return
     out = output.out()
     for file in plugin.files:
         out.print(f"wrote {plugin.folder / file}", markup=False)

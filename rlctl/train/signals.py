@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 from rlctl import output
 from rlctl.errors import Interrupted
+from rlctl.rollout.child_process import STOP_SIGNALS
 
 if TYPE_CHECKING:
     from rlctl.train.loop import TrainingLoop
 
-_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_S = 1.0  # equal signals within it are one: `timeout` sends SIGTERM to the process and to its group
 
 Handler = Callable[[int, FrameType | None], None]
@@ -35,7 +35,7 @@ class HandledSignals:
             # ignored stays so.
             self._before = {
                 each: signal.getsignal(each)
-                for each in _STOP_SIGNALS
+                for each in STOP_SIGNALS
                 if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN
             }
         self.handle_again()

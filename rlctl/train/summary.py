@@ -14,9 +14,7 @@ from rlctl.train.request import TrainResult
 def show(result: TrainResult, json: str | None) -> None:
     """Print the result, what the training's records show, and what to type next; for `--json -` JSON instead."""
     findings = diagnose(result.run)
-    if json is not None:
-        output.write_result_json(json, _to_json(result, findings))
-    if json == "-":
+    if json is not None and output.write_result_json(json, _to_json(result, findings)):
         return
     run = result.run.path
     lines = [result.note] if result.note else []
