@@ -70,7 +70,9 @@ def _make_console(stream: TextIO | None) -> Console:
 
     terminal = (stream or sys.stderr).isatty()
     width = None if terminal else _PIPED_WIDTH
-    return Console(file=stream, stderr=stream is None, highlight=False, width=width, soft_wrap=not terminal)
+    # No emoji: "car.py:Car: no findings" would have one in it.
+    options: dict[str, Any] = {"highlight": False, "emoji": False, "soft_wrap": not terminal}
+    return Console(file=stream, stderr=stream is None, width=width, **options)
 
 
 def is_utf8() -> bool:
@@ -106,6 +108,11 @@ def format_duration(seconds: float) -> str:
         if seconds >= size:
             return f"{round(seconds / size, 1):g} {unit}"
     return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{seconds:.0f} s"
+
+
+def format_count(count: int, noun: str) -> str:
+    """Return a number of things: `1 episode`, `2,000 episodes`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def print_notes(notes: Iterable[str]) -> None:

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from rlctl import error_boundary
+from rlctl import error_boundary, output
 
 RLCTL = f"{sys.executable} -m rlctl"
 
@@ -24,6 +24,11 @@ def test_a_terminal_that_is_not_utf8(encoding):
     done = shell(f'{sys.executable} -c "{code}"', PYTHONIOENCODING=encoding, PYTHONUTF8="0")
     assert done.stderr.endswith(b"[0, 0, 5]\n"), done.stderr
     assert b"Traceback" not in done.stderr
+
+
+def test_the_name_of_a_class_is_no_emoji(capsys):
+    output.err().print("arms.py:Robot: no findings", markup=False)
+    assert capsys.readouterr().err == "arms.py:Robot: no findings\n"
 
 
 def test_progress_in_ascii(monkeypatch, capsys):

@@ -18,7 +18,7 @@ def train(
         str | None,
         typer.Option(
             metavar="RUN",
-            help="Go on with a run instead: a folder, also of a group, a task's name, or latest.",
+            help="Go on with a run, or with a group of seeds: its folder, a task's name, or latest.",
             autocompletion=completion.complete_run,
         ),
     ] = None,
@@ -68,14 +68,15 @@ def train(
 ) -> None:
     """Train a policy, evaluate as it goes, and keep the best and the last."""
     claim_stdout()
-    from rlctl.run.directory import is_group
+    from rlctl.run.group import find_group
     from rlctl.run.recipe_sources import merge_flags
     from rlctl.train.request import TrainRequest, run_training
     from rlctl.train.summary import show
 
+    group_folder = find_group(resume, output) if resume is not None else None
     request = TrainRequest(
         task=task,
-        resume=resume,
+        resume=resume if group_folder is None else str(group_folder),
         config=config,
         settings=merge_flags(
             settings, algo=algo, seed=seed, total_timesteps=total_timesteps, n_envs=n_envs, stop_success=stop_success
@@ -88,7 +89,7 @@ def train(
         force=force,
         initial_policy=initial_policy,
     )
-    if seeds is not None or (resume is not None and is_group(Path(resume))):
+    if seeds is not None or group_folder is not None:
         from rlctl.eval import group
         from rlctl.train.seeds import train_seeds
 

@@ -83,8 +83,11 @@ def show(result: GroupScore, json: str | None) -> None:
         return
     out = output.out()
     scores = [each.score for each in result.seeds if each.score is not None]
-    episodes = f", {scores[0].episodes} episodes each, seed {scores[0].seed}" if scores else ""
-    out.print(f"{result.group.task}: {result.group.path}, {len(result.seeds)} seeds{episodes}", markup=False)
+    episodes = f", {output.format_count(scores[0].episodes, 'episode')} each, seed {scores[0].seed}" if scores else ""
+    out.print(
+        f"{result.group.task}: {result.group.path}, {output.format_count(len(result.seeds), 'seed')}{episodes}",
+        markup=False,
+    )
     success, returns = result.spread("success"), result.spread("mean_return")
     rows = [_list_cells(each) for each in result.seeds]
     for label in ("mean", "IQM", "std"):

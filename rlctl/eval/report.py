@@ -106,7 +106,8 @@ def _show_head(result: Evaluation) -> None:
     mode = "" if result.deterministic else ", sampled actions"
     out.print(f"{result.spec.task}: {describe_policy(result)}", markup=False)
     randomization = describe_randomization(result.events)
-    out.print(f"{len(result.episodes)} episodes, seed {result.seed}{mode}{randomization and f', {randomization}'}")
+    episodes = output.format_count(len(result.episodes), "episode")
+    out.print(f"{episodes}, seed {result.seed}{mode}{randomization and f', {randomization}'}")
 
 
 def describe_policy(result: Evaluation) -> str:

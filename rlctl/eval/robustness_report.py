@@ -22,7 +22,9 @@ def show(result: Robustness, json: str | None) -> None:
     out = output.out()
     out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})", markup=False)
     mode = "" if result.deterministic else ", sampled actions"
-    out.print(f"{result.episodes} episodes in every cell, the same seeds (seed {result.seed}){mode}")
+    out.print(
+        f"{output.format_count(result.episodes, 'episode')} in every cell, the same seeds (seed {result.seed}){mode}"
+    )
     out.print(f"nominal: {format_outcome(result.nominal)}")
     worst = result.find_worst()
     for each in result.maps:

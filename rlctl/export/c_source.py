@@ -17,6 +17,7 @@ import rlctl
 from rlctl.dict_spaces import SINGLE, split_space
 from rlctl.errors import AnswerIsNo, UsageError, short_repr
 from rlctl.export.c_layers import CWriter
+from rlctl.output import format_count
 from rlctl.run.c_policy import LIBRARY_SUFFIX, action_type, observation_type
 from rlctl.run.layers import ScaleImage
 from rlctl.run.network import Network, Tensors, select_actor_tensors
@@ -162,7 +163,7 @@ def _write_header(name: str, info: PolicyInfo, layout: _Layout, members: list[st
         f"observation, {layout.size} elements, raw: normalisation is inside"
         + (f"; one observation, the last {layout.frames} are stacked inside" if layout.frames > 1 else ""),
         *layout.list_elements(),
-        f"action, {layout.action_size} element{'s' if layout.action_size > 1 else ''}",
+        f"action, {format_count(layout.action_size, 'element')}",
         *layout.list_actions(),
         "",
         "Nothing is allocated, and nothing is shared between calls" + (" but the state." if members else "."),

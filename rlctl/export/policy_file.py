@@ -67,7 +67,9 @@ def show(report: PolicyFileReport, json: str | None) -> None:
     out.print(f"{info.algo} for {info.spec.task}, step {info.training_steps:,}", markup=False)
     for name, score in {"policy": provenance.score, **provenance.baselines}.items():
         out.print(f"{name:8} {describe_score(score)}", markup=False)
-    out.print(f"{provenance.score.episodes} episodes, seed {provenance.score.seed}; 95 % intervals")
+    out.print(
+        f"{output.format_count(provenance.score.episodes, 'episode')}, seed {provenance.score.seed}; 95 % intervals"
+    )
 
 
 def as_json(report: PolicyFileReport) -> dict[str, Any]:

@@ -97,8 +97,9 @@ def format_agreement(agreement: Agreement) -> str:
 
 def format_closed_loop(loop: ClosedLoop) -> str:
     """Return the comparison of whole episodes, in a line."""
+    episodes = output.format_count(loop.episodes, "episode")
     return (
-        f"{loop.episodes} episodes: success same in {loop.same_success}, length in {loop.same_length}, "
+        f"{episodes}: success same in {loop.same_success}, length in {loop.same_length}, "
         f"return within {loop.max_return_difference:.1e} "
         f"(mean {loop.mean_return:.5g} and {loop.mean_return_exported:.5g})"
     )

@@ -51,11 +51,17 @@ def choose_episodes(
         policy.give_to(workers)
         results = [episode.result for episode in play_episodes(workers, seeds)]
     chosen = select(results, choice)
+    return chosen, f"{_describe_choice(results, choice.kind, len(chosen))} (seed {seed})"
+
+
+def _describe_choice(results: Sequence[EpisodeResult], kind: str, count: int) -> str:
+    episodes = output.format_count(len(results), "episode")
+    if kind == "failures":
+        failures = output.format_count(sum(not result.success for result in results), "failure")
+        return f"{count} of {failures} among {episodes}" if count else f"nothing to replay: no failure among {episodes}"
     known = [result.success for result in results if result.success is not None]
-    successes = f", {sum(known)} of which succeeded" if known else ""
-    if not chosen:
-        return chosen, f"no failure among {episodes} episodes (seed {seed}): nothing to replay"
-    return chosen, f"the {len(chosen)} {choice.kind} of {episodes} episodes (seed {seed}){successes}"
+    successes = f", of which {sum(known)} succeeded" if known else ""
+    return f"the {f'{count} ' if count > 1 else ''}{kind} of {episodes}{successes}"
 
 
 def select(results: Sequence[EpisodeResult], choice: Choice) -> list[EpisodeResult]:

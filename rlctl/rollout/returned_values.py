@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.dict_spaces import SINGLE, split, split_space
 from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
+from rlctl.output import format_count
 from rlctl.rollout.shared_arrays import observation_fields
 
 STEP = ("observation", "reward", "terminated", "truncated", "info")
@@ -27,10 +28,7 @@ def check_tuple(returned: Any, names: tuple[str, ...], call: str) -> Any:
     """Return what a call gave back if it is a tuple with a value for each name."""
     if isinstance(returned, tuple | list) and len(returned) == len(names):
         return returned
-    if isinstance(returned, tuple | list):
-        what = f"{len(returned)} value{'' if len(returned) == 1 else 's'}"
-    else:
-        what = reprlib.repr(returned)
+    what = format_count(len(returned), "value") if isinstance(returned, tuple | list) else reprlib.repr(returned)
     raise InvalidReturn(f"{call} returned {what}, and not ({', '.join(names)}), as Gymnasium requires")
 
 

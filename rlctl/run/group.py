@@ -11,7 +11,8 @@ from typing import Any
 from rlctl import registry
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files
-from rlctl.run.directory import GROUP_FILE, RunDirectory, is_group
+from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, is_group
+from rlctl.run.lookup import find_run
 
 _MOST_SEEDS = 1000
 _RANGE = re.compile(r"(\d{1,9})-(\d{1,9})")
@@ -78,6 +79,14 @@ def create_group(task: str, seeds: list[int], options: list[str], root: Path) ->
         raise ArtifactError(f"{folder}: cannot make a group's folder: {error.strerror}") from None
     files.write_json(folder / GROUP_FILE, {"task": task, "seeds": seeds, "options": options})
     return Group(folder, task, seeds, options)
+
+
+def find_group(text: str, root: Path = ROOT) -> Path | None:
+    """Return the group that a user's word stands for, if it does: its folder, or a word whose newest run is in one."""
+    if is_group(Path(text)):
+        return Path(text)
+    folder = find_run(text, root).path.parent
+    return folder if is_group(folder) and not (Path(text) / "run.json").is_file() else None
 
 
 def read_group(path: Path) -> Group:

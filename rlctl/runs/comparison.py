@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval.evaluate import EvalRequest, Evaluation, run_evaluation
 from rlctl.run.directory import RunDirectory, is_group
-from rlctl.run.group import read_group
+from rlctl.run.group import find_group, read_group
 from rlctl.run.lookup import find_run
 from rlctl.run.recipe import find_difference, find_mixed
 from rlctl.runs.statistics import (
@@ -123,7 +123,7 @@ def compare(texts: Sequence[str], request: EvalRequest, threshold: float | None 
     """
     if len(texts) < 2:
         raise UsageError("give two or more to compare, the baseline first: rlctl runs compare A B")
-    groups = [find_group(text) for text in texts]
+    groups = [find_runs_of(text) for text in texts]
     _refuse_unequal(texts, groups)
     task = _common_task([run for group in groups for run in group], request.task)
     recipes = [[run.recipe() for run in group] for group in groups]
@@ -150,7 +150,7 @@ def compare(texts: Sequence[str], request: EvalRequest, threshold: float | None 
     )
 
 
-def find_group(text: str) -> list[RunDirectory]:
+def find_runs_of(text: str) -> list[RunDirectory]:
     """Return the runs that a word stands for: those of a glob, a group or a folder of runs, or one run."""
     if any(character in text for character in "*?["):
         found = [RunDirectory(path) for path in map(Path, sorted(glob.glob(text))) if (path / "run.json").is_file()]
@@ -158,15 +158,15 @@ def find_group(text: str) -> list[RunDirectory]:
             raise ArtifactError(f"{text}: no run matches")
         return found
     path = Path(text)
-    if is_group(path):
-        group = read_group(path)
-        runs = [run for seed in group.seeds if (run := group.find_run(seed)) is not None]
-        if not runs:
-            raise ArtifactError(f"{text}: none of its seeds has begun")
-        return runs
-    if path.is_dir() and not (path / "run.json").is_file():
-        return [RunDirectory(file.parent) for file in sorted(path.glob("*/run.json"))] or [find_run(text)]
-    return [find_run(text)]
+    if not is_group(path) and (found := [RunDirectory(file.parent) for file in sorted(path.glob("*/run.json"))]):
+        return found
+    if (folder := find_group(text)) is None:
+        return [find_run(text)]
+    group = read_group(folder)
+    runs = [run for seed in group.seeds if (run := group.find_run(seed)) is not None]
+    if not runs:
+        raise ArtifactError(f"{text}: none of its seeds has begun")
+    return runs
 
 
 def _refuse_unequal(texts: Sequence[str], groups: list[list[RunDirectory]]) -> None:

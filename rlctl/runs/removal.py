@@ -85,7 +85,7 @@ def remove_with_report(removal: Removal, *, yes: bool) -> None:
     if not removal.paths:
         out.print("nothing to remove")
         return
-    what = f"{len(removal.paths)} folder{'' if len(removal.paths) == 1 else 's'}"
+    what = output.format_count(len(removal.paths), "folder")
     refusal = "nothing was removed: there is no terminal to ask on; --yes removes without asking"
     if not yes and not output.confirm(f"remove {what}, {format_bytes(removal.bytes)}?", refusal):
         return

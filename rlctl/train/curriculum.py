@@ -15,6 +15,7 @@ from stable_baselines3.her import HerReplayBuffer
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
+from rlctl.output import format_count
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.workers import Workers
 from rlctl.run.env_info import EnvInfo
@@ -104,7 +105,7 @@ class Curriculum:
         reason = f"success {percent(measured)}" if rule.success is not None else f"return {measured:.2f}"
         progress = self._progress
         progress.stage, progress.stage_began, progress.stage_episodes = progress.stage + 1, steps, []
-        return self.title, f"after {steps:,} steps: {reason} over {rule.window} episode{'s' if rule.window > 1 else ''}"
+        return self.title, f"after {steps:,} steps: {reason} over {format_count(rule.window, 'episode')}"
 
     def warning(self) -> str | None:
         """Return, once, what is wrong with a rule that nothing can fulfil."""

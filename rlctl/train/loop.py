@@ -13,6 +13,7 @@ from typing import Any
 
 from rlctl.errors import ArtifactError, Interrupted, RlctlError, TaskError, UsageError
 from rlctl.eval.statistics import mean_return, success_rate
+from rlctl.output import format_count
 from rlctl.rollout.collect import Episode
 from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
@@ -279,7 +280,7 @@ class TrainingLoop:
     def write_end(self, recordings: int) -> list[Path]:
         """Write that the training is done; return the requested recordings of the last evaluation's episodes."""
         if count := self.progress.observations_outside:
-            self._display.message(f"warning: {count:,} observations were outside their space")
+            self._display.message(f"warning: outside their space: {format_count(count, 'observation')}")
         write = lambda: status.write_end(self.saver.run, self.steps, self.progress)  # noqa: E731
         self.saver.retry(lambda: self.saver.attempt("run.json", write))
         return self._evaluator.record(recordings)

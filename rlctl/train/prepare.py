@@ -15,6 +15,7 @@ from rlctl.check_env.finding import Severity
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.named_task import RUN
+from rlctl.output import format_count
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory
@@ -41,7 +42,7 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
     """Prepare a training; at the end its processes are ended, and the run has what ended it before its time."""
     recipe, request = start.recipe, start.request
     specs = recipe.env_specs(start.task, named_by=RUN if start.run else "")
-    display.phase(f"building {recipe.n_envs} environments, importing PyTorch")
+    display.phase(f"building {format_count(recipe.n_envs, 'environment')}, importing PyTorch")
     with contextlib.ExitStack() as stack:
         # The workers build their environments, and the check runs, while this process imports torch.
         workers = stack.enter_context(_make_workers(specs[start.stage - 1], recipe.n_envs, start, display))
@@ -176,7 +177,7 @@ def _refuse_errors(report: Report, display: Display) -> None:
     errors = [finding for finding in found if finding.severity is Severity.ERROR]
     if errors:
         text = "; ".join(f"{each.rule} {each.name} ({each.message})" for each in errors)
-        count = f"{len(errors)} error{'s' if len(errors) > 1 else ''}"
+        count = format_count(len(errors), "error")
         raise AnswerIsNo(
             f"the check before training found {count}: {text}\n"
             f"rlctl check-env {task} shows details; --no-check trains anyway."

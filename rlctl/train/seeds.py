@@ -26,7 +26,7 @@ from rlctl.run.group import Group, create_group, parse_seeds, read_group
 from rlctl.run.recipe_sources import resolve
 from rlctl.train.request import TrainRequest
 from rlctl.train.signals import HandledSignals
-from rlctl.train.start import preserve_process_state
+from rlctl.train.start import check_arguments, preserve_process_state
 from rlctl.train.warm_start import find_source
 
 CORES_PER_TRAINING = 2
@@ -55,7 +55,7 @@ class SeedsResult:
             which = ", ".join(f"seed {seed} with exit code {code}" for seed, code in self.failed.items())
             raise SeedsFailed(
                 f"{self.score.group.path}: {len(self.failed)} of {len(self.score.group.seeds)} seeds failed: {which}. "
-                f"What each said is above; to try those again: rlctl train --resume {self.score.group.path}",
+                f"What each said is above; to try again: rlctl train --resume {self.score.group.path}",
                 max(self.failed.values()),
             )
 
@@ -69,6 +69,8 @@ def train_seeds(
     `UsageError` for seeds that are none, `RecipeError` for a recipe that is wrong, and `Interrupted` after a signal,
     when all have saved their checkpoints.
     """
+    if seeds is None:
+        check_arguments(request)
     group = _begin(request, seeds) if seeds is not None else read_group(Path(str(request.resume)))
     options = [] if seeds is not None else list_options(request)
     waiting = [seed for seed in group.seeds if not group.is_done(seed) or options]
@@ -85,6 +87,7 @@ def _begin(request: TrainRequest, seeds: str) -> Group:
         raise UsageError("--seeds is about a new group: give a task, and no --resume")
     if "seed" in request.settings:
         raise UsageError("--seeds and --seed: give one of the two")
+    check_arguments(request)
     numbers = parse_seeds(seeds)
     with preserve_process_state():
         registry.load(request.task)
@@ -114,12 +117,15 @@ def _choose_jobs(group: Group, waiting: int, jobs: int | None) -> int:
     cores = available_cores()
     chosen = min(jobs or max(1, cores // CORES_PER_TRAINING), max(waiting, 1))
     done = len(group.seeds) - waiting
-    output.print_notes(
-        [
-            f"{group.path}: {len(group.seeds)} seeds{f', {done} done' if done else ''}, {chosen} at a time: a training "
-            f"keeps {CORES_PER_TRAINING} cores busy, there are {cores}; --jobs changes it"
-        ]
-    )
+    note = f"{group.path}: {output.format_count(len(group.seeds), 'seed')}"
+    if waiting:
+        note += (
+            f"{f', {done} done' if done else ''}, {chosen} at a time: a training keeps {CORES_PER_TRAINING} cores "
+            f"busy, there are {cores}; --jobs changes it"
+        )
+    else:
+        note += ", all done: nothing to train; -n makes them longer"
+    output.print_notes([note])
     return chosen
 
 

@@ -103,11 +103,18 @@ class Start:
 
 def find_start(request: TrainRequest) -> Start:
     """Return where a request starts, after a look at all that can be wrong with it; nothing is changed yet."""
+    check_arguments(request)
+    return _find_new(request) if request.task is not None else _find_checkpoint(request)
+
+
+def check_arguments(request: TrainRequest) -> None:
+    """Raise `UsageError` for arguments that exclude each other, and for a device that cannot exist."""
     if (request.task is None) == (request.resume is None):
         raise UsageError("give a task to train, or --resume RUN to go on with a run; one of the two")
     if not _DEVICE.fullmatch(request.device):  # now, and not after half a minute of imports
         raise UsageError(f"--device {request.device!r}: no such device; give cpu, cuda, cuda:1, or auto")
-    return _find_new(request) if request.task is not None else _find_checkpoint(request)
+    if request.resume is not None:
+        _check_resume(request)
 
 
 def _find_new(request: TrainRequest) -> Start:
@@ -128,7 +135,6 @@ def _find_checkpoint(request: TrainRequest) -> Start:
     """
     from rlctl.train import checkpoint
 
-    _check_resume(request)
     run = lookup.find_run(request.resume, request.root)
     before = run.recipe()
     lock = run.lock()  # before looking: a process that is training removes old checkpoints

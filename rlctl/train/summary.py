@@ -66,7 +66,7 @@ def _format_result(result: TrainResult) -> list[str]:
         success = "" if progress.best_success is None else f"success {percent(progress.best_success)}, "
         lines.append(
             f"best at step {progress.best_step:,}: {success}return {progress.best_return:.2f} "
-            f"(mean of {result.recipe.eval.episodes} episodes)"
+            f"(mean of {output.format_count(result.recipe.eval.episodes, 'episode')})"
         )
     if stages:
         short = "" if progress.stage == stages else "; evaluated in the last, which it did not reach"

@@ -37,14 +37,14 @@ def test_they_are_episodes_of_the_evaluation_bit_for_bit(run, tmp_path, capsys):
     expected = sorted((bool(each.result.success), each.result.total_reward, each.result.seed) for each in evaluated)[:2]
     assert [(each.success, each.total_reward, each.seed) for each in result.episodes] == expected
     assert all(each.recording.is_file() for each in result.episodes)
-    assert result.choice.startswith("the 2 worst of 5 episodes (seed 0), ")
+    assert result.choice.startswith("the 2 worst of 5 episodes, of which ")
     assert "warning" not in capsys.readouterr().err
 
 
 def test_no_failures_is_an_answer(replay, run, tmp_path):
     done = replay(run.run.path, "--failures", 2, "--episodes", 2, "--set", "task.tolerance=9", "-o", "out")
     assert done.returncode == 0, done.stderr
-    assert "no failure among 2 episodes (seed 0): nothing to replay" in done.stdout
+    assert "nothing to replay: no failure among 2 episodes (seed 0)" in done.stdout
     assert not (tmp_path / "out").exists()
 
 

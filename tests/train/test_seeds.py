@@ -11,8 +11,9 @@ import pytest
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates
 from rlctl.eval.group import as_json, evaluate_group
-from rlctl.run.group import parse_seeds, read_group
+from rlctl.run.group import find_group, parse_seeds, read_group
 from rlctl.run.lookup import find_policy, find_run
+from rlctl.runs.comparison import find_runs_of
 from rlctl.runs.listing import list_runs
 from rlctl.runs.removal import plan_removal
 from rlctl.train.request import TrainRequest
@@ -82,6 +83,35 @@ def test_runs_of_a_group_are_found(group):
     assert sorted(names) == sorted(f"Line/{group.path.name}/{group.find_run(seed).path.name}" for seed in (4, 5))
     with pytest.raises(UsageError, match="a group of runs; name one of them"):
         find_run(str(group.path), root)
+    assert f"it is one of a group of seeds: {group.path}" in find_policy("latest", root=root).notes
+    assert find_policy(str(newest), root=root).notes == ()
+
+
+def test_the_newest_thing_trained_is_the_group(group, monkeypatch, tmp_path):
+    root = group.path.parent.parent
+    one = group.find_run(5).path
+    assert [find_group(word, root) for word in ("latest", LINE, str(group.path))] == [group.path] * 3
+    assert find_group(str(one), root) is None
+    assert find_group(str(root / "latest"), root) is None
+    (tmp_path / "runs").symlink_to(root)
+    monkeypatch.chdir(tmp_path)
+    assert [run.path.name for run in find_runs_of("latest")] == [group.find_run(seed).path.name for seed in (4, 5)]
+    assert [run.path for run in find_runs_of(str(one))] == [one]
+
+
+def test_resume_latest_goes_on_with_the_group(group, rlctl):
+    """One run was stopped before its first checkpoint: both are in the table at the end."""
+    root = group.path.parent.parent
+    one = group.find_run(4)
+    before = one.status()
+    one.write_status({"status": "interrupted"})
+    try:
+        done = rlctl("train", "--resume", "latest", "-o", root)
+    finally:
+        one.write_status(before)
+    assert done.returncode == 0, done.stderr
+    assert f"{group.path}: 2 seeds, 1 done, 1 at a time" in done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines()[-5:-3]] == ["4", "5"]
 
 
 def test_a_group_that_is_being_trained_is_not_removed(group):

@@ -39,7 +39,7 @@ def text(report: Report) -> str:
     from rich.console import Console
 
     stream = io.StringIO()
-    _print(Console(file=stream, width=1000, soft_wrap=True, highlight=False, color_system=None), report)
+    _print(Console(file=stream, width=1000, soft_wrap=True, highlight=False, color_system=None, emoji=False), report)
     return stream.getvalue()
 
 
@@ -47,9 +47,9 @@ def summary(report: Report) -> str:
     """Say in a line what was found."""
     verdict = report.verdict
     counts = Counter(finding.severity for finding in verdict.findings)
-    found = ", ".join(f"{counts[s]} {s}{'s' if counts[s] != 1 else ''}" for s in Severity if counts[s])
+    found = ", ".join(output.format_count(counts[s], s) for s in Severity if counts[s])
     waived = f", {len(verdict.waived)} waived" if verdict.waived else ""
-    rules = f"{len(verdict.judged)} rule{'s' if len(verdict.judged) != 1 else ''} judged"
+    rules = f"{output.format_count(len(verdict.judged), 'rule')} judged"
     return f"{report.task}: {found or 'no findings'}{waived}; {rules} in {report.seconds:.1f} s"
 
 

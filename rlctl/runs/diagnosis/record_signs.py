@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from rlctl.output import format_count
 from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
 
 
@@ -61,7 +62,7 @@ def _median(curve: Curve) -> float:
 def observations_outside(run: History) -> str | None:
     """Observations were outside their space."""
     count = run.status.get("observations_outside")
-    return f"{count:,} observations were outside their space" if isinstance(count, int) and count else None
+    return f"outside their space: {format_count(count, 'observation')}" if isinstance(count, int) and count else None
 
 
 def diverged(run: History) -> str | None:

@@ -13,7 +13,7 @@ import numpy as np
 from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.run.episode import RecordedEpisode
 from rlctl.run.recipe import find_mixed
-from rlctl.runs.comparison import find_group
+from rlctl.runs.comparison import find_runs_of
 from rlctl.runs.diagnosis import Finding
 from rlctl.runs.show import RunDescription
 from rlctl.runs.summary import Rows, list_points
@@ -45,7 +45,7 @@ def collect(texts: Sequence[str]) -> Report:
 
     Raises `ArtifactError` for a damaged run and one that has nothing yet, `UsageError` for runs of several tasks.
     """
-    found = {run.path.resolve(): run for text in texts for run in find_group(text)}
+    found = {run.path.resolve(): run for text in texts for run in find_runs_of(text)}
     runs = [RunDescription(run) for run in found.values()]
     for each in runs:
         if each.summary.state == "damaged":
