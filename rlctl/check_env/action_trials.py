@@ -56,16 +56,6 @@ class Dimension:
         low, high = self.bounds
         return (low if np.isfinite(low) else min(-1.0, high)), (high if np.isfinite(high) else max(1.0, low))
 
-    @property
-    def is_continuous(self) -> bool:
-        """Whether it is a number with finite bounds of which every part counts."""
-        return is_float_box(self.leaf) and bool(np.isfinite(self.bounds).all())
-
-
-def is_float_box(leaf: Leaf) -> bool:
-    """Say whether a leaf of the action space is continuous."""
-    return leaf.kind == "Box" and leaf.dtype.startswith("float")
-
 
 def find_dimensions(leaves: list[Leaf]) -> list[Dimension]:
     """Return the numbers of an action that can be varied."""

@@ -67,11 +67,9 @@ class Episode:
         max_steps: int = 10_000,
         deadline: float = float("inf"),
         given: Iterable[Any] | None = None,
-        timer: Callable[..., Any] | None = None,
     ) -> None:
         """`actions` is a kind (see `draw_actions`), drawn with `action_seed`, else with `seed`; or the name of
-        those that are `given`. `deadline` is on `read_clock`'s clock [s]. `timer` calls the environment's functions
-        for us."""
+        those that are `given`. `deadline` is on `read_clock`'s clock [s]."""
         self.instance = instance
         self.seed = seed
         self.number = number
@@ -80,7 +78,6 @@ class Episode:
         self.steps = 0
         self.ended = ""
         """`terminated`, `truncated`, `both`, `raised`, or what cut it: `steps`, `time`; empty while it goes on."""
-        self._timer = timer
         self.actions = actions
         self._given = given
         self._action_seed = seed if action_seed is None else action_seed
@@ -96,7 +93,7 @@ class Episode:
         self.steps, self.ended = 0, "" if self.max_steps else "steps"
         self._next = self._choose_actions()
         try:
-            returned = self.instance.reset(self.seed, self.number, timer=self._timer)
+            returned = self.instance.reset(self.seed, self.number)
         except EnvironmentRaised:
             self.ended = "raised"
             raise
@@ -115,8 +112,7 @@ class Episode:
         call, env = self.instance.call, self.instance.env
         try:
             action = call("sample", next, self._next, step=self.steps)
-            timed = (self._timer, env.step, action) if self._timer else (env.step, action)
-            returned = call("step", *timed, step=self.steps)
+            returned = call("step", env.step, action, step=self.steps)
         except EnvironmentRaised:
             self.ended = "raised"
             raise

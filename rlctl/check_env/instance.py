@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import inspect
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
 from rlctl import env_spec, registry
@@ -16,6 +16,9 @@ from rlctl.check_env.leaves import find_leaves
 from rlctl.check_env.messages import Failure
 from rlctl.check_env.progress import Progress
 from rlctl.errors import TaskError
+
+Timer = Callable[..., Any]
+"""Calls a function, its first argument, with the other arguments, and returns what it returns."""
 
 MOST_FAILURES = 3
 """After so many episodes that raise no other is played for the same purpose."""
@@ -59,6 +62,8 @@ class Instance:
         self.action_leaves = find_leaves(getattr(env, "action_space", None))
         self.accepts_seed, self.accepts_options = (_accepts(env, name) for name in ("seed", "options"))
         self.progress = progress
+        self.timers: Mapping[str, Timer] = {}
+        """What calls the environment's functions, by their names, while they are timed."""
 
     @property
     def is_env(self) -> bool:
@@ -78,18 +83,19 @@ class Instance:
         """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`."""
         self.progress.enter(name, step)
         try:
+            if timer := self.timers.get(name):
+                return timer(function, *arguments, **keywords)
             return function(*arguments, **keywords)
         except BaseException as error:
             raise EnvironmentRaised(name) from error
         finally:
             self.progress.leave()
 
-    def reset(self, seed: int, episode: int = 0, timer: Callable[..., Any] | None = None) -> Any:
+    def reset(self, seed: int, episode: int = 0) -> Any:
         """Reset with a seed, where reset takes one, and return what it returns."""
         self.progress.episode(episode, seed)
         keywords = {"seed": seed} if self.accepts_seed else {}
-        timed = (timer, self.env.reset) if timer else (self.env.reset,)
-        return self.call("reset", *timed, **keywords)
+        return self.call("reset", self.env.reset, **keywords)
 
     def close(self) -> None:
         """Close the environment, where it can be."""

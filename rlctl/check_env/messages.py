@@ -10,7 +10,6 @@ import importlib
 import itertools
 import json
 import math
-import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -230,14 +229,13 @@ def encode(message: Any) -> bytes:
     arrays: list[NDArray[Any]] = []
     plain = _to_plain(message, arrays)
     header = json.dumps([plain, [[each.dtype.str, each.shape] for each in arrays]]).encode()
-    return b"".join([struct.pack("<q", len(header)), header, *(each.tobytes() for each in arrays)])
+    return b"\n".join([header, b"".join(each.tobytes() for each in arrays)])
 
 
 def decode(content: bytes) -> Any:
     """Return the dataclass that `encode` was given."""
-    (length,) = struct.unpack_from("<q", content)
-    start = 8 + length
-    plain, forms = json.loads(content[8:start])
+    start = content.index(b"\n") + 1  # JSON has none
+    plain, forms = json.loads(content[:start])
     arrays = []
     for kind, shape in forms:
         array = np.frombuffer(content, kind, math.prod(shape), start).reshape(shape)

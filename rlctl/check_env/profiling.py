@@ -9,10 +9,8 @@ import re
 import sys
 import sysconfig
 import time
-from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import CodeType
 from typing import Any
 
 from rlctl.check_env import bullet_calls
@@ -67,107 +65,75 @@ class TimedCall:
     """`rendering`, `sleeping`, `loading` or `connecting`, for what is suspicious."""
 
 
-class Profiler:
-    """Calls functions under Python's profiler; use it inside `bullet_calls.visible_to_profilers`."""
-
-    def __init__(self) -> None:
-        self._profile = cProfile.Profile()
-
-    def __call__(self, function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
-        """Call the function and return what it returns."""
-        self._profile.enable()
-        try:
-            return function(*arguments, **keywords)
-        finally:
-            self._profile.disable()
-
-    def profile(self, is_own: Callable[[str], bool]) -> Profile:
-        """Return where the time went; `is_own` says of a file whether it is the environment's own code."""
-        return Profile(self._profile.getstats(), is_own)
-
-
-@dataclasses.dataclass
-class _Function:
-    name: str
-    place: str
-    """Of the environment's own functions only."""
-    kind: str
-    own_s: float = 0.0
-    """The time in itself [s]."""
+Function = tuple[str, int, str]
+"""File, line and name, as Python's profiler has them; the file of what is not written in Python is `~`."""
 
 
 class Profile:
-    """The functions that were called, and by whom."""
+    """The functions that were called under a profiler, and by whom; `is_own` says whether a file is the environment's.
 
-    def __init__(self, stats: list[Any], is_own: Callable[[str], bool]) -> None:
+    Run the profiler inside `bullet_calls.visible_to_profilers`.
+    """
+
+    def __init__(self, profile: cProfile.Profile, is_own: Callable[[str], bool]) -> None:
+        profile.create_stats()
+        self._stats: dict[Function, Any] = profile.stats
+        """Per function the number of calls, twice, the time in itself and with all it calls [s], the same by caller."""
+        self._own = {each for each in self._stats if each[0] != "~" and is_own(each[0])}
         modules = {getattr(each, "__dict__", {}).get("__file__"): name for name, each in list(sys.modules.items())}
-        self._functions: dict[Any, _Function] = {}
-        self._callers: dict[Any, Counter[Any]] = defaultdict(Counter)
-        """What calls a function, with the time of that and of all it calls [s]."""
-        for entry in stats:
-            own = isinstance(entry.code, CodeType) and is_own(entry.code.co_filename)
-            name = _name_of(entry.code, own, modules)
-            place = f"{Path(entry.code.co_filename).name}:{entry.code.co_firstlineno}" if own else ""
-            function = self._functions.setdefault(entry.code, _Function(name, place, _kind_of(name, own)))
-            function.own_s += entry.inlinetime
-            for each in entry.calls or ():
-                self._callers[each.code][entry.code] += each.totaltime
-        self._seconds = sum(each.own_s for each in self._functions.values()) or 1.0
+        self._names = {each: each[2] if each in self._own else _name_of(each, modules) for each in self._stats}
+        self._kinds = {each: _kind_of(name, each in self._own) for each, name in self._names.items()}
 
     def slowest(self) -> list[TimedCall]:
         """Return the functions by the time in themselves, the slowest first."""
-        return self._sum_up([(code, self._place(code), each.own_s) for code, each in self._functions.items()])
+        return self._sum_up([(each, self._place(each), stats[2]) for each, stats in self._stats.items()])
 
     def suspicious(self) -> list[TimedCall]:
         """Return the functions of a suspicious kind that no other such calls, with the time in all they call."""
         return self._sum_up(
             [
-                (code, self._functions[code].place or self._place(caller), seconds)
-                for code, callers in self._callers.items()
-                for caller, seconds in callers.items()
-                if self._functions[code].kind and not self._functions[caller].kind
+                (each, self._place(each if each in self._own else caller), spent[3])
+                for each, stats in self._stats.items()
+                for caller, spent in stats[4].items()
+                if self._kinds[each] and not self._kinds[caller]
             ]
         )
 
-    def _place(self, code: Any) -> str:
+    def _place(self, function: Function | None) -> str:
         """Return the place of a function, or of the own function that most of its time is spent for."""
         seen = set()
-        while code is not None and not self._functions[code].place:
-            seen.add(code)
-            callers = [each for each, _ in self._callers.get(code, Counter()).most_common() if each not in seen]
-            code = callers[0] if callers else None
-        return "" if code is None else self._functions[code].place
+        while function is not None and function not in self._own:
+            seen.add(function)
+            callers = {each: spent[3] for each, spent in self._stats[function][4].items() if each not in seen}
+            function = max(callers, key=lambda each: callers[each], default=None)
+        return "" if function is None else f"{Path(function[0]).name}:{function[1]}"
 
-    def _sum_up(self, calls: Sequence[tuple[Any, str, float]]) -> list[TimedCall]:
+    def _sum_up(self, calls: Sequence[tuple[Function, str, float]]) -> list[TimedCall]:
         """Return one call per name, with the place where most of its time goes, the slowest first."""
-        seconds: dict[str, float] = {}
-        first: dict[str, tuple[Any, str]] = {}
-        for code, place, spent in sorted(calls, key=lambda each: -each[2]):
-            name = self._functions[code].name
-            first.setdefault(name, (code, place))
-            seconds[name] = seconds.get(name, 0.0) + spent
-        timed = [
-            TimedCall(name, place, seconds[name] / self._seconds, self._functions[code].kind)
-            for name, (code, place) in first.items()
-        ]
-        return sorted(timed, key=lambda each: -each.share)
+        total = sum(stats[2] for stats in self._stats.values()) or 1.0
+        found: dict[str, TimedCall] = {}
+        for function, place, spent in sorted(calls, key=lambda each: -each[2]):
+            name = self._names[function]
+            call = found.setdefault(name, TimedCall(name, place, 0.0, self._kinds[function]))
+            found[name] = dataclasses.replace(call, share=call.share + spent / total)
+        return sorted(found.values(), key=lambda each: -each.share)
 
 
-def _name_of(code: CodeType | str, own: bool, modules: dict[Any, str]) -> str:
-    """Return a function's name without private modules: `numpy.linalg.norm`, `open`, `Ant.observe`."""
-    if isinstance(code, CodeType) and own:
-        return code.co_qualname.replace("<locals>.", "")
-    if isinstance(code, CodeType):
-        is_replaced = code.co_filename == bullet_calls.__file__
-        name = f"{'pybullet' if is_replaced else modules.get(code.co_filename, '')}.{code.co_qualname}"
-    elif (match := _BUILTIN.fullmatch(code)) is None:
-        return code
+def _name_of(function: Function, modules: dict[Any, str]) -> str:
+    """Return a library's function without private modules: `numpy.linalg.norm`, `open`."""
+    file, _, name = function
+    if file == bullet_calls.__file__:
+        name = f"pybullet.{name}"
+    elif file != "~":
+        name = f"{modules.get(file, '')}.{name}"
+    elif (match := _BUILTIN.fullmatch(name)) is None:
+        return name
     elif match["bare"]:  # OpenCV's functions do not say whose they are
         name = f"cv2.{match['bare']}" if hasattr(sys.modules.get("cv2"), match["bare"]) else match["bare"]
     else:
         name = match["function"] or f"{match['of']}.{match['method']}"
-    *parts, function = name.replace("<locals>.", "").removeprefix("builtins.").removeprefix("io.").split(".")
-    return ".".join([*(each for each in parts if each and not each.startswith("_")), function])
+    *parts, last = name.removeprefix("builtins.").removeprefix("io.").split(".")
+    return ".".join([*(each for each in parts if each and not each.startswith("_")), last])
 
 
 def find_own_code(env: Any) -> Callable[[str], bool]:
@@ -181,9 +147,8 @@ def find_own_code(env: Any) -> Callable[[str], bool]:
 
     @functools.cache
     def is_own(file: str) -> bool:
-        if file.startswith(f"{folder}/"):
-            return True
-        return not file.startswith(("<", *(f"{each}/" for each in libraries))) and "site-packages" not in file
+        is_library = file.startswith(("<", *(f"{each}/" for each in libraries))) or "site-packages" in file
+        return file.startswith(f"{folder}/") or not is_library
 
     return is_own
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import mmap
 import os
 
-import numpy as np
-from numpy.typing import NDArray
 
-CALLS = ("", "load", "build", "reset", "step", "close", "sample", "render", "compute_reward")
-_NUMBERS = 6
-_PHASE_BYTES = 64
-_SIZE = 8 * _NUMBERS + _PHASE_BYTES
+class _Memory(ctypes.Structure):
+    _fields_ = (
+        ("counter", ctypes.c_int64),
+        ("call", ctypes.c_char * 16),
+        ("phase", ctypes.c_char * 64),
+        ("episode", ctypes.c_int64),
+        ("seed", ctypes.c_int64),
+        ("step", ctypes.c_int64),
+        ("is_first", ctypes.c_bool),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,37 +41,34 @@ class Progress:
 
     def __init__(self, descriptor: int | None = None) -> None:
         if descriptor is None:
-            memory: mmap.mmap | bytearray = bytearray(_SIZE)
+            self._now = _Memory()
         else:
-            os.ftruncate(descriptor, _SIZE)
-            memory = mmap.mmap(descriptor, _SIZE)
-        self._numbers: NDArray[np.int64] = np.frombuffer(memory, np.int64, _NUMBERS)
-        self._phase: NDArray[np.uint8] = np.frombuffer(memory, np.uint8, _PHASE_BYTES, 8 * _NUMBERS)
+            os.ftruncate(descriptor, ctypes.sizeof(_Memory))
+            self._now = _Memory.from_buffer(mmap.mmap(descriptor, ctypes.sizeof(_Memory)))
         self._called: set[str] = set()
 
     def phase(self, name: str) -> None:
         """Note which experiment, or part of one, begins."""
-        text = np.frombuffer(name.encode()[:_PHASE_BYTES].ljust(_PHASE_BYTES, b"\0"), np.uint8)
-        self._phase[:] = text
+        self._now.phase = name.encode()
 
     def episode(self, episode: int, seed: int) -> None:
         """Note which episode begins."""
-        self._numbers[2:5] = episode, seed, 0
+        self._now.episode, self._now.seed, self._now.step = episode, seed, 0
 
     def enter(self, call: str, step: int = 0) -> None:
         """Note that a call into the environment begins."""
-        self._numbers[4:6] = step, call not in self._called
+        now = self._now
+        now.step, now.is_first, now.call = step, call not in self._called, call.encode()
+        now.counter += 1
         self._called.add(call)
-        self._numbers[1] = CALLS.index(call)
-        self._numbers[0] += 1
 
     def leave(self) -> None:
         """Note that the call came back."""
-        self._numbers[1] = 0
-        self._numbers[0] += 1
+        self._now.call = b""
+        self._now.counter += 1
 
     def read(self) -> Position:
         """Return where the child is."""
-        counter, call, episode, seed, step, is_first = self._numbers.tolist()
-        phase = self._phase.tobytes().rstrip(b"\0").decode(errors="replace") or "build"
-        return Position(counter, CALLS[call], phase, episode, seed, step, bool(is_first))
+        now = self._now
+        call, phase = now.call.decode(), now.phase.decode() or "build"
+        return Position(now.counter, call, phase, now.episode, now.seed, now.step, now.is_first)

@@ -117,20 +117,8 @@ class DeadLater(DeadAction):
         self.first = False
 
 
-class Saturated(Clean):
-    def move(self, action):
-        super().move(np.clip(10.0 * action, -1.0, 1.0).astype(np.float32))
-
-
 class Switch(Clean):
     """The second number opens or closes: nothing is wrong with it."""
 
     def move(self, action):
         super().move(np.array([action[0], np.sign(action[1])], np.float32))
-
-
-class OneWay(Clean):
-    """Only pushes, never pulls: nothing is wrong with it."""
-
-    def move(self, action):
-        super().move(np.maximum(action, 0.0))

@@ -1,7 +1,6 @@
 """Environments that do not repeat, and instances that disturb each other."""
 
 import random
-import time
 
 import numpy as np
 import pybullet
@@ -64,11 +63,6 @@ class FixedStartNoise(FixedStart):
 
     def move(self, action):
         super().move(action + self.np_random.uniform(-0.1, 0.1, 2).astype(np.float32))
-
-
-class TimeInInfo(Clean):
-    def info(self):
-        return {**super().info(), "time": time.perf_counter()}
 
 
 class UnseededLater(Clean):

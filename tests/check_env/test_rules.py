@@ -48,7 +48,6 @@ CASES = [
     case("broken_repeats.py:LeakyReset", ("RL303", "error")),
     case("broken_repeats.py:ClassCounter", ("RL304", "error")),
     case("broken_repeats.py:FixedStart", ("RL306", "info")),
-    case("broken_repeats.py:TimeInInfo", ("RL307", "warning")),
     case("broken_repeats.py:UnseededLater", ("RL308", "warning")),
     case("broken_repeats.py:Residue", ("RL301", "warning")),
     case("broken_repeats.py:SharedWorld", ("RL401", "error"), ("RL402", "error"), ("RL808", "error")),

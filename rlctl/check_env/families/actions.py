@@ -1,9 +1,9 @@
-"""RL7: the actions do something, and in all of their range."""
+"""RL7: the actions do something."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
+from typing import Literal
 
 from rlctl.check_env.action_trials import (
     REPEATED_STEPS,
@@ -23,27 +23,14 @@ STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))
 """Seeds and steps that are compared until a difference shows: most show at once, some need time or another start."""
 LONGEST_DELAY = 4
 """Observations may hold so many earlier actions; a penalty on changes of the action reaches as far [steps]."""
-SATURATED = 0.2
-"""The part of the range from which on nothing may change for it to be called saturated: four fifths are then lost."""
-SWITCH = 0.01
-"""If even from here on nothing changes, only the sign counts: a gripper's switch, say, which is meant."""
 MOST_NAMES = 8
 """So many dimensions are named in a message."""
+Effect = Literal["lasting", "cost", "copy", "none"]
+"""What a number of the action does; `cost`: in the reward of its own step only; `copy`: beside that, only as a copy of
+itself in the observation."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Effect:
-    """What one dimension of the action does."""
-
-    name: str
-    kind: str
-    """`lasting`; `cost`: in the reward of its own step only; `copy`: beside that, only as a copy of itself in the
-    observation; `none`."""
-    saturates: bool = False
-    """Whether nothing changes from a fifth of its range on."""
-
-
-@experiment("action effects", "RL701", "RL702", share=4.0)
+@experiment("action effects", "RL701", share=4.0)
 def compare_actions(context: Context) -> Iterator[Message]:
     """Play the same episode with each number of the action at other values."""
     with context.fresh() as instance:
@@ -52,35 +39,33 @@ def compare_actions(context: Context) -> Iterator[Message]:
             raise NotJudged("no number of the action can be varied")
         trials = Trials(context, instance)
         trials.require_repeatable()
-        effects: list[_Effect] = []
+        effects: dict[str, Effect] = {}
         why = f"only {MOST_DIMENSIONS} are compared" if len(every) > MOST_DIMENSIONS else ""
         try:
             for dimension in every[:MOST_DIMENSIONS]:
-                effects.append(_effect(trials, dimension))
+                effects[dimension.name] = _find_effect(trials, dimension)
         except OutOfTime:
             why = "there was no time for more"
         if not effects:
             raise NotJudged("there was no time to compare a single action")
     left_out = f" ({len(effects)} of {len(every)} dimensions: {why})" if why else ""
     yield from _without_effect(effects, len(every), left_out)
-    yield from _saturated(effects, left_out)
 
 
-def _effect(trials: Trials, dimension: Dimension) -> _Effect:
+def _find_effect(trials: Trials, dimension: Dimension) -> Effect:
     copies = trials.copies(dimension, FIRST_SEED, REPEATED_STEPS, LONGEST_DELAY)
-    kind = "none"
+    effect: Effect = "none"
     for seed, steps in STAGES:
         plain = trials.plain(seed, steps)
         for end in dimension.ends:
             played = trials.with_value(seed, steps, dimension, end)
             if observations_differ(plain, played, copies):
-                saturates = dimension.is_continuous and _saturates(trials, dimension, copies)
-                return _Effect(dimension.name, "lasting", saturates)
+                return "lasting"
             if find_other_rewards(plain, played):
-                kind = "cost"
-            elif kind == "none" and observations_differ(plain, played):
-                kind = "copy"
-    return _Effect(dimension.name, "lasting" if kind == "cost" and _lasts(trials, dimension) else kind)
+                effect = "cost"
+            elif effect == "none" and observations_differ(plain, played):
+                effect = "copy"
+    return "lasting" if effect == "cost" and _lasts(trials, dimension) else effect
 
 
 def _lasts(trials: Trials, dimension: Dimension) -> bool:
@@ -96,47 +81,27 @@ def _lasts(trials: Trials, dimension: Dimension) -> bool:
     return False
 
 
-def _saturates(trials: Trials, dimension: Dimension, copies: Sequence[int]) -> bool:
-    """Say whether small and large values do the same, in both directions, and not only by their sign, as a switch."""
-    low, high = dimension.bounds
-    middle, half = (low + high) / 2, (high - low) / 2
-
-    def same(first: float, second: float) -> bool:
-        for seed, steps in STAGES:
-            one, two = (trials.with_value(seed, steps, dimension, middle + part * half) for part in (first, second))
-            if observations_differ(one, two, copies):
-                return False
-        return True
-
-    return same(SATURATED, 1.0) and same(-SATURATED, -1.0) and not (same(SWITCH, 1.0) and same(-SWITCH, -1.0))
-
-
-def _without_effect(effects: Sequence[_Effect], total: int, left_out: str) -> Iterator[Finding]:
-    dead, costly, copied = ([each.name for each in effects if each.kind == kind] for kind in ("none", "cost", "copy"))
+def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) -> Iterator[Finding]:
+    dead, costly, copied = (
+        [name for name, effect in effects.items() if effect == kind] for kind in ("none", "cost", "copy")
+    )
     if dead:
         what = (
             "no action has any effect" if len(dead) == total else f"{list_names(dead, MOST_NAMES)} without any effect"
         )
         how = f"at its lowest and highest value, over {STAGES[-1][1]} steps from two seeds"
         message = f"{what}: {how}, no observation, reward or end changes{left_out}"
-        yield _finding("RL701", dead, message, Severity.ERROR if len(dead) == total else Severity.WARNING)
+        yield _finding(dead, message, Severity.ERROR if len(dead) == total else Severity.WARNING)
     if costly:
         names = list_names(costly, MOST_NAMES)
         message = f"{names} changes nothing but its own step's reward, a cost for doing nothing{left_out}"
         # If no action moves anything, it is a bandit, or a series that is only watched.
-        acts = any(each.kind == "lasting" for each in effects)
-        yield _finding("RL701", costly, message, Severity.WARNING if acts else Severity.INFO)
+        yield _finding(costly, message, Severity.WARNING if "lasting" in effects.values() else Severity.INFO)
     if copied:
         message = f"{list_names(copied, MOST_NAMES)} changes nothing but its own copy in the observation{left_out}"
-        yield _finding("RL701", copied, message, Severity.INFO)
+        yield _finding(copied, message, Severity.INFO)
 
 
-def _saturated(effects: Sequence[_Effect], left_out: str) -> Iterator[Finding]:
-    if names := [each.name for each in effects if each.saturates]:
-        message = f"{list_names(names, MOST_NAMES)}: from {SATURATED} of its range on, nothing changes{left_out}"
-        yield _finding("RL702", names, message, Severity.WARNING)
-
-
-def _finding(rule: str, names: list[str], message: str, severity: Severity) -> Finding:
+def _finding(names: list[str], message: str, severity: Severity) -> Finding:
     evidence = {"value": names, "seed": FIRST_SEED, "seeds": [FIRST_SEED, SECOND_SEED], "steps": STAGES[-1][1]}
-    return Finding(rule, message, evidence, severity)
+    return Finding("RL701", message, evidence, severity)

@@ -26,8 +26,6 @@ COMPARED_STEPS = 300
 """How far comparisons go."""
 DIRTY_STEPS = 37
 """How far the other episode goes, at most, that is left unfinished before a repetition."""
-SECONDS = "episode/t"
-"""In info: how long an episode took, by Gymnasium's RecordEpisodeStatistics."""
 LATE = 20
 """What an unfinished episode changes only after so many steps is a residue, not the episode's start [steps]."""
 NEARLY = 1e-5
@@ -135,22 +133,6 @@ def compare_processes(records: Records) -> Iterator[Finding]:
     if difference is not None:
         require_repeatable(records)
         yield report("RL305", records, trajectory, difference, "played by a new process")
-
-
-@check("RL307", "comparisons")
-def compare_infos(records: Records) -> Iterator[Finding]:
-    """Compare the numbers in the infos of the steps of an episode and its repetition."""
-    require_repeatable(records)
-    one, two = records.require_role("alone"), records.require_role("reused")
-    found: list[Difference] = []
-    for name in sorted(one.infos.keys() & two.infos.keys() - {SECONDS}):
-        a, b = one.infos[name], two.infos[name]
-        later = a.steps > 0  # some fill reset's info with a random action, which nobody reads
-        differences = _compare(a.values[later], b.values[b.steps > 0], a.steps[later], str)
-        found += [dataclasses.replace(each, element=f"info {name!r}") for each in differences]
-    if found:
-        earliest = min(found, key=lambda each: each.step)
-        yield report("RL307", records, one, earliest, "played twice by one instance")
 
 
 @dataclasses.dataclass(frozen=True)

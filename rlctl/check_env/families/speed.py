@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import cProfile
 import dataclasses
 import statistics
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
 
 from rlctl.check_env.bullet_calls import visible_to_profilers
 from rlctl.check_env.clock import read_clock
 from rlctl.check_env.episode import Episode
 from rlctl.check_env.finding import Finding, NotJudged, check, experiment, list_names
-from rlctl.check_env.instance import Context, Instance, rebuilds_world
+from rlctl.check_env.instance import Context, Instance, Timer, rebuilds_world
 from rlctl.check_env.messages import Fact, Message
-from rlctl.check_env.profiling import Profiler, Stopwatch, TimedCall, find_own_code
+from rlctl.check_env.profiling import Profile, Stopwatch, TimedCall, find_own_code
 from rlctl.check_env.records import Records
+from rlctl.output import format_duration
 
 FIRST_SPEED_SEED = 5000
 TIMED_STEPS = 200
@@ -74,16 +75,18 @@ def measure_speed(context: Context) -> Iterator[Message]:
     """Play random episodes: first with nothing but a clock, then under a profiler."""
     instance, seconds = context.instance, min(LONGEST_S, context.budget.seconds_left)
     steps, resets = Stopwatch(), Stopwatch()
+    stopwatches = {"step": steps, "reset": resets}
     deadline = read_clock() + seconds / 2
-    _play(instance, steps, resets, TIMED_STEPS, deadline)
-    _play(instance, steps, resets, TIMED_RESETS, deadline, only_reset=True)
-    profilers = Profiler(), Profiler()
+    _play(instance, stopwatches, TIMED_STEPS, deadline)
+    _play(instance, stopwatches, TIMED_RESETS, deadline, only_reset=True)
+    profilers = {"step": cProfile.Profile(), "reset": cProfile.Profile()}
+    timers = {call: each.runcall for call, each in profilers.items()}
     with visible_to_profilers():
         for only_reset in (False, True):
             deadline = read_clock() + min(seconds / 4, PROFILED_S)
-            _play(instance, *profilers, MOST_STEPS, deadline, only_reset=only_reset)
+            _play(instance, timers, MOST_STEPS, deadline, only_reset=only_reset)
     is_own = find_own_code(instance.env)
-    in_step, in_reset = (each.profile(is_own) for each in profilers)
+    in_step, in_reset = (Profile(each, is_own) for each in profilers.values())
     yield Fact(
         "speed",
         Speed(
@@ -100,22 +103,21 @@ def measure_speed(context: Context) -> Iterator[Message]:
 
 
 def _play(
-    instance: Instance, of_step: Any, of_reset: Any, calls: int, deadline: float, *, only_reset: bool = False
+    instance: Instance, timers: Mapping[str, Timer], calls: int, deadline: float, *, only_reset: bool = False
 ) -> None:
-    """Play random episodes for so many steps, or resets, each called by `of_step` or `of_reset`."""
-
-    def timer(function: Any, *arguments: Any, **keywords: Any) -> Any:
-        return (of_reset if function == instance.env.reset else of_step)(function, *arguments, **keywords)
-
+    """Play random episodes for so many steps, or resets, with timers for calls of `step` and `reset`."""
+    instance.timers = timers
     number = 0
-    while calls > 0 and read_clock() < deadline:
-        steps = 0 if only_reset else calls
-        seed = FIRST_SPEED_SEED + number
-        episode = Episode(instance, seed, number=number, max_steps=steps, deadline=deadline, timer=timer)
-        for _ in episode:
-            pass
-        number += 1
-        calls -= max(1, episode.steps)
+    try:
+        while calls > 0 and read_clock() < deadline:
+            steps = 0 if only_reset else calls
+            episode = Episode(instance, FIRST_SPEED_SEED + number, number=number, max_steps=steps, deadline=deadline)
+            for _ in episode:
+                pass
+            number += 1
+            calls -= max(1, episode.steps)
+    finally:
+        instance.timers = {}
 
 
 def typical(seconds: Sequence[float], batch: int) -> float | None:
@@ -190,7 +192,7 @@ def format_speed(records: Records) -> str:
     calls = f"; slowest: {_list(speed.slowest_in_step)}" if speed.slowest_in_step else ""
     return (
         f"step {_time(step_s)}, reset {_time(reset_s)} ({reset_s / episode_s:.1%} of an episode), "
-        f"{per_s:,.{0 if per_s >= 10 else 1}f} steps/s: a million steps take {_duration(MILLION / per_s)}{calls}"
+        f"{per_s:,.{0 if per_s >= 10 else 1}f} steps/s: a million steps take {format_duration(MILLION / per_s)}{calls}"
     )
 
 
@@ -258,10 +260,3 @@ def _time(seconds: float) -> str:
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"
     return f"{seconds * 1e6:.3g} us"
-
-
-def _duration(seconds: float) -> str:
-    for unit, size in (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0)):
-        if seconds >= size:
-            return f"{seconds / size:.2g} {unit}"
-    return f"{seconds:.2g} seconds"
