@@ -46,3 +46,21 @@ def stack(observations: Sequence[Any]) -> Observations:
     rows = [split(each) for each in observations]
     stacked: Observations = join({key: np.stack([row[key] for row in rows]) for key in rows[0]})
     return stacked
+
+
+def split_names(observations: Any, sizes: Mapping[str, int]) -> dict[str, NDArray[Any]]:
+    """Return observations of several rows by name, each of shape (rows, ...): by key, or by the sizes of what is flat.
+
+    Of stacked observations it is the newest. Where nothing has a name there is one part.
+    """
+    parts = split(observations)
+    if SINGLE not in parts or not sizes or parts[SINGLE].ndim != 2:
+        return parts
+    newest = parts[SINGLE][:, -sum(sizes.values()) :]
+    return dict(zip(sizes, np.split(newest, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
+
+
+def format_space(space: Any, longest: int = 100) -> str:
+    """Return a space as text of one line; of one that would be longer only its kind and shape."""
+    text = " ".join(str(space).split())
+    return text if len(text) <= longest else f"{type(space).__name__}{getattr(space, 'shape', None) or ''}"

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from rlctl.errors import RecipeError, short_repr
 from rlctl.run import schema_text, yaml_text
-from rlctl.run.quantities import Number
+from rlctl.run.quantities import Number, Section
 
 _NUMBER_WITH_UNIT = re.compile(r"^\s*[-+]?\d[\d.eE+-]*\s*[^\d\s.]")
 Positive = Annotated[Number, Field(gt=0)]
@@ -26,11 +26,7 @@ def _check_order(value: tuple[float, float]) -> tuple[float, float]:
 Bounds = Annotated[tuple[Number, Number], pydantic.AfterValidator(_check_order)]
 
 
-class _Section(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
-
-
-class JointLimits(_Section):
+class JointLimits(Section):
     """Limits of one joint, or of all."""
 
     position: Bounds | None = None
@@ -47,7 +43,7 @@ class JointLimits(_Section):
     """Lowest and highest value of the action itself, whatever it commands."""
 
 
-class Sensor(_Section):
+class Sensor(Section):
     """What is checked of one named observation; every observation must be finite in any case."""
 
     range: Bounds | None = None
@@ -56,14 +52,14 @@ class Sensor(_Section):
     """Time after which a value that has not changed by a single bit is a fault [s]."""
 
 
-class Measured(_Section):
+class Measured(Section):
     """Which observations are the joints' own state, an element per element of the action."""
 
     position: str | None = None
     """Name of the observation with the joint positions."""
 
 
-class Limits(_Section):
+class Limits(Section):
     """What a robot may be told to do."""
 
     command: Literal["position", "step", "speed", "torque", "action"] = "action"

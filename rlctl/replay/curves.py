@@ -11,6 +11,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from rlctl.dict_spaces import split_names
 from rlctl.replay.recorder import Rollout
 from rlctl.replay.scene import Scene, encode_jpeg
 
@@ -141,7 +142,7 @@ def _numbered(name: str, count: int) -> list[str]:
 
 def _observations(rollout: Rollout, timelines: Timelines) -> list[Plot]:
     plots = []
-    for name, values in named_observations(rollout).items():
+    for name, values in split_names(rollout.episode.observations, rollout.env.observation_sizes).items():
         unit = rollout.env.observation_units.get(name)
         entity = "observation" if not name else rr.new_entity_path(["observation", name])
         title = f"observed {name}" if name else "observation"
@@ -154,21 +155,6 @@ def _observations(rollout: Rollout, timelines: Timelines) -> list[Plot]:
         _send(timelines, entity, 0, shown, _numbered(name or "observation", flat.shape[1])[: shown.shape[1]])
         plots.append(Plot(f"{title} [{unit}]" if unit else title, entity, "observation"))
     return plots
-
-
-def named_observations(rollout: Rollout) -> dict[str, NDArray[Any]]:
-    """Return the observations by name, each of shape (T + 1, ...); under "" where there are no names.
-
-    Of stacked observations it is the newest.
-    """
-    observations, sizes = rollout.episode.observations, rollout.env.observation_sizes
-    if isinstance(observations, dict):
-        return observations
-    if not sizes or observations.ndim != 2:
-        return {"": observations}
-    newest = observations[:, -sum(sizes.values()) :]
-    ends = np.cumsum(list(sizes.values()))
-    return {name: newest[:, end - size : end] for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
 
 def _is_image(values: NDArray[Any]) -> bool:

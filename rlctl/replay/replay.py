@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -108,15 +109,20 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
     output.results()  # from here on what an environment, or PyBullet's window, prints goes to stderr
     if request.verify is not None:
         return _verify(request.verify)
-    if _is_episode(request.source):
-        path = Path(str(request.source))
-        if request.video is not None:
-            return _film_episode(path, request.video)
-        return _show_episode(path) if request.gui else _record_episode(path, request.output)
-    actor = _Actor(request)
-    if request.video is not None:
-        return actor.film(request.video)
-    return actor.show() if request.gui else actor.record()
+    played = _Recorded(Path(str(request.source)), request.output) if _is_episode(request.source) else _Actor(request)
+    spec, seeds, film = played.spec, played.seeds, None
+    if request.video is not None and seeds:
+        with closing(make_filmable(spec)) as env:
+            begin = functools.partial(played.begin, env)
+            rollouts, film = film_episodes(request.video, env, spec, seeds, begin, policy=played.name)
+        episodes = [_summarize(rollout) for rollout in rollouts]
+    elif request.gui:
+        with closing(open_window(spec)) as env:
+            rollouts = show_episodes(env, spec, seeds, functools.partial(played.begin, env))
+        episodes = [_summarize(rollout) for rollout in rollouts]
+    else:
+        episodes = played.record()
+    return dataclasses.replace(played.report(episodes), film=film)
 
 
 def _is_episode(source: str | None) -> bool:
@@ -164,31 +170,28 @@ def _load_episode(path: Path) -> RecordedEpisode:
     return dataclasses.replace(episode, info=episode.info.model_copy(update={"spec": spec}))
 
 
-def _record_episode(path: Path, where: Path | None) -> ReplayResult:
-    episode = _load_episode(path)
-    recording = path.with_suffix(".rrd")
-    if where is not None:
-        recording = where if where.suffix == ".rrd" else where / recording.name
-    rollout = record_episode(episode, recording, title=f"{episode.info.spec.task} / episode {path.stem}")
-    return ReplayResult(episode.info.spec.task, episode.info.policy, [_summarize(rollout, recording, path)])
+class _Recorded:
+    """A recorded episode, whose actions are replayed."""
 
+    def __init__(self, path: Path, output: Path | None) -> None:
+        self._path, self._output = path, output
+        self._episode = _load_episode(path)
+        info = self._episode.info
+        self.spec, self.seeds, self.name = info.spec, [info.seed], info.policy
 
-def _show_episode(path: Path) -> ReplayResult:
-    episode = _load_episode(path)
-    info, spec = episode.info, episode.info.spec
-    with closing(open_window(spec)) as env:
-        actions = recorded_actions(episode, env, path)
-        rollouts = show_episodes(env, spec, [info.seed], lambda seed: actions)
-    return ReplayResult(spec.task, info.policy, [_summarize(rollout) for rollout in rollouts])
+    def begin(self, env: Env, seed: int) -> Choose:
+        return recorded_actions(self._episode, env, self._path)
 
+    def record(self) -> list[ReplayedEpisode]:
+        """Write the recording beside the episode, or to `--output`."""
+        recording = self._path.with_suffix(".rrd")
+        if self._output is not None:
+            recording = self._output if self._output.suffix == ".rrd" else self._output / recording.name
+        title = f"{self.spec.task} / episode {self._path.stem}"
+        return [_summarize(record_episode(self._episode, recording, title=title), recording, self._path)]
 
-def _film_episode(path: Path, film_file: Path) -> ReplayResult:
-    episode = _load_episode(path)
-    info, spec = episode.info, episode.info.spec
-    with closing(make_filmable(spec)) as env:
-        actions = recorded_actions(episode, env, path)
-        rollouts, film = film_episodes(film_file, env, spec, [info.seed], lambda seed: actions, policy=info.policy)
-    return ReplayResult(spec.task, info.policy, [_summarize(rollout) for rollout in rollouts], film=film)
+    def report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
+        return ReplayResult(self.spec.task, self.name, episodes)
 
 
 class _Actor:
@@ -201,65 +204,51 @@ class _Actor:
         self._file, self._run = found.file, found.run
         self._policy = load_policy(self._file)
         info = self._policy.info
-        self._spec: EnvSpec = found.locate(info.derive_spec(request.task, request.changes))
-        self._name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
+        self.spec: EnvSpec = found.locate(info.derive_spec(request.task, request.changes))
+        self.name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
         self._described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
         self._chosen: dict[int, float] = {}
         """Returns of the chosen episodes, by seed."""
         self._choice = ""
         if request.choice is None:
-            self._seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)
+            self.seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)
         else:
             episodes = request.episodes or _EPISODES_TO_CHOOSE_FROM
             player = load_player(self._file, deterministic=True)
-            results, self._choice = choose_episodes(player, self._spec, episodes, request.seed, request.choice)
-            self._seeds = [result.seed for result in results]
+            results, self._choice = choose_episodes(player, self.spec, episodes, request.seed, request.choice)
+            self.seeds = [result.seed for result in results]
             self._chosen = {result.seed: result.total_reward for result in results}
 
-    def show(self) -> ReplayResult:
-        with closing(open_window(self._spec)) as env:
-            self._check_fits(env)
-            rollouts = show_episodes(env, self._spec, self._seeds, self._begin)
-        return self._report([_summarize(rollout) for rollout in rollouts])
-
-    def film(self, path: Path) -> ReplayResult:
-        if not self._seeds:
-            return self._report([])
-        with closing(make_filmable(self._spec)) as env:
-            self._check_fits(env)
-            rollouts, film = film_episodes(path, env, self._spec, self._seeds, self._begin, policy=self._name)
-        return dataclasses.replace(self._report([_summarize(rollout) for rollout in rollouts]), film=film)
-
-    def record(self) -> ReplayResult:
+    def record(self) -> list[ReplayedEpisode]:
+        """Write each episode and its recording."""
         from rlctl.replay.rrd import write_rrd
 
-        spec, done = self._spec, []
+        spec, done = self.spec, []
         with closing(make_drawable(spec, print_warning)) as env:
-            self._check_fits(env)
-            for seed in self._seeds:
-                rollout = play_episode(env, spec, seed, self._begin(seed), policy=self._name, draw=print_warning)
+            for seed in self.seeds:
+                choose = self.begin(env, seed)
+                rollout = play_episode(env, spec, seed, choose, policy=self.name, draw=print_warning)
                 recording = self._next_recording()
                 episode = recording.with_suffix(".npz")
                 save_episode(episode, rollout.episode)
-                title, several = f"{spec.task} / episode {recording.stem}", len(self._seeds) > 1
+                title, several = f"{spec.task} / episode {recording.stem}", len(self.seeds) > 1
                 write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
                 done.append(_summarize(rollout, recording, episode))
-        return self._report(done)
+        return done
 
-    def _report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
+    def report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
+        """Return the result; warns where an episode is not what it was when it was chosen."""
         for each in episodes:
             before = self._chosen.get(each.seed, each.total_reward)
             if before != each.total_reward:
                 print_warning(
                     f"warning: seed {each.seed}: return {each.total_reward:.6g}, it was {before:.6g} when it was "
-                    f"chosen; does the environment repeat itself? rlctl check-env {self._spec.task}"
+                    f"chosen; does the environment repeat itself? rlctl check-env {self.spec.task}"
                 )
-        return ReplayResult(self._spec.task, self._name, episodes, policy_file=self._described, choice=self._choice)
+        return ReplayResult(self.spec.task, self.name, episodes, policy_file=self._described, choice=self._choice)
 
-    def _check_fits(self, env: Env) -> None:
+    def begin(self, env: Env, seed: int) -> Choose:
         self._policy.info.check_fits(describe(env), self._file)
-
-    def _begin(self, seed: int) -> Choose:
         self._policy.reset()
         return lambda observation, step: self._policy.predict(observation)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pydantic
 from gymnasium import spaces
 
+from rlctl.dict_spaces import format_space
 from rlctl.env_spec import LARGEST_SPACE
 from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.joints import Joints
@@ -51,14 +52,9 @@ class EnvInfo(pydantic.BaseModel):
         for name in ("observation", "action"):
             ours, theirs = getattr(self, f"{name}_space"), getattr(other, f"{name}_space")
             if ours != theirs:
-                own, foreign = _shorten(space_from_json(ours)), _shorten(space_from_json(theirs))
+                own, foreign = (format_space(space_from_json(each), 120) for each in (ours, theirs))
                 return f"its {name} space is {own}, {whose} is {foreign}"
         return None
-
-
-def _shorten(space: spaces.Space[Any]) -> str:
-    text = " ".join(str(space).split())
-    return text if len(text) <= 120 else f"{type(space).__name__}{space.shape or ''}"
 
 
 def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:

@@ -19,10 +19,8 @@ from rlctl.run.named_spec import EpisodeSpec
 FORMAT = 1
 
 
-class EpisodeInfo(pydantic.BaseModel):
+class EpisodeInfo(pydantic.BaseModel, extra="forbid"):
     """What an episode was: its environment, its seed, how it ended."""
-
-    model_config = pydantic.ConfigDict(extra="forbid")
 
     format: int = FORMAT
     spec: EpisodeSpec

@@ -35,19 +35,15 @@ from rlctl.run.shipped import Provenance, find_shipped_policy
 FORMAT = 1
 
 
-class Score(pydantic.BaseModel):
+class Score(pydantic.BaseModel, extra="forbid"):
     """What a policy reached in the evaluation that it was kept for."""
-
-    model_config = pydantic.ConfigDict(extra="forbid")
 
     success: float | None
     mean_return: float
 
 
-class PolicyInfo(pydantic.BaseModel):
+class PolicyInfo(pydantic.BaseModel, extra="forbid"):
     """Everything about a policy but its numbers."""
-
-    model_config = pydantic.ConfigDict(extra="forbid")
 
     format: int = FORMAT
     algo: str

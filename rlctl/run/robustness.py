@@ -13,8 +13,8 @@ from rlctl.run.shipped import Interval
 FORMAT = 1
 
 
-class _Content(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+class _Content(pydantic.BaseModel, extra="forbid", frozen=True):
+    pass
 
 
 class Outcome(_Content):

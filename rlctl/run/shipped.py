@@ -20,10 +20,8 @@ Interval = tuple[float, float]
 """Lower and upper bound of a 95 % interval."""
 
 
-class MeasuredScore(pydantic.BaseModel):
+class MeasuredScore(pydantic.BaseModel, extra="forbid"):
     """What a policy, or a baseline, scored over a list of episodes that its training has not seen."""
-
-    model_config = pydantic.ConfigDict(extra="forbid")
 
     episodes: int
     seed: int
@@ -41,10 +39,8 @@ class MeasuredScore(pydantic.BaseModel):
     """Mean of |action - action before|, over elements and steps; 0 for discrete actions."""
 
 
-class Provenance(pydantic.BaseModel):
+class Provenance(pydantic.BaseModel, extra="forbid"):
     """Where an exported policy is from, and what was measured of it."""
-
-    model_config = pydantic.ConfigDict(extra="forbid")
 
     run: str
     """Name of the run, with its task."""

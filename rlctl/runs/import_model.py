@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.run import files
 from rlctl.run.env_info import EnvInfo, describe
 from rlctl.run.policy import PolicyInfo, collect_versions, load_policy, save_policy
 from rlctl.runs.sb3_model import SavedModel, SavedNormalization, read_model, read_normalization
@@ -129,16 +130,15 @@ def _write_checked(output: Path, info: PolicyInfo, tensors: dict[str, NDArray[An
     """Write the file beside its place, load it, and put it in place only if it acts."""
     from rlctl.run.torch_policy import TorchPolicy
 
-    beside = output.with_name(f".{output.stem}.import.safetensors")
-    save_policy(beside, info, tensors)
-    try:
-        load_policy(beside)
-        TorchPolicy.load(beside)  # which is stricter
-        beside.replace(output)
-    except ArtifactError as error:
-        raise ArtifactError(str(error).replace(str(beside), str(output))) from None
-    finally:
-        beside.unlink(missing_ok=True)
+    def write(part: Path) -> None:
+        save_policy(part, info, tensors)
+        try:
+            load_policy(part)
+            TorchPolicy.load(part)  # which is stricter
+        except ArtifactError as error:
+            raise ArtifactError(str(error).replace(str(part), str(output))) from None
+
+    files.write_with(output, write)
 
 
 def show(result: ImportedPolicy, json: str | None) -> None:

@@ -3,12 +3,16 @@ import json
 import numpy as np
 import pytest
 
+from rlctl.dict_spaces import split_names
 from rlctl.errors import ArtifactError
-from rlctl.replay.curves import named_observations
 from rlctl.replay.rrd import write_rrd
 from rlctl.task import rough_heights
 from tests.replay.conftest import play, reach
 from tests.replay.reading import column, entities, properties, reader, static
+
+
+def observed_by_name(rollout):
+    return split_names(rollout.episode.observations, rollout.env.observation_sizes)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +55,7 @@ def test_weighted_terms_have_a_curve_each_and_add_up(recording, reached):
 
 
 def test_goal_and_hand_are_where_they_were(recording, reached):
-    observed = named_observations(reached)
+    observed = observed_by_name(reached)
     goal = (observed["hand"] + observed["hand_to_goal"])[0]
     _, drawn = column(recording, "/world/markers/goal", "Points3D:positions")
     np.testing.assert_allclose(drawn[:, 0], np.broadcast_to(goal, (121, 3)), atol=1e-6)
@@ -64,7 +68,7 @@ def test_actions_and_observations_by_name(recording, reached):
     assert steps[0] == 1
     np.testing.assert_array_equal(actions, reached.episode.actions)
     _, hand = column(recording, "/observation/hand")
-    np.testing.assert_array_equal(hand, named_observations(reached)["hand"])
+    np.testing.assert_array_equal(hand, observed_by_name(reached)["hand"])
 
 
 def test_robot_has_meshes_where_its_links_are(recording, reached):

@@ -17,6 +17,7 @@ from rlctl.check_env.finding import RECORDING, Finding, check, experiment
 from rlctl.check_env.instance import Context, Instance, find_author, find_time_limit, is_task
 from rlctl.check_env.messages import Built, Message
 from rlctl.check_env.records import Records
+from rlctl.dict_spaces import format_space
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
 
 WAIVERS = "rlctl_ignore"
@@ -129,8 +130,8 @@ def describe_built(instance: Instance) -> Built:
     return Built(
         leaves=instance.leaves,
         action_leaves=instance.action_leaves,
-        observation_space=_short(getattr(env, "observation_space", None)),
-        action_space=_short(env.action_space),
+        observation_space=format_space(getattr(env, "observation_space", None)),
+        action_space=format_space(env.action_space),
         names=dict(inner.observation_sizes) if is_task(env) else {},
         events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
         max_steps=find_time_limit(env),
@@ -159,14 +160,6 @@ def _place(author: type) -> tuple[str | None, int | None]:
         return inspect.getsourcefile(author), inspect.getsourcelines(author)[1]
     except (OSError, TypeError):
         return None, None
-
-
-def _short(space: Any) -> str:
-    text = " ".join(str(space).split())
-    if len(text) <= 100:
-        return text
-    shape = getattr(space, "shape", None)
-    return f"{type(space).__name__}{shape or ''}"
 
 
 def _read_truncation(env: Any) -> str:

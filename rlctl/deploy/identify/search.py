@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import queue
 from collections.abc import Callable, Sequence
-from multiprocessing.connection import Connection, wait
-from types import TracebackType
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -53,54 +55,44 @@ class SearchWorkers:
 
     def __init__(self, spec: EnvSpec, log: Log, unknowns: Unknowns, count: int) -> None:
         first = encode({"log": dataclasses.asdict(log), "unknowns": dataclasses.asdict(unknowns)})
-        main = "rlctl.deploy.identify.search:main"
-        self._children: list[ChildProcess] = []
+        self.count = count
+        self._children = contextlib.ExitStack()
+        self._free: queue.SimpleQueue[Connection] = queue.SimpleQueue()
+        self._threads = ThreadPoolExecutor(count)
         try:
             for _ in range(count):
-                child = ChildProcess(main, {"spec": dataclasses.asdict(spec)}, stdout=2, stderr=2)
-                self._children.append(child)
+                spec_of_child = {"spec": dataclasses.asdict(spec)}
+                child = ChildProcess("rlctl.deploy.identify.search:main", spec_of_child, stdout=2, stderr=2)
+                self._children.callback(child.close)
                 child.connection.send_bytes(first)
+                self._free.put(child.connection)
         except BaseException:
-            self.close()
+            self._children.close()
             raise
-
-    @property
-    def count(self) -> int:
-        return len(self._children)
 
     def ask(self, questions: Sequence[dict[str, Any]]) -> list[Any]:
         """Return the answers to questions, each given to the next worker that is free."""
-        answers: dict[int, Any] = {}
-        waiting = list(enumerate(questions))[::-1]
-        asked: dict[Any, int] = {}
-        free = [child.connection for child in self._children]
-        while waiting or asked:
-            while waiting and free:
-                index, question = waiting.pop()
-                connection = free.pop()
-                connection.send_bytes(encode(question))
-                asked[connection] = index
-            for connection in [each for each in wait(list(asked)) if isinstance(each, Connection)]:
-                try:
-                    answer = json.loads(connection.recv_bytes())
-                except (EOFError, OSError):
-                    raise TaskError("a worker process ended while it followed the log; see what it printed") from None
-                if isinstance(answer, dict) and "error" in answer:
-                    raise getattr(errors, answer["error"], TaskError)(answer["message"])
-                answers[asked.pop(connection)] = answer
-                free.append(connection)
-        return [answers[index] for index in range(len(questions))]
+        return list(self._threads.map(self._ask_one, questions))
 
-    def close(self) -> None:
-        """End the processes."""
-        for child in self._children:
-            child.close()
+    def _ask_one(self, question: dict[str, Any]) -> Any:
+        connection = self._free.get()
+        try:
+            connection.send_bytes(encode(question))
+            answer = json.loads(connection.recv_bytes())
+        except (EOFError, OSError):
+            raise TaskError("a worker process ended while it followed the log; see what it printed") from None
+        finally:
+            self._free.put(connection)
+        if isinstance(answer, dict) and "error" in answer:
+            raise getattr(errors, answer["error"], TaskError)(answer["message"])
+        return answer
 
     def __enter__(self) -> SearchWorkers:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
+    def __exit__(self, *_: object) -> None:
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        self._children.close()
 
 
 def search(

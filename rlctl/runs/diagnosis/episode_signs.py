@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import split
+from rlctl.dict_spaces import split_names
 from rlctl.run.episode import RecordedEpisode
 from rlctl.runs.diagnosis.history import History
 
@@ -128,10 +128,10 @@ def badly_scaled_observations(run: History) -> str | None:
 
 def _named_observations(episode: RecordedEpisode, run: History) -> dict[str, Array]:
     """Return observations by name, each of shape (T + 1, elements)."""
-    parts = {key: np.asarray(rows, np.float64) for key, rows in split(episode.observations).items() if rows.ndim <= 2}
-    rows = {key: each.reshape(len(each), -1) for key, each in parts.items()}
     sizes = run.env.observation_sizes if run.env is not None else {}
-    if list(rows) != [""] or sum(sizes.values()) != rows[""].shape[1]:
-        return {key or "observation": each for key, each in rows.items()}
-    bounds = np.cumsum([0, *sizes.values()])
-    return {name: rows[""][:, low:high] for name, low, high in zip(sizes, bounds, bounds[1:], strict=False)}
+    parts = split_names(episode.observations, sizes).items()
+    return {
+        name or "observation": np.asarray(rows, np.float64).reshape(len(rows), -1)
+        for name, rows in parts
+        if rows.ndim <= 2
+    }
