@@ -36,7 +36,7 @@ class ServedPolicy:
             return float(np.exp(network.log_std).mean())
         if network.lstm is not None or self.info.env.action_space["type"] != "Box":
             return None
-        return float(np.exp(network.compute_log_std(network.compute_latent(observation))).mean())
+        return float(network.compute_std(network.compute_latent(observation)).mean())
 
     def check_replaces(self, other: EnvInfo) -> None:
         """Raise `ArtifactError` if this policy cannot take the place of one for another environment."""

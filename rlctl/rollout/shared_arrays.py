@@ -123,15 +123,22 @@ class SegmentArrays:
 
     def first(self, steps: int, ended: Sequence[EpisodeResult]) -> SegmentArrays:
         """Return the first steps, in which some episodes ended; the arrays are the same memory."""
+        return self._select(np.s_[:, :steps], np.s_[:, : steps + 1], ended)
+
+    def of(self, env: int) -> SegmentArrays:
+        """Return those of one environment: shape (steps, ...), in the same memory."""
+        return self._select(env, env, ())
+
+    def _select(self, index: Any, observed: Any, ended: Sequence[EpisodeResult]) -> SegmentArrays:
         return SegmentArrays(
-            {key: rows[:, : steps + 1] for key, rows in self.observation.items()},
-            {key: rows[:, :steps] for key, rows in self.final.items()},
-            self.stored[:, :steps],
-            self.action[:, :steps],
-            self.reward[:, :steps],
-            self.terminated[:, :steps],
-            self.truncated[:, :steps],
-            self.terms[:, :steps],
+            {key: rows[observed] for key, rows in self.observation.items()},
+            {key: rows[index] for key, rows in self.final.items()},
+            self.stored[index],
+            self.action[index],
+            self.reward[index],
+            self.terminated[index],
+            self.truncated[index],
+            self.terms[index],
             ended,
         )
 

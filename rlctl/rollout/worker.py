@@ -181,17 +181,16 @@ class Worker:
     ) -> list[EpisodeResult]:
         """Play a segment of one environment; without `next_seeds` no episode begins where one ends."""
         arrays, index, player, write = self._arrays, episode.index, self._loaded_player, self._writer.write
-        segment, inside = arrays.segment, arrays.inside
-        now = {key: rows[index] for key, rows in segment.observation.items()}
-        final = {key: rows[index] for key, rows in segment.final.items()}
+        segment, inside = arrays.segment.of(index), arrays.inside[index]
+        now = segment.observation
         single = now.get(SINGLE)
-        stored, taken, rewards = segment.stored[index], segment.action[index], segment.reward[index]
         state = None if self._states is None else self._states[index]
         if player.state is not None and state is not None:
             player.state[:] = state
         for key, rows in now.items():
             rows[0] = arrays.observation[key][index]
         player.begin_segment(episode.seed, episode.step)
+        inside[0] = episode.seed
         ended: list[EpisodeResult] = []
         row, only_one = 0, asked.until_end or next_seeds is None
         while row < asked.steps and not (only_one and ended):
@@ -199,26 +198,26 @@ class Worker:
             began = perf_counter()
             chosen, action = player.act(observation, episode.seed, episode.step)
             acted = perf_counter()
-            stored[row] = np.ravel(chosen)
-            taken[row] = action
+            segment.stored[row] = np.ravel(chosen)
+            segment.action[row] = action
             episode.step += 1
-            inside[index] = episode.seed, episode.step, row
-            observation, reward, terminated, truncated, info = episode.take_step(taken[row])
+            inside[1], inside[2] = episode.step, row
+            observation, reward, terminated, truncated, info = episode.take_step(segment.action[row])
             episode.acting_s += acted - began
             episode.stepping_s += perf_counter() - acted
-            rewards[row] = reward
-            segment.terminated[index, row], segment.truncated[index, row] = terminated, truncated
+            segment.reward[row] = reward
+            segment.terminated[row], segment.truncated[row] = terminated, truncated
             if asked.record:
-                segment.terms[index, row] = list(info["metrics"].values())
+                segment.terms[row] = list(info["metrics"].values())
             if asked.contacts:
                 episode.measure_contact()
             row += 1
             if terminated or truncated:
                 ended.append(episode.summarize(info, row - 1, player.report()))
                 if next_seeds is not None:
-                    write(final, row - 1, observation)
+                    write(segment.final, row - 1, observation)
                     seed = next(next_seeds)
-                    inside[index] = seed, 0, row
+                    inside[:] = seed, 0, row
                     observation = episode.start(seed)
                     if player.state is not None:
                         player.state[:] = 0.0

@@ -1,6 +1,6 @@
 """The layers of a policy's actor as data: NumPy plays them on one observation, `rlctl.export` writes them as ONNX.
 
-Arrays are used where they lie: if they are in shared memory, new numbers written there act from the next step on.
+Arrays are used where they lie: if they are in shared memory, new numbers written there act once `prepare` was called.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ class Layer(abc.ABC):
     @abc.abstractmethod
     def __call__(self, value: Any) -> Array:
         """Return what the layer makes of one observation's value, without a batch dimension."""
+
+    def prepare(self) -> None:  # noqa: B027 (most have nothing to compute)
+        """Compute what follows from the numbers alone, again after they have changed."""
 
 
 def apply(layers: Iterable[Layer], value: Any) -> Array:
@@ -93,12 +96,24 @@ class Normalize(Layer):
     clip: float
     epsilon: float = 1e-8
     """What SB3's VecNormalize adds to the variance."""
+    _deviation: Array = dataclasses.field(init=False)
+    _high: Array = dataclasses.field(init=False)
+    _low: Array = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        # Whole arrays: with a plain number a function of so few elements takes twice as long.
+        self._high = np.full(np.shape(self.mean), self.clip)
+        self._low = -self._high
+        self.prepare()
+
+    def prepare(self) -> None:
+        self._deviation = np.sqrt(self.variance + self.epsilon)
 
     def __call__(self, value: Array) -> Array:
         # In float64 as VecNormalize: an element that hardly varies is multiplied by up to 10,000.
-        normalized: Array = (value - self.mean) / np.sqrt(self.variance + self.epsilon)
-        np.minimum(normalized, self.clip, out=normalized)
-        np.maximum(normalized, -self.clip, out=normalized)
+        normalized: Array = (value - self.mean) / self._deviation
+        np.minimum(normalized, self._high, out=normalized)
+        np.maximum(normalized, self._low, out=normalized)
         return normalized.astype(np.float32)
 
 

@@ -71,6 +71,14 @@ class Network:
         self.log_std = read.tensors.get(name)
         """Parameter of PPO's and gSDE's noise; None where there is none, or a layer computes it."""
         self._log_std_layer = read.linear(name) if f"{name}.weight" in read.tensors else None
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Compute what follows from the numbers alone, again after they have changed."""
+        for part in self.parts.values():
+            for layer in part:
+                layer.prepare()
+        self._std = None if self.log_std is None else np.exp(self.log_std)
 
     def compute_latent(self, observation: object) -> Array:
         """Return what the head starts from; a recurrent network goes one step on."""
@@ -83,12 +91,13 @@ class Network:
             value = self.lstm.step(value)
         return apply(self.trunk, value)
 
-    def compute_log_std(self, latent: Array) -> Array:
-        """Return the logarithm of the standard deviation: of a layer, or the parameter."""
+    def compute_std(self, latent: Array) -> Array:
+        """Return the standard deviation: of a layer, or the parameter."""
         if self._log_std_layer is not None:
-            return np.clip(self._log_std_layer(latent), -20.0, 2.0)
-        assert self.log_std is not None  # only Gaussian heads ask
-        return self.log_std
+            deviation: Array = np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
+            return deviation
+        assert self._std is not None  # only Gaussian heads ask
+        return self._std
 
 
 def _read_actor(algo: str, read: _Reader) -> tuple[list[Layer], list[Layer]]:

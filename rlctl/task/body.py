@@ -70,7 +70,6 @@ class Body(Motors):
         self.all_joint_names = [info[1].decode() for info in infos]
         self._links = {info[12].decode(): index for index, info in enumerate(infos)}
         self.base_name: str = pybullet.getBodyInfo(body_id, physicsClientId=client)[0].decode()
-        self._link_numbers = list(self._links.values())
         self._all_names = [*self._links, self.base_name]
         movable = [info for info in infos if info[2] in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)]
         self.joint_names = [info[1].decode() for info in movable]
@@ -88,20 +87,14 @@ class Body(Motors):
         """Names of all links but the base."""
         return list(self._links)
 
-    def _read_joints(self) -> Any:
-        raw = self._cache.get("raw joints")
-        if raw is None:
-            # None where a body has no joints.
-            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client) or ()
-            self._cache["raw joints"] = raw
-        return raw
-
-    def _joint_states(self) -> tuple[Array, Array]:
+    def _joint_states(self) -> tuple[Array, Array, Any]:
+        # Positions, velocities, and motor torques in a tuple: few tasks need them as an array.
         state = self._cache.get("joints")
         if state is None:
-            raw = self._read_joints()
-            state = (np.array([joint[0] for joint in raw]), np.array([joint[1] for joint in raw]))
-            self._cache["joints"] = state
+            # None where a body has no joints.
+            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client) or ()
+            positions, velocities, _, torques = zip(*raw, strict=True) if raw else ((), (), (), ())
+            state = self._cache["joints"] = (np.array(positions), np.array(velocities), torques)
         return state
 
     @property
@@ -122,9 +115,8 @@ class Body(Motors):
         """
         torques: Array | None = self._cache.get("torques")
         if torques is None:
-            raw = self._read_joints()
             # PyBullet divides a substep's impulse by the time of the whole step.
-            torques = self._substeps * np.array([joint[3] for joint in raw])
+            torques = self._substeps * np.array(self._joint_states()[2])
             if self._commanded is not None:
                 torques = np.where(np.isnan(self._commanded), torques, self._commanded)
             self._cache["torques"] = torques
@@ -169,24 +161,28 @@ class Body(Motors):
         )
         return np.array(solution)
 
-    def _link_state(self, link: str) -> tuple[Array, Array]:
-        state = self._cache.get(("link", link))  # a link may be called "base" or "joints"
+    def _read_link(self, link: str) -> Any:
+        state = self._cache.get(("link", link))
         if state is None:
-            raw = pybullet.getLinkState(
+            state = self._cache["link", link] = pybullet.getLinkState(
                 self.id, self._link_index(link), computeForwardKinematics=1, physicsClientId=self.client
             )
-            # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
-            state = (np.array(raw[4]), np.array(raw[5]))
-            self._cache["link", link] = state
         return state
 
     def link_position(self, link: str) -> Array:
         """Position of the link frame [m], world frame, shape (3,)."""
-        return self._link_state(link)[0]
+        position: Array | None = self._cache.get(("position", link))  # a link may be called "base" or "joints"
+        if position is None:
+            # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
+            position = self._cache["position", link] = np.array(self._read_link(link)[4])
+        return position
 
     def link_orientation(self, link: str) -> Array:
         """Orientation of the link frame, quaternion (x, y, z, w), world frame, shape (4,)."""
-        return self._link_state(link)[1]
+        orientation: Array | None = self._cache.get(("orientation", link))
+        if orientation is None:
+            orientation = self._cache["orientation", link] = np.array(self._read_link(link)[5])
+        return orientation
 
     def mass_state(self, link: str) -> MassState:
         """Return where the centre of mass of a link, or of the base, is and how it moves.
@@ -208,15 +204,14 @@ class Body(Motors):
         pose = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
         return MassState(*pose, *pybullet.getBaseVelocity(self.id, physicsClientId=self.client))
 
-    @property
-    def mass_positions(self) -> list[Vector]:
-        """Positions of the centres of mass [m], world frame: of the base, then of `link_names`; see `mass_state`."""
-        positions: list[Vector] | None = self._cache.get("masses")
-        if positions is None:
-            base, _ = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
-            links = pybullet.getLinkStates(self.id, self._link_numbers, physicsClientId=self.client) or ()
-            positions = self._cache["masses"] = [base, *[link[0] for link in links]]
-        return positions
+    def mass_positions(self, links: Sequence[str]) -> list[Vector]:
+        """Return the positions of the centres of mass of links [m], world frame, as `mass_state` has them.
+
+        They are read at every call.
+        """
+        numbers = [self._links[link] if link in self._links else self._link_index(link) for link in links]
+        states = pybullet.getLinkStates(self.id, numbers, physicsClientId=self.client) or ()
+        return [state[0] for state in states]
 
     def links_touching(self, other: Body) -> set[str]:
         """Return the links, or the base, in contact with `other`, which may be the body itself, at the last step."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -41,7 +42,7 @@ class Motors(Properties):
     def __init__(self) -> None:
         super().__init__()
         self._plans: dict[tuple[str, ...], _Plan] = {}
-        self._commanded: Array | None = None  # by `set_torques`, shape (all joints,); NaN: the motor's
+        self._commanded: list[float] | None = None  # by `set_torques`, of all joints; NaN: the motor's
 
     def _restore_nominal(self) -> None:
         super()._restore_nominal()
@@ -114,7 +115,8 @@ class Motors(Properties):
 
     def _forget_torques(self, joints: list[int]) -> None:
         if self._commanded is not None:
-            self._commanded[joints] = np.nan
+            for joint in joints:
+                self._commanded[joint] = math.nan
 
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
         """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves it."""
@@ -138,8 +140,9 @@ class Motors(Properties):
         chosen = self.find_joints(joints)
         given = self._apply_strength(torques.tolist(), chosen)
         if self._commanded is None:
-            self._commanded = np.full(len(self.joint_indices), np.nan)
-        self._commanded[chosen] = given
+            self._commanded = [math.nan] * len(self.joint_indices)
+        for joint, torque in zip(chosen, given, strict=True):
+            self._commanded[joint] = torque
         pybullet.setJointMotorControlArray(
             self.id,
             [self.joint_indices[joint] for joint in chosen],

@@ -31,6 +31,7 @@ class ObservationFormat:
         self.sizes = {name: int(np.size(value)) for name, value in first.items()}
         """Elements per name, in the order of the flat observation."""
         self.space = self._make_space()
+        self._zeros = np.zeros(self.space.shape or (), np.float32)
 
     def _make_space(self) -> Any:
         for name in [*self._bounds, *self._task.observation_units]:
@@ -67,12 +68,12 @@ class ObservationFormat:
                 observed[name] = self._clip_rounding(observed[name], lowest, highest, parts, step)
             return observed
         try:
-            observation = np.concatenate(list(parts.values()), axis=None, dtype=np.float32)
+            observation = np.concatenate([*parts.values()], axis=None, dtype=np.float32)
         except ValueError:
             raise self._shape_mismatch(parts, step) from None
         if observation.shape != self.space.shape:
             raise self._shape_mismatch(parts, step)
-        if not math.isfinite(np.add.reduce(observation)):
+        if not math.isfinite(observation.dot(self._zeros)):  # 0, unless an element is not finite
             raise self._not_finite(parts, step)
         if self._bounds:
             observation = self._clip_rounding(observation, self.space.low, self.space.high, parts, step)

@@ -99,8 +99,9 @@ class Properties:
         pybullet.changeVisualShape(self.id, link, shapeIndex=shape, rgbaColor=color, physicsClientId=self.client)
 
     def _link_index(self, link: str) -> int:
-        base = f"only its base, {self.base_name!r}"
-        check_name(link, self._links, f"{self.file.name} has no link", TaskError, none=base)
+        if link not in self._links:  # asked here, too: links are read at every step
+            base = f"only its base, {self.base_name!r}"
+            check_name(link, self._links, f"{self.file.name} has no link", TaskError, none=base)
         return self._links[link]
 
     def find_joints(self, joints: Collection[str] = ()) -> list[int]:
@@ -110,7 +111,7 @@ class Properties:
                 check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
         if not self.joint_names:
             raise TaskError(f"{self.file.name} has no joints")
-        return [self.joint_names.index(joint) for joint in joints or self.joint_names]
+        return [self.joint_names.index(joint) for joint in joints] or list(range(len(self.joint_names)))
 
     def _part_index(self, part: str) -> int:
         # A link's index, or -1 for the base, by its name.
