@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError
+from rlctl.errors import TaskError, describe_exception
 from rlctl.replay.mjcf import Shape, read_shapes
 from rlctl.task.body import Body
 from rlctl.task.bullet import pybullet
@@ -236,7 +236,9 @@ class Camera:
             self._pictures.append((step, encode_jpeg(np.asarray(self._env.render()))))
         except Exception as error:  # missing pygame, no OpenGL, no picture: the recording goes on without
             self._works = False
-            self._warn(f"no camera pictures: {type(error).__name__}: {error}")
+            no_render = isinstance(error, NotImplementedError)
+            why = "the environment does not implement render" if no_render else describe_exception(error)
+            self._warn(f"no camera pictures: {why}")
         if len(self._pictures) > _MOST_PICTURES:  # the length of an episode is not known before its end
             self._pictures, self._every = self._pictures[::2], 2 * self._every
 

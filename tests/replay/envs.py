@@ -106,6 +106,12 @@ class Blind(Pixels):
         super().__init__()
 
 
+class Undrawn(Pixels):
+    """Takes a render_mode, and has no render()."""
+
+    render = gymnasium.Env.render
+
+
 class Chance(Pixels):
     """Not reproducible: after five steps its point comes from nowhere."""
 

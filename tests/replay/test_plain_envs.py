@@ -51,6 +51,7 @@ def test_time_follows_from_the_frame_rate(tmp_path):
     [
         ("Pixels", {"fault": "render"}, "no camera pictures: OSError: no OpenGL"),
         ("Blind", {}, "no camera pictures: "),
+        ("Undrawn", {}, "no camera pictures: the environment does not implement render"),
     ],
 )
 def test_missing_pictures_cost_a_warning_and_nothing_else_is_missing(name, parameters, reason, tmp_path):
