@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from rlctl.env_spec import EnvSpec
@@ -17,13 +23,15 @@ from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run.acting import Exploration
 from rlctl.run.policy import PolicyInfo
 from tests.benchmarks.row import Row, side_by_side
-from tests.benchmarks.stepping_workers import SteppingWorkers
 
 MANY = 64
 STEPS = 40  # of each environment in a segment
 HIDDEN = 64
 EPISODES = 100
 SAMPLES = Exploration(stochastic=True)
+BEFORE = "85f4e6aae9f677b6110d60fa1f6ccd0e54f971b8"
+"""The last commit whose workers stepped all environments by turns: from then on the figure to compare with is fixed."""
+PROGRAM = Path(__file__).with_name("stepping_by_turns.py")
 
 
 def reach(repeat: int) -> Row:
@@ -39,9 +47,8 @@ def half_cheetah(repeat: int) -> Row:
 def evaluation(repeat: int) -> Row:
     """Count environment steps of 100 whole episodes of `reach`, as `rlctl eval` plays them."""
     workers = Workers(EnvSpec("reach"), available_cores())
-    policy = make_policy(workers)
-    workers.set_policy(*policy)
-    turns = _Turns("reach", policy)
+    workers.set_policy(*make_policy(workers))
+    turns = _Turns("reach")
 
     def play() -> float:
         began = time.perf_counter()
@@ -50,7 +57,7 @@ def evaluation(repeat: int) -> Row:
 
     pair = side_by_side(play, lambda: turns.play(2), 2 * repeat + 1)
     workers.close()
-    turns.workers.close()
+    turns.close()
     return Row(
         "evaluating reach",
         f"{pair.ours:,.0f} steps/s",
@@ -83,10 +90,10 @@ def per_step(repeat: int) -> Row:
 def _row(task: str, target: float, repeat: int) -> Row:
     workers = Workers(EnvSpec(task), MANY)
     player = _Player(workers)
-    turns = _Turns(task, make_policy(workers))
+    turns = _Turns(task)
     pair = side_by_side(lambda: player.play(2), lambda: turns.play(2), 2 * repeat + 1)
     workers.close()
-    turns.workers.close()
+    turns.close()
     return Row(
         f"playing {task}",
         f"{pair.ours:,.0f} steps/s",
@@ -127,34 +134,38 @@ class _Player:
 
 
 class _Turns:
-    """All environments step by step with a batched policy in torch, as before workers acted."""
+    """All environments step by step with a batched policy in torch: rlctl as it was before workers acted."""
 
-    def __init__(self, task: str, policy: tuple[PolicyInfo, dict[str, NDArray[Any]]]) -> None:
-        self.workers = SteppingWorkers(task, MANY, available_cores())
-        info, tensors = policy
-        self._weights = [torch.from_numpy(tensors[f"policy/{name}.weight"]) for name in _LAYERS]
-        self._low, self._high = info.env.spaces()[1].low, info.env.spaces()[1].high  # type: ignore[attr-defined]
-        self._mean, self._scale = tensors["normalize//mean"], np.sqrt(tensors["normalize//var"] + 1e-8)
-        torch.set_num_threads(1)
+    def __init__(self, task: str) -> None:
+        self._folder = tempfile.TemporaryDirectory()
+        root, repository = Path(self._folder.name), Path(__file__).parents[2]
+        archive = subprocess.run(
+            ["git", "archive", BEFORE, "rlctl", "plugins"], cwd=repository, stdout=subprocess.PIPE, check=True
+        )
+        with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as files:
+            files.extractall(root, filter="data")
+        self._process = subprocess.Popen(
+            [sys.executable, str(PROGRAM), task, str(MANY), str(STEPS), str(HIDDEN)],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(root), str(root / "plugins")])},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._read()
 
-    def _act(self, observations: NDArray[Any]) -> NDArray[Any]:
-        normalized = np.clip((observations - self._mean) / self._scale, -10, 10).astype(np.float32)
-        with torch.no_grad():
-            value = torch.from_numpy(normalized)
-            for weight in self._weights[:-1]:
-                value = torch.tanh(value @ weight.T)
-            mean = value @ self._weights[-1].T
-            sampled: NDArray[Any] = torch.normal(mean, 0.5).numpy()
-        return np.clip(sampled, self._low, self._high)
+    def _read(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline()
 
     def play(self, segments: int) -> float:
         """Return steps per second."""
-        workers = self.workers
-        began = time.perf_counter()
-        for _ in range(segments * STEPS):
-            workers.action[:] = self._act(workers.observation.copy())
-            workers.step()
-        return segments * STEPS * MANY / (time.perf_counter() - began)
+        print(segments, file=self._process.stdin, flush=True)
+        return float(self._read())
+
+    def close(self) -> None:
+        """End its processes."""
+        self._process.communicate()
+        self._folder.cleanup()
 
 
 _LAYERS = ("mlp_extractor.policy_net.0", "mlp_extractor.policy_net.2", "action_net")
