@@ -105,7 +105,6 @@ def test_its_recipe_is_found_installed_or_not(rlctl, plugin, install, tmp_path):
         ("numpy", "there is a module 'numpy' already"),
         ("stable-baselines3", "there is a module 'stable_baselines3' already"),
         ("sb3-contrib", "there is a module 'sb3_contrib' already"),
-        ("pytest-xdist", "there is a distribution of that name"),
     ],
 )
 def test_names_that_cannot_be(tmp_path, monkeypatch, name, message):

@@ -148,15 +148,9 @@ def _cross(impulses: Sequence[float], rates: NDArray[np.float64]) -> float | Non
     from scipy.optimize import isotonic_regression
 
     falling = isotonic_regression(rates, increasing=False).x
-    below = np.flatnonzero(falling <= 0.5)
-    if not below.size:
+    if falling[-1] > 0.5:
         return None
-    index = int(below[0])
-    if index == 0:
-        return float(impulses[0])
-    before, after = falling[index - 1], falling[index]
-    part = (before - 0.5) / (before - after)
-    return float(impulses[index - 1] + part * (impulses[index] - impulses[index - 1]))
+    return float(np.interp(-0.5, -falling, impulses))  # which wants rising values
 
 
 def _judge(

@@ -104,8 +104,8 @@ def bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _draw_path(body: BodyMotion, timelines: Timelines) -> None:
-    """Draw the path of a robot's trunk, or else of an arm's last link: a segment per step."""
-    if not body.joint_names or (body.trunk is None and not body.chain):
+    """Draw the path of a robot's trunk, or else of its last link: a segment per step."""
+    if not body.joint_names:
         return
     points = _path_points(body).astype(np.float32)
     entity = _entity("world", "paths", body.name)

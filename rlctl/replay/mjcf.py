@@ -8,12 +8,12 @@ what was simulated: `axisangle` is in radians whatever the compiler says, `euler
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rlctl.task.bullet import pybullet
 
@@ -107,7 +107,7 @@ def _orientation(geom: Mapping[str, str]) -> tuple[float, ...]:
         return (*map(float, vector), float(w))
     if turn := _numbers(geom, "axisangle"):
         axis = np.array(turn[:3]) / np.linalg.norm(turn[:3])
-        return (*map(float, math.sin(turn[3] / 2) * axis), math.cos(turn[3] / 2))
+        return tuple(Rotation.from_rotvec(turn[3] * axis).as_quat().tolist())
     return (0.0, 0.0, 0.0, 1.0)
 
 
@@ -115,8 +115,6 @@ def _between(start: np.ndarray, end: np.ndarray) -> tuple[tuple[float, ...], tup
     """Return the centre [m], quaternion and length [m] of what reaches from `start` to `end` along its z axis."""
     along = end - start
     length = float(np.linalg.norm(along))
-    x, y, z = along / length if length else (0.0, 0.0, 1.0)
-    # The shortest turn from z to the direction: (z cross d, 1 + z . d), normalized; half a turn is about x.
-    turn = np.array([-y, x, 0.0, 1.0 + z]) if z > -1 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
-    turn /= np.linalg.norm(turn)
-    return tuple(((start + end) / 2).tolist()), tuple(turn.tolist()), length
+    direction = along / length if length else np.array([0.0, 0.0, 1.0])
+    turn, _ = Rotation.align_vectors([direction], [[0.0, 0.0, 1.0]])  # the shortest one
+    return tuple(((start + end) / 2).tolist()), tuple(turn.as_quat().tolist()), length

@@ -62,8 +62,6 @@ class BodyMotion:
     """Index in `links` of what moves about: a free base, or what sliding joints without limits carry; else None."""
     box: tuple[Array, Array]
     """Lowest and highest corner [m] at the reset."""
-    chain: bool
-    """Whether the links follow each other in one line, as those of an arm do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,7 +177,6 @@ class _BodyReader:
             shapes=shapes,
             trunk=self._trunk(),
             box=self._box,
-            chain=self._is_chain(),
         )
 
     def _ground_height(self) -> float | None:
@@ -190,13 +187,6 @@ class _BodyReader:
             return None
         endless = high[2] - low[2] > 1e6  # an infinite plane has an infinite box
         return float(self._poses[0][0][0][2] if endless else high[2])
-
-    def _is_chain(self) -> bool:
-        parents = [
-            pybullet.getJointInfo(self.body.id, index, physicsClientId=self.client)[16]
-            for index in range(len(self.links) - 1)
-        ]
-        return len(parents) > 1 and parents == list(range(-1, len(parents) - 1))
 
     def _trunk(self) -> int | None:
         trunk = self.body.find_trunk() if self.body.joint_names else None

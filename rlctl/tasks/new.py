@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import importlib.util
 import keyword
 import os
@@ -101,22 +100,10 @@ def _check(name: str, package: str) -> None:
         raise UsageError(
             f"name {name!r}: {package} is a word of Python, so no package can have it; choose another name"
         )
-    # Installing the plugin would hide the module, or replace the distribution, for everything else here.
+    # Installing the plugin would hide the module for everything else here.
     spec = importlib.util.find_spec(package)
     if spec is not None and spec.origin is not None:  # without an origin it is just a folder on the path
         raise UsageError(f"name {name!r}: there is a module {package!r} already ({spec.origin}); choose another name")
-    if _is_installed(name):
-        raise UsageError(
-            f"name {name!r}: there is a distribution of that name, which pip would replace; choose another"
-        )
-
-
-def _is_installed(distribution: str) -> bool:
-    try:
-        importlib.metadata.distribution(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 def _read_sources() -> dict[Path, str]:

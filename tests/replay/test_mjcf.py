@@ -262,7 +262,6 @@ def test_shapes_turn_with_their_link():
         shapes=[Shape("trunk", pybullet.GEOM_SPHERE, (0.1,), None, (0.5, 0.0, 0.0), (0, 0, 0, 1), (1, 1, 1, 1))],
         trunk=0,
         box=(np.zeros(3), np.ones(3)),
-        chain=False,
     )
     assert shape_centers(robot, 0)[0, 0] == pytest.approx([1.0, 2.5, 3.0])  # x becomes y
 
