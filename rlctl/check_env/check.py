@@ -18,7 +18,7 @@ from rlctl.check_env.progress import Position
 from rlctl.check_env.records import Records
 from rlctl.check_env.supervisor import Supervisor
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import RecipeError, UsageError, did_you_mean
+from rlctl.errors import UsageError, did_you_mean
 
 LOADING = ("RL0", "RL216")
 """What is judged even where no instance could be built: loading, and windows that end it."""
@@ -95,7 +95,7 @@ def check(
 
     def receive(message: Message) -> None:
         if isinstance(message, Mistake):
-            mistakes.append((RecipeError if message.is_recipe else UsageError)(message.message))
+            mistakes.append(UsageError(message.message))
         else:
             records.add(message)
 

@@ -17,7 +17,7 @@ from rlctl.check_env.finding import Experiment, Finding, NotApplicable, NotJudge
 from rlctl.check_env.instance import Budget, Context
 from rlctl.check_env.messages import End, Failure, Finished, Message, Mistake, Skipped, encode
 from rlctl.check_env.progress import Progress
-from rlctl.errors import RecipeError, UsageError
+from rlctl.errors import UsageError
 
 
 def main(
@@ -43,7 +43,7 @@ def run(
         for message in _run_all(context, chosen, seconds):
             yield dataclasses.replace(message, process=process) if isinstance(message, Failure) else message
     except UsageError as error:
-        yield Mistake(str(error), isinstance(error, RecipeError))
+        yield Mistake(str(error))
 
 
 def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> Iterator[Message]:

@@ -213,7 +213,6 @@ class Mistake:
     """The user named a task or a parameter that does not exist."""
 
     message: str
-    is_recipe: bool
 
 
 @dataclasses.dataclass(frozen=True)

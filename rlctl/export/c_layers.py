@@ -19,9 +19,7 @@ _ACTIVATIONS = {
     "tanh": "hyperbolic_tangent({x})",
     "relu": "relu({x})",
     "elu": "elu({x})",
-    "leaky_relu": "leaky_relu({x})",
     "silu": "{x} * sigmoid({x})",
-    "gelu": "0.5f * {x} * (1.0f + erff({x} / 1.41421356f))",
 }
 _FUNCTIONS = {
     # expf is several times as fast as tanhf; the difference of the two is below 2e-7.
@@ -29,7 +27,6 @@ _FUNCTIONS = {
     "    return 1.0f - 2.0f / (expf(2.0f * x) + 1.0f);\n}\n",
     "sigmoid": "static float sigmoid(float x)\n{\n    return 1.0f / (1.0f + expf(-x));\n}\n",
     "relu": "static float relu(float x)\n{\n    return x < 0.0f ? 0.0f : x;\n}\n",
-    "leaky_relu": "static float leaky_relu(float x)\n{\n    return x < 0.0f ? 0.01f * x : x;\n}\n",
     "elu": "static float elu(float x)\n{\n    return x < 0.0f ? expm1f(x) : x;\n}\n",
     # Comparisons that are false for NaN, so that it is passed on and not turned into a bound.
     "bound": "static double bound(double x, double low, double high)\n{\n"

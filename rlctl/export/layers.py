@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -184,21 +183,14 @@ def _emit_clip(graph: Graph, value: str, layer: Clip) -> str:
 def _emit_activation(graph: Graph, value: str, layer: Activation) -> str:
     if layer.name == "silu":
         return graph.add("Mul", value, graph.add("Sigmoid", value))
-    if layer.name != "gelu":
-        operator, attributes = _OPERATORS[layer.name]
-        return graph.add(operator, value, **attributes)
-    # 0.5 x (1 + erf(x / sqrt(2))); ONNX has an operator for it from opset 20 only.
-    root = graph.constant("gelu.root2", np.float32(math.sqrt(2.0)))
-    one, half = graph.constant("gelu.one", np.float32(1.0)), graph.constant("gelu.half", np.float32(0.5))
-    erf = graph.add("Erf", graph.add("Div", value, root))
-    return graph.add("Mul", graph.add("Mul", value, graph.add("Add", erf, one)), half)
+    operator, attributes = _OPERATORS[layer.name]
+    return graph.add(operator, value, **attributes)
 
 
 _OPERATORS: dict[str, tuple[str, dict[str, float]]] = {
     "tanh": ("Tanh", {}),
     "relu": ("Relu", {}),
     "elu": ("Elu", {"alpha": 1.0}),
-    "leaky_relu": ("LeakyRelu", {"alpha": 0.01}),
 }
 _EMIT: dict[type[Layer], Callable[[Graph, str, Any], str]] = {
     Linear: _emit_linear,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -71,15 +70,8 @@ def send_curves(rollout: Rollout, timelines: Timelines) -> list[Plot]:
 
 
 def palette(count: int) -> list[Color]:
-    """Return distinct colours."""
-    if count <= len(_PALETTE):
-        return _PALETTE[:count]
-    return [_hue(index / count) for index in range(count)]
-
-
-def _hue(hue: float) -> Color:
-    red, green, blue = colorsys.hsv_to_rgb(hue, 0.65, 0.85)
-    return round(255 * red), round(255 * green), round(255 * blue)
+    """Return colours, which are distinct as long as there are enough of them."""
+    return [_PALETTE[index % len(_PALETTE)] for index in range(count)]
 
 
 def _send(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-import pydantic
 from pydantic import Field
 
 from rlctl.run.quantities import Number, NumberAfter, Section, Switch, Whole
@@ -119,17 +118,8 @@ class _OffPolicy(Parameters):
     """Steps of each environment between updates."""
     gradient_steps: _Count | Literal[-1] = Field(1, json_schema_extra=decide_by("-1"))
     """Gradient steps per update; -1: as many as environment steps were taken."""
-    optimize_memory_usage: Switch = False
-    """Not supported: checkpoints need the whole buffer."""
     n_steps: _Count = 1
     """Steps of the n-step return."""
-
-    @pydantic.field_validator("optimize_memory_usage")
-    @classmethod
-    def _refuse(cls, value: bool) -> bool:
-        if value:
-            raise ValueError("not supported: checkpoints need the whole buffer; leave it out")
-        return value
 
 
 class _Continuous(_OffPolicy):

@@ -214,18 +214,9 @@ def _elu(value: Array) -> Array:
     return np.where(value > 0, value, np.expm1(np.minimum(value, 0)))
 
 
-def _gelu(value: Array) -> Array:
-    from scipy.special import erf  # few networks need it
-
-    result: Array = np.float32(0.5) * value * (np.float32(1.0) + erf(value / np.float32(np.sqrt(2.0))))
-    return result
-
-
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "tanh": np.tanh,
     "relu": lambda value: np.maximum(value, np.float32(0.0)),
     "elu": _elu,
-    "leaky_relu": lambda value: np.where(value > 0, value, np.float32(0.01) * value),
     "silu": lambda value: value * _sigmoid(value),
-    "gelu": _gelu,
 }

@@ -46,7 +46,7 @@ class _ActorAndCritic(Parameters):
     qf: _Layers
 
 
-Activation = Literal["tanh", "relu", "elu", "leaky_relu", "silu", "gelu"]
+Activation = Literal["tanh", "relu", "elu", "silu"]
 
 
 class _Network(Parameters):

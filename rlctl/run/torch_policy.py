@@ -42,9 +42,7 @@ ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "tanh": torch.nn.Tanh,
     "relu": torch.nn.ReLU,
     "elu": torch.nn.ELU,
-    "leaky_relu": torch.nn.LeakyReLU,
     "silu": torch.nn.SiLU,
-    "gelu": torch.nn.GELU,
 }
 
 # Of no use to a policy that is run, and no plain data.

@@ -35,7 +35,7 @@ _POLICIES = {
     "sb3_contrib.common.recurrent": "recurrent_ppo",
 }
 """Module of the policy class -> algorithm; a model does not name its algorithm."""
-_ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "LeakyReLU": "leaky_relu", "SiLU": "silu", "GELU": "gelu"}
+_ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu"}
 _EXTRACTORS = frozenset({"FlattenExtractor", "NatureCNN", "CombinedExtractor"})
 _TRAINING_ONLY = frozenset({"optimizer_class", "optimizer_kwargs"})
 _STORAGES = {

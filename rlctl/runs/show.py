@@ -13,8 +13,7 @@ from rlctl.errors import ArtifactError
 from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
 from rlctl.run.robustness import Robustness
-from rlctl.runs.diagnosis import diagnose
-from rlctl.runs.diagnosis import show as diagnosis
+from rlctl.runs.diagnosis import diagnose, format_finding
 from rlctl.runs.diagnosis.history import History
 from rlctl.runs.listing import as_json
 from rlctl.runs.summary import Rows, list_points, summarize
@@ -80,7 +79,7 @@ def show(run: RunDescription, json: str | None) -> None:
     source = run.status.get("from")
     if json is not None:
         content = {**as_json(summary), "evaluations": run.evaluations, "metrics": run.metrics}
-        found = {"warnings": run.warnings, "findings": diagnosis.as_json(run.findings)}
+        found = {"warnings": run.warnings, "findings": run.findings}
         measured = None if run.robustness is None else run.robustness.model_dump(mode="json")
         if output.write_result_json(json, {**content, **found, "robustness": measured, "bytes": sizes}):
             return
@@ -102,7 +101,7 @@ def show(run: RunDescription, json: str | None) -> None:
     for line in () if run.robustness is None else describe_robustness(run.robustness):
         out.print(f"robustness: {line}", markup=False)
     for finding in run.findings:
-        out.print("\n".join(diagnosis.format_finding(finding)), markup=False)
+        out.print("\n".join(format_finding(finding)), markup=False)
     files = "  ".join(f"{name} {format_bytes(size)}" for name, size in sizes.items())
     out.print(f"files: {files}  in {summary.path}", markup=False)
 

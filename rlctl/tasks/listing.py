@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 from rlctl import registry
 from rlctl.errors import RecipeError
@@ -13,7 +12,10 @@ from rlctl.errors import RecipeError
 class ListedTask:
     """A row of the table."""
 
-    entry: registry.TaskEntry
+    name: str
+    target: str
+    distribution: str
+    version: str
     algo: str | None
     problem: str | None
 
@@ -35,7 +37,7 @@ def describe_entry(entry: registry.TaskEntry, *, check: bool) -> ListedTask:
         problem = problem or f"{entry.recipe_file}: {error}"
     if check and problem is None:
         problem = registry.check_import(entry)
-    return ListedTask(entry, algo, problem)
+    return ListedTask(entry.name, entry.target, entry.distribution, entry.version, algo, problem)
 
 
 def _read_algorithm(entry: registry.TaskEntry) -> str | None:
@@ -54,7 +56,7 @@ def show(listed: list[ListedTask], json: str | None) -> None:
     """Print the table, or JSON alone for `-`."""
     from rlctl import output
 
-    if json is not None and output.write_result_json(json, {"tasks": [_to_json(each) for each in listed]}):
+    if json is not None and output.write_result_json(json, {"tasks": listed}):
         return
     if not listed:
         output.out().print("no tasks are installed")
@@ -64,20 +66,8 @@ def show(listed: list[ListedTask], json: str | None) -> None:
     columns = ["task", "origin", "algorithm", *(["problem"] if any(each.problem for each in listed) else [])]
     rows: list[list[str | Text]] = []
     for each in listed:
-        origin = f"{each.entry.distribution} {each.entry.version}"
+        origin = f"{each.distribution} {each.version}"
         problem = Text(each.problem or "", style="red")
-        row: list[str | Text] = [each.entry.name, origin, each.algo or "ppo (default)", problem]
+        row: list[str | Text] = [each.name, origin, each.algo or "ppo (default)", problem]
         rows.append(row[: len(columns)])
     output.print_table(columns, rows, left=columns)
-
-
-def _to_json(each: ListedTask) -> dict[str, Any]:
-    entry = each.entry
-    return {
-        "name": entry.name,
-        "target": entry.target,
-        "distribution": entry.distribution,
-        "version": entry.version,
-        "algo": each.algo,
-        "problem": each.problem,
-    }

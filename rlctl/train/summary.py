@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rlctl import output
-from rlctl.runs.diagnosis import Finding, diagnose
-from rlctl.runs.diagnosis.show import as_json, format_end
+from rlctl.runs.diagnosis import Finding, diagnose, format_end
 from rlctl.train.display import duration, percent
 from rlctl.train.request import TrainResult
 
@@ -50,7 +49,7 @@ def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:
             "policy": str(result.run.best_policy),
         },
         **({"stage": progress.stage, "stages": stages} if stages else {}),
-        "findings": as_json(findings),
+        "findings": findings,
         "recordings": [str(path) for path in result.recordings],
         "note": result.note,
     }

@@ -15,7 +15,7 @@ from rlctl.check_env.finding import Check, choose_rules
 from rlctl.check_env.messages import Fact, Series, decode, encode
 from rlctl.check_env.records import Records
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import RecipeError, UsageError
+from rlctl.errors import UsageError
 from tests import fork_server
 
 FOLDER = Path(__file__).parent
@@ -94,7 +94,7 @@ def test_hash_order_shows_in_a_new_process(in_root):
 def test_unknown_names_are_usage_errors(in_root):
     with pytest.raises(UsageError, match=r"no task 'reech'. Did you mean 'reach'\?"):
         check(EnvSpec("reech"), env_timeout_s=10)
-    with pytest.raises(RecipeError, match=r"no parameter 'sise'. Did you mean 'size'\?"):
+    with pytest.raises(UsageError, match=r"no parameter 'sise'. Did you mean 'size'\?"):
         check(EnvSpec(f"{BROKEN}:Clean", {"sise": 1.0}), env_timeout_s=10)
     with pytest.raises(UsageError, match="no module 'nowhere'"):
         check(EnvSpec("nowhere:Env"), env_timeout_s=10)

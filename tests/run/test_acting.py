@@ -28,7 +28,7 @@ CASES = {
         {"use_sde": True, "policy_kwargs": {"squash_output": True, "full_std": False, "use_expln": True}},
     ),
     "ppo, elu": ("ppo", FLAT, BOX, {"policy_kwargs": {"activation_fn": torch.nn.ELU}}),
-    "ppo, gelu": ("ppo", FLAT, BOX, {"policy_kwargs": {"activation_fn": torch.nn.GELU}}),
+    "ppo, silu": ("ppo", FLAT, BOX, {"policy_kwargs": {"activation_fn": torch.nn.SiLU}}),
     "ppo, no layers": ("ppo", FLAT, BOX, {"policy_kwargs": {"net_arch": []}}),
     "ppo, dict": ("ppo", DICT, BOX, {}),
     "ppo, image, channels first": ("ppo", spaces.Box(0, 255, (3, 40, 36), np.uint8), BOX, {}),

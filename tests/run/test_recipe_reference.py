@@ -15,6 +15,7 @@ from rlctl.run.torch_policy import ALGORITHMS as CLASSES
 # Set by rlctl itself, or not plain data.
 NOT_FOR_RECIPES = {
     *("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log", "policy_kwargs", "_init_setup_model"),
+    "optimize_memory_usage",  # a checkpoint needs the whole buffer
     *("rollout_buffer_class", "rollout_buffer_kwargs", "replay_buffer_class", "replay_buffer_kwargs"),
 }
 NOT_FOR_POLICIES = {

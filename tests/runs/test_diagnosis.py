@@ -13,9 +13,8 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.run.policy import PolicyInfo, save_policy
-from rlctl.runs.diagnosis import Grade, diagnose
+from rlctl.runs.diagnosis import Grade, diagnose, format_end
 from rlctl.runs.diagnosis.findings import list_signs
-from rlctl.runs.diagnosis.show import format_end
 
 UPDATES = 30
 STEPS = 1000 * np.arange(1, UPDATES + 1)

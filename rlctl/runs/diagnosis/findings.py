@@ -1,4 +1,4 @@
-"""What signs mean together: which signs make a finding, and its texts, are data in `findings.yaml`."""
+"""What signs mean together, and findings as lines; which signs make one, and its texts, are data in `findings.yaml`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import enum
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -118,3 +118,20 @@ def _settings(names: Iterable[str], history: History) -> Iterable[Setting]:
             continue  # this algorithm has no such parameter
         advice = f"usually {row['range']}, often {row['common']}; raise: {row['raise']}; lower: {row['lower']}"
         yield Setting(name, value, advice)
+
+
+def format_finding(finding: Finding) -> list[str]:
+    """Return a finding with its evidence, its meaning and what to try."""
+    settings = [
+        f"  {each.name} is {'not set' if each.value is None else each.value}: {each.advice}"
+        for each in finding.settings
+    ]
+    return [finding.line, f"  {finding.meaning}", *(f"  try: {each}" for each in finding.advice), *settings]
+
+
+def format_end(findings: Sequence[Finding], run: str) -> list[str]:
+    """Return what a training says at its end: warnings in full, the rest in one line; nothing where all is well."""
+    warnings = [each for each in findings if each.grade == Grade.WARNING]
+    others = [f"{each.id} {each.name}" for each in findings if each.grade != Grade.WARNING]
+    lines = [line for each in warnings for line in format_finding(each)]
+    return [*lines, f"noted: {', '.join(others)}; more: rlctl runs show {run}"] if others else lines
