@@ -50,6 +50,7 @@ ROWS = {
     "reach-sparse": "robots:reach_sparse",
     "checkpoints-ppo": "checkpoints:while_ppo_trains",
     "checkpoints-sac": "checkpoints:while_sac_trains",
+    "beside-training": "checkpoints:beside_training",
     "replay-buffer": "checkpoints:replay_buffer",
     "zoo-ppo-reach": "zoo:ppo_reach",
     "zoo-ppo-half-cheetah": "zoo:ppo_half_cheetah",

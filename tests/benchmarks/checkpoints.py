@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 import statistics
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from tests.benchmarks.row import Row
 
-_SHARE = 0.02
+_SHARE, _BESIDE = 0.02, 0.12
 _TRANSITIONS, _SIZE, _NEW = 300_000, 53, 1_000
 
 
@@ -25,6 +27,42 @@ def while_sac_trains(repeat: int) -> Row:
     """Do the same for SAC, whose replay buffer grows."""
     settings = {"algo": "sac", "total_timesteps": 6_000, "algo_kwargs": {"learning_starts": 500}}
     return _while_training("checkpoints, SAC", settings, repeat)
+
+
+def beside_training(repeat: int) -> Row:
+    """Measure the part of a training of `reach`, as shipped, that is neither playing nor learning.
+
+    It is the time in `TrainingLoop.boundary`, where checkpoints, logging and evaluations are, of that in
+    `TrainingLoop.run`: from the first step to the end, without the start of the program and its processes.
+    """
+    found = [_train_as_shipped(seed) for seed in range(repeat)]
+    share, evaluations, checkpoints, seconds = (statistics.median(column) for column in zip(*found, strict=True))
+    return Row(
+        "checkpoints, logging, evaluation",
+        f"{share:.1%}",
+        "-",
+        f"{share / _BESIDE:.2f} of what they may",
+        "<= 12 % of the time",
+        share <= _BESIDE,
+        f"reach as shipped, {seconds:.1f} s: evaluations {evaluations:.1%}, checkpoints {checkpoints:.1%}, "
+        f"logging and the rest {share - evaluations - checkpoints:.1%}",
+    )
+
+
+def _train_as_shipped(seed: int) -> tuple[float, float, float, float]:
+    """Return the parts of the time at boundaries, in evaluations and in checkpoints, and the time [s]."""
+    from rlctl.train.loop import TrainingLoop
+    from rlctl.train.saving import Saver
+
+    with (
+        _timed_calls(TrainingLoop, "boundary") as boundaries,
+        _timed_calls(TrainingLoop, "evaluate") as evaluations,
+        _timed_calls(Saver, "checkpoint") as checkpoints,
+        _timed_calls(TrainingLoop, "run") as runs,
+    ):
+        _run({"seed": seed})
+    seconds = _total(runs)
+    return _total(boundaries) / seconds, _total(evaluations) / seconds, _total(checkpoints) / seconds, seconds
 
 
 def _while_training(name: str, settings: dict, repeat: int) -> Row:
@@ -45,39 +83,49 @@ def _while_training(name: str, settings: dict, repeat: int) -> Row:
 def _train(settings: dict) -> tuple[float, int, float, float, float]:
     """Return the part of the time, how many, when the first two were there [s], and the median of their times [ms]."""
     from rlctl.train.loop import TrainingLoop
-    from rlctl.train.request import TrainRequest, run_training
     from rlctl.train.saving import Saver
 
-    saves: list[tuple[float, float]] = []
-    evaluations: list[float] = []
-    began: list[float] = []
-    save, evaluate, begin = Saver.checkpoint, TrainingLoop.evaluate, TrainingLoop.run
+    with (
+        _timed_calls(Saver, "checkpoint") as saves,
+        _timed_calls(TrainingLoop, "evaluate") as evaluations,
+        _timed_calls(TrainingLoop, "run") as runs,
+    ):
+        _run(settings)
+    began = runs[0][0]
+    trained = saves[-1][1] - began - _total(evaluations)
+    first, second = (end - began for _, end in saves[:2])
+    return _total(saves) / trained, len(saves), first, second, 1000 * statistics.median(b - a for a, b in saves)
 
-    def timed_save(self, *arguments, **options):
-        start = time.monotonic()
-        result = save(self, *arguments, **options)
-        saves.append((start, time.monotonic()))
-        return result
 
-    def timed_evaluate(self, **options):
-        start = time.monotonic()
-        evaluate(self, **options)
-        evaluations.append(time.monotonic() - start)
+def _run(settings: dict) -> None:
+    from rlctl.train.request import TrainRequest, run_training
 
-    def timed_begin(self):
-        began.append(time.monotonic())
-        begin(self)
+    with tempfile.TemporaryDirectory() as folder:
+        run_training(TrainRequest("reach", settings=settings, root=Path(folder)))
 
-    Saver.checkpoint, TrainingLoop.evaluate, TrainingLoop.run = timed_save, timed_evaluate, timed_begin
+
+@contextlib.contextmanager
+def _timed_calls(owner: type, method: str) -> Iterator[list[tuple[float, float]]]:
+    """Note when each call of a method began and ended [s]."""
+    calls: list[tuple[float, float]] = []
+    original = getattr(owner, method)
+
+    def timed(*arguments, **options):
+        began = time.monotonic()
+        try:
+            return original(*arguments, **options)
+        finally:
+            calls.append((began, time.monotonic()))
+
+    setattr(owner, method, timed)
     try:
-        with tempfile.TemporaryDirectory() as folder:
-            run_training(TrainRequest("reach", settings=settings, root=Path(folder)))
+        yield calls
     finally:
-        Saver.checkpoint, TrainingLoop.evaluate, TrainingLoop.run = save, evaluate, begin
-    each = [end - start for start, end in saves]
-    trained = saves[-1][1] - began[0] - sum(evaluations)
-    first, second = (end - began[0] for _, end in saves[:2])
-    return sum(each) / trained, len(saves), first, second, 1000 * statistics.median(each)
+        setattr(owner, method, original)
+
+
+def _total(calls: list[tuple[float, float]]) -> float:
+    return sum(end - began for began, end in calls)
 
 
 def replay_buffer(repeat: int) -> Row:
