@@ -46,13 +46,9 @@ class _Pictures:
         try:
             picture = np.asarray(self._env.render())
         except Exception as error:  # missing pygame, no OpenGL
-            raise UsageError(
-                f"no pictures: the environment's render() raised {type(error).__name__}: {error}"
-            ) from None
+            raise UsageError(f"the environment's render() raised {describe_exception(error)}") from None
         if picture.ndim != 3 or picture.shape[2] != 3:
-            raise UsageError(
-                f"no pictures: the environment's render() returned {picture.dtype} of shape {picture.shape}"
-            )
+            raise UsageError(f"the environment's render() returned {picture.dtype} of shape {picture.shape}")
         height, width = (size - size % 2 for size in picture.shape[:2])  # encoders want even sizes
         return np.ascontiguousarray(picture[:height, :width].astype(np.uint8))
 

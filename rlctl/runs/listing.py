@@ -32,11 +32,12 @@ def list_runs(
     Raises `UsageError` for an unknown order or a task without runs, which may be one of `commands` misspelt.
     """
     if sort not in SORT_KEYS:
-        raise UsageError(f"--sort {sort}: give one of {', '.join(SORT_KEYS)}.{did_you_mean(sort, list(SORT_KEYS))}")
+        raise UsageError(f"--sort {sort}: give one of {', '.join(SORT_KEYS)}")
     found = [summarize(path) for path in find_runs(root)]
     if task is not None:
         every = found
-        found = [run for run in every if run.task == task or run.path.parent.name == registry.make_slug(task)]
+        slug = registry.make_slug(task)
+        found = [run for run in every if run.task == task or run.name.partition("/")[0] == slug]
         if not found:
             names = sorted({run.task for run in every})
             close = did_you_mean(task, [*names, *commands])

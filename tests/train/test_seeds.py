@@ -79,7 +79,7 @@ def test_runs_of_a_group_are_found(group):
     assert newest.parent == group.path
     assert find_policy(LINE, root=root).run.path == newest
     assert (root / "latest").resolve().parent == group.path.resolve()
-    names = [run.name for run in list_runs(LINE, root=root)]
+    names = [run.name for run in list_runs("Line", root=root)]
     assert sorted(names) == sorted(f"Line/{group.path.name}/{group.find_run(seed).path.name}" for seed in (4, 5))
     with pytest.raises(UsageError, match="a group of runs; name one of them"):
         find_run(str(group.path), root)
