@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import ArtifactError, UsageError
+from rlctl.errors import ArtifactError, UsageError, describe_exception
 from rlctl.replay.difference import find_difference
 from rlctl.replay.recorder import play_episode, recorded_actions
 from rlctl.replay.scene import Env, encode_jpeg, find_bounds
