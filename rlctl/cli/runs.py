@@ -140,7 +140,7 @@ def remove_runs(
 
 @app.command("prune")
 def prune_runs(yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False) -> None:
-    """Remove the checkpoints of finished runs, which are needed only to train on."""
+    """Remove the checkpoints of finished runs, which are needed only to make these longer."""
     from rlctl.runs.removal import plan_prune, remove_with_report
 
     remove_with_report(plan_prune(), yes=yes)

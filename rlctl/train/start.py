@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlctl import registry
-from rlctl.errors import RecipeError, UsageError
+from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.run import directory, lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.recipe import Recipe, validate
@@ -149,6 +149,11 @@ def _find_checkpoint(request: TrainRequest) -> Start:
             )
         run.recover()
         found, damage = checkpoint.read_newest(run)
+        if found is None and status.get("status") == "finished":
+            raise ArtifactError(
+                f"{run.path}: finished, and its checkpoints were removed; "
+                f"for a new training that begins with its policy: rlctl train {task} --from {run.path}"
+            )
         if found is not None and request.settings:
             found = _reopen(found, before, recipe)
         notes = ["no checkpoint yet: the training begins at its first step"]

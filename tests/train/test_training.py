@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from rlctl.errors import DivergedError, RecipeError, TaskError, UsageError
+from rlctl.errors import ArtifactError, DivergedError, RecipeError, TaskError, UsageError
 from rlctl.run import recipe as recipes
 from rlctl.run import recipe_sources
 from rlctl.run.acting import PolicyPlayer
@@ -143,6 +143,14 @@ def test_resume_goes_on_with_weights_optimiser_normalisation_and_counters(train,
     # 80 steps an environment: eight episodes of ten ended, the ninth has just begun.
     assert after.tensors["environments/episodes_started"].tolist() == [9] * 4
     assert after.tensors["environments/steps"].tolist() == [0] * 4
+
+
+def test_a_finished_run_without_checkpoints_does_not_begin_again(copied, resume):
+    shutil.rmtree(copied.checkpoint(0).parent)
+    before = copied.metrics_file.read_bytes()
+    with pytest.raises(ArtifactError, match=r"finished, and its checkpoints were removed; .* --from "):
+        resume(copied, total_timesteps=512)
+    assert copied.metrics_file.read_bytes() == before
 
 
 def test_resuming_a_finished_run_does_nothing(copied, resume):

@@ -31,7 +31,8 @@ class Report:
     def title(self) -> str:
         first = self.runs[0].summary
         seeds = ", ".join(str(each.summary.seed) for each in self.runs)
-        return f"{first.task}, {first.algo}, {'seed' if len(self.runs) == 1 else 'seeds'} {seeds}"
+        algorithms = " and ".join(dict.fromkeys(each.summary.algo for each in self.runs))
+        return f"{first.task}, {algorithms}, {'seed' if len(self.runs) == 1 else 'seeds'} {seeds}"
 
     @property
     def terms(self) -> list[str]:
