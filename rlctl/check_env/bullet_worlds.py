@@ -28,7 +28,7 @@ WEIGHT_STEPS = 20
 UNMOVED = 1e-3
 """Gravity changes nothing where no position or speed differs by more [m, rad, m/s, rad/s]."""
 LONGEST_S = 0.1
-"""How long a world goes on without its environment [s]: what was put inside something is thrown out by then."""
+"""How long a world is simulated without its environment [s]: what was put inside something is thrown out by then."""
 MOST_STEPS = 100
 
 Link = tuple[int, int]
@@ -181,7 +181,7 @@ def measure_thickness(client: int, link: Link) -> float:
 
 
 def weight_matters(world: World) -> bool:
-    """Say whether gravity would change how a world without it goes on: not where all that moves moves level."""
+    """Say whether gravity would change the motion of a world without it: not where all that moves moves level."""
     p, client = bullet(), world.client
     state = p.saveState(physicsClientId=client)
     ends = []
@@ -211,7 +211,7 @@ class Jump:
 
 
 def find_jumps(world: World, seed: int) -> list[Jump]:
-    """Let a world go on without its environment, and return how fast each free body became."""
+    """Simulate a world without its environment, and return how fast each free body became."""
     p, client = bullet(), world.client
     dt = float(p.getPhysicsEngineParameters(physicsClientId=client)["fixedTimeStep"])
     gravity = float(np.linalg.norm(read_gravity(client)))

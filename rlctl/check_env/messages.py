@@ -116,8 +116,6 @@ class Trajectory:
     reward_is_number: NDArray[np.bool_]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
-    action_values: NDArray[np.float64]
-    """Numbers of each action, in the order of the action space's leaves. Shape (T, A)."""
     infos: Mapping[str, Series]
     """Numbers in info, by name; those in a dictionary of info as `reward_terms/distance`. Values have shape (n,)."""
     forms: list[Form]

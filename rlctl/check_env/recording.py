@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rlctl.check_env.episode import Episode, Moment
 from rlctl.check_env.failures import EnvironmentRaised, describe_failure
 from rlctl.check_env.instance import Budget
-from rlctl.check_env.leaves import Leaf, find_numbers, flatten_action, name_type, pick
+from rlctl.check_env.leaves import Leaf, find_numbers, name_type, pick
 from rlctl.check_env.messages import MOST_INFOS, Failure, Form, Series, Trajectory
 
 
@@ -32,7 +32,6 @@ class Recording:
         self._flags: list[tuple[bool, bool]] = []
         self._forms: dict[tuple[Any, ...], list[int]] = {}
         self._infos: dict[str, tuple[list[int], list[float]]] = {}
-        self._actions: list[NDArray[np.float64]] = []
         self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
 
     def run(self) -> list[Trajectory | Failure]:
@@ -80,7 +79,6 @@ class Recording:
         if not moment.is_readable:
             return 0
         if moment.step:
-            self._actions.append(flatten_action(self.episode.instance.action_leaves, moment.action))
             self._count_form("terminated", name_type(moment.terminated))
             self._count_form("truncated", name_type(moment.truncated))
             self._flags.append(moment.flags)
@@ -163,7 +161,6 @@ class Recording:
                 index: Series(np.array(steps, np.int64), np.stack(values))
                 for index, (steps, values) in self._values.items()
             },
-            action_values=np.stack(self._actions) if self._actions else np.zeros((0, 0)),
             rewards=np.array(self._rewards, np.float64),
             reward_is_number=np.array(self._is_number, np.bool_),
             terminated=np.array([flag for flag, _ in self._flags], np.bool_),

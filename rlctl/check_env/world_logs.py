@@ -156,8 +156,8 @@ class WorldLogger:
             own = [read_world(each) for each in ids]
         return [world for world in own if world.bodies][:MOST_WORLDS]
 
-    def let_go(self, number: int, deadline: float) -> None:
-        """Reset, and let every world go on without the environment, which leaves them unusable."""
+    def simulate_alone(self, number: int, deadline: float) -> None:
+        """Reset, and simulate every world without the environment, which leaves them unusable."""
         self.play(number, "none", 0, deadline)
         for logged in self._worlds.values():
             with contextlib.suppress(bullet().error):

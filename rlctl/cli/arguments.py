@@ -27,7 +27,7 @@ Set = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="Set a key, e.g. task.tolerance=0.02, randomize=true.")
 ]
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE", help="Write JSON too; - for stdout, alone.")]
-Seed = Annotated[int | None, typer.Option(help="Seed.", min=0)]
+EpisodeSeed = Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)]
 EnvTimeout = Annotated[float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1)]
 NEnvs = Annotated[int | None, typer.Option(help="Environments stepped side by side.", min=1)]
 Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]

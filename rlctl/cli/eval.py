@@ -10,6 +10,7 @@ import typer
 from rlctl.cli.arguments import (
     Checkpoint,
     EnvTimeout,
+    EpisodeSeed,
     Json,
     NEnvs,
     Pretrained,
@@ -37,10 +38,9 @@ def evaluate(
         ),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Episodes, each with its own seed.", min=1)] = 100,
-    seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    seed: EpisodeSeed = 0,
     stage: Annotated[
-        str | None,
-        typer.Option(metavar="N|all", help="Stage of the curriculum it was trained in.", show_default="the last"),
+        int | None, typer.Option(help="Stage of the curriculum it was trained in.", min=1, show_default="the last")
     ] = None,
     settings: Set = [],
     stochastic: Annotated[
@@ -74,8 +74,8 @@ def evaluate(
 ) -> None:
     """Say how good a policy is: success rate with its interval, returns, reward terms."""
     claim_stdout()
-    from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluations
-    from rlctl.eval.report import show_all
+    from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
+    from rlctl.eval.report import show
     from rlctl.run.directory import is_group
     from rlctl.run.group import read_group
 
@@ -98,11 +98,11 @@ def evaluate(
         if policy is not None or limits is not None:
             given = "--limits" if policy is None else "--policy"
             raise UsageError(f"{given} plays a task as it is: leave out --vary and --push")
-        from rlctl.eval.robustness_report import show
+        from rlctl.eval import robustness_report
         from rlctl.eval.vary import check_gates, measure_robustness
 
         robustness = measure_robustness(request, vary, push=push, yes=yes, gates=gates)
-        show(robustness, json)
+        robustness_report.show(robustness, json)
         return check_gates(robustness, gates)
     if run is not None and policy is None and is_group(Path(run)):
         from rlctl.eval import group
@@ -110,6 +110,6 @@ def evaluate(
         scores = group.evaluate_group(read_group(Path(run)), request)
         group.show(scores, json)
         return scores.check(gates)
-    results = run_evaluations(request, gates)
-    show_all(results, json)
-    return gates.check(*results)
+    result = run_evaluation(request, gates)
+    show(result, json)
+    return gates.check(result)

@@ -12,7 +12,16 @@ import typer
 from typer.core import TyperCommand
 
 from rlctl import completion
-from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Set, choose_checkpoint, claim_stdout, parse_changes
+from rlctl.cli.arguments import (
+    Checkpoint,
+    EpisodeSeed,
+    Json,
+    Pretrained,
+    Set,
+    choose_checkpoint,
+    claim_stdout,
+    parse_changes,
+)
 
 if TYPE_CHECKING:
     from rlctl.replay.replay import Choice
@@ -56,7 +65,7 @@ def replay(
     failures: Annotated[
         int | None, typer.Option(metavar="[N]", help="Up to N (1) that failed of --episodes, worst first.", min=1)
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    seed: EpisodeSeed = 0,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
     task: Annotated[

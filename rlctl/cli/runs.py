@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from rlctl.cli.arguments import TASK_FORMS, Json, Run, Set, claim_stdout, parse_changes
+from rlctl.cli.arguments import TASK_FORMS, EpisodeSeed, Json, Run, Set, claim_stdout, parse_changes
 from rlctl.errors import UsageError
 
 
@@ -76,7 +76,7 @@ def compare_runs(
         list[str], typer.Argument(metavar="A B...", help="Runs, globs or folders of runs; the first is the baseline.")
     ],
     episodes: Annotated[int, typer.Option(help="Episodes that each run plays.", min=2)] = 100,
-    seed: Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)] = 0,
+    seed: EpisodeSeed = 0,
     task: Annotated[str | None, typer.Option(help="Evaluate all on this task.")] = None,
     threshold: Annotated[
         float | None, typer.Option(help="Success rate (or return) to be reached soon; 0.9 where success is known.")

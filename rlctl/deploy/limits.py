@@ -1,4 +1,4 @@
-"""`limits.yaml`: what a robot may be told to do, by the names of its joints. Typed, every key checked."""
+"""`limits.yaml`: limits on the commands of a robot, by the names of its joints. Typed, every key checked."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Measured(Section):
 
 
 class Limits(Section):
-    """What a robot may be told to do."""
+    """Limits on the commands of a robot."""
 
     command: Literal["position", "step", "speed", "torque", "action"] = "action"
     """What an action commands: joint positions, steps from the present positions, speeds, torques, or anything."""

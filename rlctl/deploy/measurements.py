@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 _KEPT = 4096  # requests that quantiles are of
 
@@ -18,29 +17,26 @@ class Durations:
     """The last durations of something, for quantiles."""
 
     def __init__(self) -> None:
-        self._values: NDArray[np.float64] = np.zeros(_KEPT)
+        self._values: collections.deque[float] = collections.deque(maxlen=_KEPT)
         self.count = 0
         self.sum_s = 0.0
 
     def add(self, seconds: float) -> None:
         """Add one."""
-        self._values[self.count % _KEPT] = seconds
+        self._values.append(seconds)
         self.count += 1
         self.sum_s += seconds
 
     def quantiles(self) -> dict[str, float]:
         """Return p50 and p99 of the last ones [s]; zeros if there is none."""
-        values = self._values[: min(self.count, _KEPT)]
-        if not len(values):
-            return {"0.5": 0.0, "0.99": 0.0}
-        return dict(zip(("0.5", "0.99"), np.quantile(values, (0.5, 0.99)).tolist(), strict=True))
+        median, high = np.quantile(list(self._values) or [0.0], (0.5, 0.99)).tolist()
+        return {"0.5": median, "0.99": high}
 
 
 class Measurements:
     """Counts and durations of all clients together."""
 
     def __init__(self) -> None:
-        self.started_s = time.time()
         self.inference, self.request = Durations(), Durations()
         self.errors = self.deadline_misses = self.connections = self.refused = self.policy_changes = 0
         self.control_error = float("nan")

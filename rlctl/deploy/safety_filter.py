@@ -86,13 +86,13 @@ class SafetyFilter:
         self._ordered = False
         self._enter("stopped", reason)
 
-    def hold(self, reason: str = "told to hold") -> None:
+    def hold(self, reason: str = "hold ordered") -> None:
         """Keep the robot where it is until `resume`; a stop stays."""
         if self.state != "stopped":
             self._ordered, self._goes_home = True, False
             self._enter("holding", reason)
 
-    def home(self, reason: str = "told to go home") -> None:
+    def home(self, reason: str = "way home ordered") -> None:
         """Bring the robot home and keep it there until `resume`; a stop is left. Raises `UsageError` without a home."""
         if self._home is None:
             raise UsageError("no home is known: write home: [positions] into the limits file")

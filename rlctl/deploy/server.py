@@ -111,7 +111,7 @@ class PolicyServer:
             await asyncio.to_thread(self._recording.flush)
 
     async def check_watchdogs(self) -> None:
-        """Look after clients that fell silent, for ever."""
+        """Stop clients that send no observations any more; runs until it is cancelled."""
         period = max(self.posting.safety.control_dt or 1.0, _SHORTEST_TICK_S)
         while True:
             await asyncio.sleep(period)

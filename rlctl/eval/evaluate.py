@@ -33,8 +33,8 @@ class EvalRequest:
     episodes: int = 100
     seed: int = 0
     changes: EnvChanges = UNCHANGED
-    stage: str | None = None
-    """Stage of the curriculum, from 1, or `all`; None: the last."""
+    stage: int | None = None
+    """Stage of the curriculum, from 1; None: the last."""
     deterministic: bool = True
     n_envs: int | None = None
     env_timeout_s: float = 60.0
@@ -97,14 +97,9 @@ class Gates:
         if not has_success and (self.min_success is not None or self.min_success_lower is not None):
             raise UsageError("--min-success: this task reports no success (no is_success); use --min-return")
 
-    def check(self, *results: Evaluation) -> None:
-        """Raise `AnswerIsNo`, naming every gate that was missed; of several stages each must reach them."""
-        missed = []
-        for result in results:
-            stage = f"stage {result.spec.stage}: " if len(results) > 1 else ""
-            found = self.list_missed(result.success_rate, result.success_interval, result.returns.mean)
-            missed += [stage + each for each in found]
-        if missed:
+    def check(self, result: Evaluation) -> None:
+        """Raise `AnswerIsNo`, naming every gate that was missed."""
+        if missed := self.list_missed(result.success_rate, result.success_interval, result.returns.mean):
             raise AnswerIsNo("gate missed: " + "; ".join(missed))
 
     def list_missed(self, rate: float | None, interval: tuple[float, float] | None, mean_return: float) -> list[str]:
@@ -124,24 +119,18 @@ NO_GATES = Gates()
 
 def run_evaluation(request: EvalRequest, gates: Gates = NO_GATES) -> Evaluation:
     """Find the policy, play its episodes, and return their statistics."""
-    (evaluation,) = run_evaluations(request, gates)
-    return evaluation
-
-
-def run_evaluations(request: EvalRequest, gates: Gates = NO_GATES) -> list[Evaluation]:
-    """Find the policy and evaluate it as `run_evaluation` does, in every stage that was asked for, with equal seeds."""
     if request.baseline is not None:
-        return [_evaluate(load_baseline(request), choose_task(request), request, gates)]
-    _, policy, specs = find_player(request)
-    return [_evaluate(policy, spec, request, gates) for spec in specs]
+        return _evaluate(load_baseline(request), choose_task(request), request, gates)
+    _, policy, spec = find_player(request)
+    return _evaluate(policy, spec, request, gates)
 
 
-def find_player(request: EvalRequest) -> tuple[lookup.FoundPolicy, LoadedPolicy, list[EnvSpec]]:
+def find_player(request: EvalRequest) -> tuple[lookup.FoundPolicy, LoadedPolicy, EnvSpec]:
     """Find and read the policy of a request, and what it is to be evaluated on."""
     found = lookup.find_policy(request.run, request.checkpoint)
     output.print_notes(found.notes)
     policy = load_player(found.file, request.deterministic)
-    return found, policy, [found.locate(spec) for spec in choose_specs(policy.info, request)]
+    return found, policy, found.locate(choose_spec(policy.info, request))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,26 +168,20 @@ def load_player(path: Path, deterministic: bool) -> LoadedPolicy:
     return LoadedPolicy(path, info, tensors)
 
 
-def choose_specs(info: PolicyInfo, request: EvalRequest) -> list[EnvSpec]:
-    """Return what to evaluate on: the policy's task or another, with changes, or the stages that were asked for."""
-    if request.stage is None:
-        return [info.derive_spec(request.task, request.changes)]
+def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:
+    """Return what to evaluate on: the policy's task or another, with changes, or the stage that was asked for."""
+    if (stage := request.stage) is None:
+        return info.derive_spec(request.task, request.changes)
     if request.task is not None and request.task != info.spec.task:
         raise UsageError(
             f"--stage: stages are those of {info.spec.task}, which the policy was trained on; leave out --task"
         )
     if not info.stages:
-        raise UsageError(f"--stage {request.stage}: this policy was trained without stages; leave out --stage")
-    if request.stage == "all":
-        numbers = list(range(1, len(info.stages) + 1))
-    elif request.stage.isdecimal() and 1 <= int(request.stage) <= len(info.stages):
-        numbers = [int(request.stage)]
-    else:
-        raise UsageError(
-            f"--stage {request.stage}: this policy was trained in {len(info.stages)} stages; "
-            f"give a number from 1 to {len(info.stages)}, or all"
-        )
-    return [request.changes.apply(info.stages[number - 1]) for number in numbers]
+        raise UsageError(f"--stage {stage}: this policy was trained without stages; leave out --stage")
+    if not 1 <= stage <= len(info.stages):
+        count = len(info.stages)
+        raise UsageError(f"--stage {stage}: this policy was trained in {count} stages; give a number from 1 to {count}")
+    return request.changes.apply(info.stages[stage - 1])
 
 
 def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:

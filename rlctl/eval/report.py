@@ -4,56 +4,13 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 from rlctl import output
-from rlctl.env_spec import EnvSpec
 from rlctl.eval.evaluate import Evaluation
 from rlctl.eval.statistics import Spread
 from rlctl.run.env_info import describe_randomization
 from rlctl.run.policy import collect_versions
-
-
-def show_all(results: Sequence[Evaluation], json: str | None) -> None:
-    """Print the numbers, or JSON alone for `-`; those of several stages as a table."""
-    if len(results) == 1:
-        show(results[0], json)
-        return
-    content = {"stages": [as_json(result) for result in results]}
-    if json is not None and output.write_result_json(json, content):
-        return
-    _show_stages(results)
-
-
-def _show_stages(results: Sequence[Evaluation]) -> None:
-    _show_head(results[0])
-    specs = [each.spec for each in results]
-    rows = [
-        (
-            str(result.spec.stage),
-            "-" if result.success_rate is None else f"{result.success_rate:.1%}",
-            "-" if (interval := result.success_interval) is None else f"{interval[0]:.1%} to {interval[1]:.1%}",
-            f"{result.returns.mean:.4g}",
-            f"{result.lengths.mean:.4g}",
-            _describe_changes(result.spec, specs),
-        )
-        for result in results
-    ]
-    output.print_table(("stage", "success", "95 % interval", "return", "length", "changes"), rows, left=("changes",))
-
-
-def _describe_changes(spec: EnvSpec, specs: Sequence[EnvSpec]) -> str:
-    """Name what is not the same in all stages."""
-    parts = []
-    for field in ("parameters", "reward_weights", "events"):
-        for name in dict.fromkeys(name for each in specs for name in getattr(each, field)):
-            values = [getattr(each, field).get(name) for each in specs]
-            if any(value != values[0] for value in values):
-                value = getattr(spec, field).get(name)
-                parts.append(f"{name} {'as it is' if value is None else value}")
-    levels = {each.level for each in specs}
-    return ", ".join([*parts, *([f"level {spec.level:g}"] if len(levels) > 1 else [])])
 
 
 def show(result: Evaluation, json: str | None) -> None:

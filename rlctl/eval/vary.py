@@ -61,11 +61,9 @@ def measure_robustness(
     `vary` is `NAME=LOWEST:HIGHEST:VALUES`, one or two, or `all`; `yes` begins a long measurement without asking.
     Random changes that the policy was trained with do not act, unless the request's own changes say so.
     """
-    if request.stage == "all":
-        raise UsageError("--stage all: --vary and --push measure one stage")
     if request.changes.randomize is None:
         request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
-    found, policy, (spec,) = find_player(request)
+    found, policy, spec = find_player(request)
     maps = axes_of.read_axes(vary, spec) if vary else []
     cells = axes_of.count_cells(maps)  # raises for too many, before one is played
     with start_workers(spec, request) as workers:

@@ -147,7 +147,7 @@ class RunDirectory:
 
 
 class RunLock:
-    """Keeps a second process from writing a run; the system lets go of it when the process ends, however it ends."""
+    """Keeps a second process from writing a run; the system releases it when the process ends, however it ends."""
 
     def __init__(self, folder: Path) -> None:
         self.keeps_out = True

@@ -37,7 +37,7 @@ class EnvInfo(pydantic.BaseModel):
     """Random changes that the task offers, and whether each acts."""
     has_success: bool = False
     has_compute_reward: bool = False
-    """Whether it can say what a step would have been worth, had another goal been wanted."""
+    """Whether it can compute the reward of a step for another goal than the wanted one."""
     max_steps: int | None = None
     robot: str = ""
     joints: Joints | None = None

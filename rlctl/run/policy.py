@@ -113,7 +113,7 @@ def encode_policy(info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> bytes:
 
 
 def compute_digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
-    """Return the sha256 of what a policy file says: a disk may give back other bits, and they load as well."""
+    """Return the sha256 of what a policy file says: a disk may return other bits, and they load as well."""
     content = hashlib.sha256(info.encode())
     for name, values in sorted(tensors.items()):
         content.update(f"{name} {values.dtype} {values.shape}".encode())

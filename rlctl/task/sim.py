@@ -84,7 +84,7 @@ class Sim(Constraints):
         `position` [m], `orientation` and `fixed` are for URDF: the others say themselves where a body is and whether
         it is fixed. `flags` are PyBullet's URDF_* flags. `self_collision` lets links collide that are not each
         other's ancestors. `inertia` of a URDF's links is what the file says, or that of their collision shapes with
-        the file's masses, for a file whose values are no good: see `rlctl.task.inertia`.
+        the file's masses, for a file whose values are wrong: see `rlctl.task.inertia`.
         """
         path = Path(file)
         if not path.is_absolute() and not path.exists():

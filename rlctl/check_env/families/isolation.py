@@ -1,4 +1,4 @@
-"""RL4: instances do not touch each other, and give back what they take."""
+"""RL4: instances do not influence each other, and release what they acquire."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def watch_worlds(context: Context) -> Iterator[Message]:
                 yield describe_failure(error, context.progress)
         if logger.worlds and context.budget.seconds_left > 0:
             with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
-                logger.let_go(len(EPISODES), context.budget.deadline)
+                logger.simulate_alone(len(EPISODES), context.budget.deadline)
     if not logger.resets:
         raise NotJudged("no episode could be logged")
     if not logger.worlds:

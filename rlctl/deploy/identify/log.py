@@ -29,7 +29,7 @@ LEAST_ROWS = 20
 
 @dataclasses.dataclass(frozen=True)
 class Log:
-    """What a robot was told and what it did: a row per control step.
+    """The commands that a robot got and what was measured: a row per control step.
 
     `positions[t]` and `velocities[t]` were measured when `actions[t]` was commanded.
     """

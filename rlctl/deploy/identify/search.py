@@ -145,7 +145,7 @@ def search(
 
 
 def _take_costs(found: Any) -> list[float]:
-    # A world that came apart costs more than any other.
+    # A simulation that diverged costs more than any other.
     return [cost if np.isfinite(cost) else np.inf for cost in found]
 
 

@@ -54,7 +54,7 @@ def stands_still(run: History) -> str | None:
     return f"actions are {largest:.1%} of their half range on average"
 
 
-def paid_for_being(run: History) -> str | None:
+def mostly_constant_reward(run: History) -> str | None:
     """Most of the positive reward is paid alike in every step, whatever is done."""
     weights = run.env.reward_weights if run.env is not None else {}
     shares = [share for each in run.episodes if (share := _constant_share(each, weights)) is not None]

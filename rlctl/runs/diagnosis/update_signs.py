@@ -12,7 +12,7 @@ _MOST_NORMALIZED_REWARD = 10.0
 """Where SB3's `VecNormalize` clips."""
 
 
-def critic_blind(run: History) -> str | None:
+def critic_explains_nothing(run: History) -> str | None:
     """The value function explains nothing of the returns."""
     explained = run.curve("explained_variance")
     if len(explained) < LEAST_ROWS:
@@ -86,7 +86,7 @@ def _read_change(run: History) -> _Change | None:
     return _Change(*(float(np.median(values)) for values in early)) if min(map(len, early)) >= LEAST_ROWS else None
 
 
-def exploration_gone(run: History) -> str | None:
+def exploration_vanishes(run: History) -> str | None:
     """The policy has become all but deterministic with half of the training to go, or was so from the beginning."""
     curve = _exploration(run)
     if len(curve) < LEAST_ROWS:
