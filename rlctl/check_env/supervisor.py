@@ -58,8 +58,8 @@ class Child:
             arguments,
             stdout=self._readers[0].descriptor,
             stderr=self._readers[1].descriptor,
-            descriptors=[self._memory],
-            environment={"PYTHONHASHSEED": str(families.PROCESSES[name].hash_seed)},
+            pass_fds=[self._memory],
+            env={"PYTHONHASHSEED": str(families.PROCESSES[name].hash_seed)},
         )
         for reader in self._readers:
             reader.close_descriptor()

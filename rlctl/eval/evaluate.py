@@ -220,7 +220,7 @@ def _play(workers: Workers, request: EvalRequest) -> list[Episode]:
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
     exploration = Exploration(stochastic=not request.deterministic)
     with output.show_progress("evaluating", len(seeds)) as show:
-        return play_episodes(workers, seeds, exploration, record=request.measure_actions, on_episode=show)
+        return play_episodes(workers, seeds, exploration, record=request.measure_actions, watch=show)
 
 
 def _summarize(

@@ -55,21 +55,14 @@ def set_start(start: StartProcess) -> None:
 class ChildProcess:
     """A process that runs `main(connection, **arguments)` of a module; `close` kills it and all that it has started.
 
-    It also ends, with its group, when its parent does. `environment` goes over the variables of this process; numeric
-    libraries get one thread. `descriptors` stay open under the same numbers. Raises `OSError` if it cannot be started.
+    It also ends, with its group, when its parent does; numeric libraries get one thread. Raises `OSError` if it cannot
+    be started.
     """
 
-    def __init__(
-        self,
-        main: str,
-        arguments: Mapping[str, Any],
-        *,
-        stdout: int,
-        stderr: int,
-        descriptors: Sequence[int] = (),
-        environment: Mapping[str, str] | None = None,
-    ) -> None:
-        """`main` is "package.module:function"; `arguments` are what JSON can hold."""
+    def __init__(self, main: str, arguments: Mapping[str, Any], **options: Any) -> None:
+        """`main` is "package.module:function"; `arguments` are what JSON can hold; `options` are those of
+        `subprocess.Popen`, of which `pass_fds` and `env` are added to what every child gets.
+        """
         ours, theirs = socket.socketpair()
         # A pipe that nobody writes to: its end shows the child that this process is gone.
         lifeline, self._lifeline = os.pipe()
@@ -80,16 +73,15 @@ class ChildProcess:
             "connection": theirs.fileno(),
             "lifeline": lifeline,
         }
+        options["pass_fds"] = (theirs.fileno(), lifeline, *options.get("pass_fds", ()))
+        options["env"] = {**os.environ, **_ONE_THREAD, **options.get("env", {})}
         try:
             with theirs, open(lifeline, "rb"), _block_signals():
                 self.process = start_process(
                     [sys.executable, "-c", _BOOTSTRAP, json.dumps(job)],
-                    pass_fds=(theirs.fileno(), lifeline, *descriptors),
                     stdin=subprocess.DEVNULL,
-                    stdout=stdout,
-                    stderr=stderr,
-                    env={**os.environ, **_ONE_THREAD, **(environment or {})},
                     process_group=0,  # so that what an environment starts can be ended with it
+                    **options,
                 )
         except BaseException:
             ours.close()

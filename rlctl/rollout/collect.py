@@ -49,14 +49,13 @@ def play_episodes(
     exploration: Exploration = Exploration(),  # noqa: B008 (it cannot change)
     *,
     record: bool = False,
-    on_episode: Callable[[int], None] | None = None,
-    check: Callable[[], None] | None = None,
+    watch: Callable[[int], None] = lambda done: None,
 ) -> list[Episode]:
     """Play an episode per seed with the workers' policy and return them in the order of `seeds`.
 
     Each worker plays in its first environment. Which one plays which episode does not matter: an episode follows from
-    its seed and the policy alone. `on_episode` is called with the number of episodes done, and `check` several times a
-    second; it may raise to leave, and the workers have to be closed then.
+    its seed and the policy alone. `watch` is called with the number of episodes done, several times a second; it may
+    raise to leave, and the workers have to be closed then.
     """
     steps = min(workers.info.max_steps or _SEGMENT, _SEGMENT)
     terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms
@@ -81,7 +80,9 @@ def play_episodes(
     while running:
         before = workers.playing
         try:
-            ended = {result.env: result for result in workers.finish_playing(first=True, check=check)}
+            ended = {
+                result.env: result for result in workers.finish_playing(first=True, check=lambda: watch(len(episodes)))
+            }
         except EpisodeFailed as error:
             if record and error.env in running:
                 error.actions = running[error.env].failed_actions(workers, error)
@@ -96,9 +97,8 @@ def play_episodes(
                 continue
             del running[env]
             episodes[recorder.index] = Episode(result, recorder.finish())
-            if on_episode:
-                on_episode(len(episodes))
             begin(env)
+    watch(len(episodes))
     return [episodes[index] for index in range(len(seeds))]
 
 

@@ -38,7 +38,11 @@ class ProcessPool:
         self._output = LineReader(self._printed.line, MAX_LINE_BYTES)
         try:
             for job in jobs:
-                self._processes.append(_start_process(job, self._output.descriptor))
+                printing, passed = self._output.descriptor, (job.memory, job.numbers)
+                options = {"stdout": printing, "stderr": printing, "pass_fds": passed}
+                self._processes.append(
+                    ChildProcess("rlctl.rollout.worker:main", {"job": dataclasses.asdict(job)}, **options)
+                )
         except BaseException:
             self.close(grace_s=0.0)
             raise
@@ -110,13 +114,3 @@ class ProcessPool:
         self._progress = bytes  # or it would hold its owner, and the memory that this maps
         self._output.wait()
         self._printed.end()
-
-
-def _start_process(job: Job, printing: int) -> ChildProcess:
-    return ChildProcess(
-        "rlctl.rollout.worker:main",
-        {"job": dataclasses.asdict(job)},
-        stdout=printing,
-        stderr=printing,
-        descriptors=(job.memory, job.numbers),
-    )

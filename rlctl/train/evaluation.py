@@ -58,7 +58,7 @@ class Evaluator:
         try:
             workers.set_policy(info, tensors)
             exploration = Exploration(stochastic=not settings.deterministic)
-            return play_episodes(workers, seeds, exploration, record=True, check=check)
+            return play_episodes(workers, seeds, exploration, record=True, watch=lambda _: check())
         except Exception:
             self.close()
             raise

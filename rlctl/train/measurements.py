@@ -229,7 +229,8 @@ def training_row(recent: Sequence[EpisodeResult], terms: Iterable[str], log: Map
 
 def tensorboard_values(row: Mapping[str, Any]) -> dict[str, float]:
     """Return what TensorBoard gets of a row of metrics, by its tags, beside what SB3 and `measurements` log."""
-    tags = {"distance": "rollout/final_distance", "stage": "curriculum/stage"}
+    tags = {"return": "rollout/ep_rew_mean", "length": "rollout/ep_len_mean", "success": "rollout/success_rate"}
+    tags |= {"distance": "rollout/final_distance", "stage": "curriculum/stage"}
     tags |= {name: f"reward_terms/{name.removeprefix('term/')}" for name in row if name.startswith("term/")}
     return {tag: row[name] for name, tag in tags.items() if row.get(name) is not None}
 

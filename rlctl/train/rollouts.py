@@ -13,7 +13,6 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.run.policy import PolicyInfo
 from rlctl.run.recipe import Recipe
@@ -109,21 +108,13 @@ class Rollouts(abc.ABC):
         return normalized
 
     def finish_segment(self, segment: SegmentArrays) -> None:
-        """Take the observations of a stored segment into account, and remember which episodes it ended."""
+        """Take the observations of a stored segment into account."""
         model = self.model
         for key, rms in observation_statistics(model.get_vec_normalize_env()).items():
             rows = segment.observation[key][:, 1:]
             rms.update(rows.reshape(-1, *rows.shape[2:]))
         model._last_episode_starts = segment.done[:, -1]
-        infos = [_info_at_end(each) for each in segment.ended]
-        model._update_info_buffer(infos, np.ones(len(infos), np.bool_))
         model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
-
-
-def _info_at_end(result: EpisodeResult) -> dict[str, Any]:
-    """Return what SB3 expects in an episode's last info."""
-    success = {} if result.success is None else {"is_success": result.success}
-    return {"episode": {"r": result.total_reward, "l": result.length, "t": 0.0}, **success}
 
 
 def to_network_layout(rows: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:

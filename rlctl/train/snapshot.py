@@ -6,7 +6,6 @@ The environments' part is in `checkpoint.py`, the replay buffer's in `replay_seg
 from __future__ import annotations
 
 import random
-from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +41,6 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
         "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
         "parameters": structure,
         "randomness": {"python": _python_state(), "action_space": model.action_space.np_random.bit_generator.state},
-        "episodes": list(model.ep_info_buffer or ()),
-        "successes": [bool(each) for each in model.ep_success_buffer or ()],
     }
     return tensors, plain
 
@@ -59,8 +56,6 @@ def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> No
         for name in _COUNTERS:  # no other: a file does not choose what is set
             if name in plain["counters"]:
                 setattr(model, name, plain["counters"][name])
-        model.ep_info_buffer = deque(plain["episodes"], maxlen=model._stats_window_size)
-        model.ep_success_buffer = deque(plain["successes"], maxlen=model._stats_window_size)
         _restore_randomness(model, tensors, plain)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise ArtifactError(f"does not fit this recipe: {' '.join(str(error).split())[:200]}") from None

@@ -40,7 +40,7 @@ def started():
             arguments,
             stdout=reader.descriptor,
             stderr=reader.descriptor,
-            environment={"PYTHONHASHSEED": "7"},
+            env={"PYTHONHASHSEED": "7"},
         )
         reader.close_descriptor()
         children.append(child)

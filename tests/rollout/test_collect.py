@@ -56,8 +56,9 @@ def test_equal_on_any_number_of_environments(spec, start, expected, n_envs):
 def test_progress_is_reported_and_workers_can_be_used_again(spec, start):
     workers = start(spec("Walk"), 3)
     done = []
-    first = play(workers, on_episode=done.append)
-    assert done == list(range(1, 11))
+    first = play(workers, watch=done.append)
+    assert done == sorted(done)
+    assert done[-1] == 10
     assert first[0].trajectory is None
     # In the middle of other episodes: they are dropped.
     workers.reset({0: 1, 1: 2})
@@ -125,13 +126,13 @@ def test_samples_follow_from_the_episode_and_the_step(spec, start):
 
 
 def test_leaving_while_episodes_are_played(spec, start):
-    def leave():
+    def leave(done):
         raise InterruptedError
 
     workers = start(spec("Walk"), 2)
     workers.set_policy(*linear(workers.info, TOWARDS_ZERO))
     with pytest.raises(InterruptedError):
-        play_episodes(workers, SEEDS, check=leave)
+        play_episodes(workers, SEEDS, watch=leave)
 
 
 def test_the_actions_of_an_episode_that_fails_are_known(spec, start):
