@@ -64,16 +64,6 @@ class OneByOne(Goal):
         return -float(np.linalg.norm(achieved_goal - desired_goal))
 
 
-class ArrayReward(Goal):
-    """Returns an array for a single goal too, as an environment made for batches may."""
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        return np.atleast_1d(super().compute_reward(achieved_goal, desired_goal, info))
-
-    def reward(self):
-        return self.compute_reward(self.position, self.goal, {}).item()
-
-
 class NumberlessReward(Goal):
     def compute_reward(self, achieved_goal, desired_goal, info):
         return "far"

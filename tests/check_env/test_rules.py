@@ -60,7 +60,6 @@ CASES = [
     case("broken_envs.py:NanReward", ("RL601", "error")),
     case("broken_goals.py:OtherReward", ("RL614", "error"), twin="broken_goals.py:Goal"),
     case("broken_goals.py:OneByOne", ("RL614", "error"), twin="broken_goals.py:RoundedReward"),
-    case("broken_goals.py:ArrayReward", ("RL614", "warning")),
     case("broken_goals.py:NumberlessReward", ("RL614", "error"), twin="broken_goals.py:NestedGoal"),
 ]
 
