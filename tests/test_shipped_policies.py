@@ -11,6 +11,7 @@ from rlctl.eval.score import measure_score
 from rlctl.export.policy_file import export_actor
 from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo
+from rlctl.run.lookup import find_policy
 from rlctl.run.policy import PolicyInfo, read_info, read_policy, save_policy
 from rlctl.run.recipe_sources import resolve_packaged
 from rlctl.run.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
@@ -46,6 +47,12 @@ def check_score(task: str, info: PolicyInfo, episodes: int = 20) -> None:
 )
 def test_a_shipped_policy_scores_what_its_metadata_says(task):
     check_score(task, read_info(find_shipped_policy(task)))
+
+
+@pytest.mark.parametrize("task", OURS)
+def test_the_file_of_a_task_is_as_its_policy_was_exported(task):
+    """Or each `--pretrained` warns."""
+    assert not [note for note in find_policy(task, "pretrained").notes if "warning" in note]
 
 
 def test_a_task_that_has_changed_is_noticed():

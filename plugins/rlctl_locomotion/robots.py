@@ -58,7 +58,7 @@ class HalfCheetah(Locomotion):
 
     def stands(self, height: float, pitch: float) -> bool:
         """The pitch is below 1 rad, and only feet touch the floor."""
-        _, fshin, fthigh, _, bshin, bthigh = self.last_feet_contact.tolist()
+        _, fshin, fthigh, _, bshin, bthigh = self.last_feet_contact
         return abs(pitch) < 1.0 and not (fshin or fthigh or bshin or bthigh)
 
     def is_terminated(self) -> bool:

@@ -98,8 +98,9 @@ def format_agreement(agreement: Agreement) -> str:
 def format_closed_loop(loop: ClosedLoop) -> str:
     """Return the comparison of whole episodes, in a line."""
     episodes = output.format_count(loop.episodes, "episode")
-    return (
+    text = (
         f"{episodes}: success same in {loop.same_success}, length in {loop.same_length}, "
         f"return within {loop.max_return_difference:.1e} "
         f"(mean {loop.mean_return:.5g} and {loop.mean_return_exported:.5g})"
     )
+    return f"{text}; the policy itself differs as much with other last bits" if loop.magnified else text

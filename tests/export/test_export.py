@@ -10,7 +10,7 @@ import pytest
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.export.export import export_policy
-from rlctl.export.report import show
+from rlctl.export.report import format_closed_loop, show
 from rlctl.export.verify import Comparison, compare_episodes, verify
 from rlctl.rollout.collect import Episode
 from rlctl.rollout.messages import EpisodeResult
@@ -107,6 +107,15 @@ def test_not_verified_is_not_kept(small, train, write, tmp_path):
     assert "20 episodes: success same in 20, length in 20, return within " in loop
     assert [each.name for each in target.parent.iterdir()] == ["policy.onnx"]
     assert target.read_bytes() == b"former"
+
+
+def test_an_environment_that_magnifies_rounding_is_verified_by_its_actions(small, train, write):
+    spec = small(factor=100.0)
+    report = export(write(train("ppo", spec, steps=0), "ppo", spec))
+    assert report.agreement.beyond_limit == 0
+    assert report.closed_loop.magnified
+    assert not report.closed_loop.agrees
+    assert "; the policy itself differs as much with other last bits" in format_closed_loop(report.closed_loop)
 
 
 def test_other_weights_are_noticed(small, train, write, tmp_path):
