@@ -96,6 +96,14 @@ SMOOTH = np.column_stack([np.sin(np.arange(100) / 20), np.cos(np.arange(100) / 2
 SHAKING = np.tile([[0.8, -0.8], [-0.8, 0.8]], (50, 1))
 
 
+STANDING = {"return": np.minimum(20.0 * np.arange(UPDATES), 200.0), "success": None}
+
+
+def survive(speed):
+    """Return an episode in which progress pays `speed` on average, and being alive 1."""
+    return make_episode(SMOOTH, terms=np.column_stack([np.ones(100), speed * (1 + SMOOTH[:, 0])]))
+
+
 def ids(run, grade=None):
     return [each.id for each in diagnose(run) if grade in (None, each.grade)]
 
@@ -127,12 +135,22 @@ def test_saturated_actions_of_a_policy_that_still_learns_are_no_finding(write_tr
     assert diagnose(write_training({"success": 0.0, "action_saturation": 0.9})) == []
 
 
+def test_constant_return_of_a_robot_that_walks_is_no_finding(write_training):
+    assert diagnose(write_training(STANDING, episodes=[survive(1.0)])) == []
+
+
+def test_standing_that_still_gets_longer_is_no_finding(write_training):
+    longer = {**STANDING, "length": np.linspace(20, 120, UPDATES)}
+    assert diagnose(write_training(longer, episodes=[survive(0.02)])) == []
+
+
 @pytest.mark.parametrize(
     ("id", "metrics", "more"),
     [
         ("Q1", {**FLAT, "length": np.tile([12, 11, 13], 10), "terminated": 1.0}, {}),
         ("Q1", FLAT, {"episodes": [make_episode(0.001 * SMOOTH)]}),
         ("Q1", {**FLAT, "approx_kl": 1e-6, "clip_fraction": 0.0}, {}),
+        ("Q1", STANDING, {"episodes": [survive(0.02)]}),
         ("Q2", {"success": 0.0, "distance": np.linspace(0.2, 0.9, UPDATES)}, {}),
         ("Q2", {"success": 0.0}, {"episodes": [make_episode(SHAKING, terms=np.eye(100, 2))]}),
         ("Q3", {"return": np.tile([0.0, 90.0, 10.0], 10), "approx_kl": 0.6, "clip_fraction": 0.7}, {}),

@@ -56,9 +56,18 @@ def stands_still(run: History) -> str | None:
 
 def mostly_constant_reward(run: History) -> str | None:
     """Most of the positive reward is paid alike in every step, whatever is done."""
+    return _describe_constant_reward(run, 0.7)
+
+
+def only_constant_reward(run: History) -> str | None:
+    """Next to all of the positive reward is paid alike in every step."""
+    return _describe_constant_reward(run, 0.9)
+
+
+def _describe_constant_reward(run: History, least: float) -> str | None:
     weights = run.env.reward_weights if run.env is not None else {}
     shares = [share for each in run.episodes if (share := _constant_share(each, weights)) is not None]
-    if not shares or (share := float(np.median(shares))) < 0.7:
+    if not shares or (share := float(np.median(shares))) < least:
         return None
     return f"{share:.0%} of the positive reward is the same in every step"
 

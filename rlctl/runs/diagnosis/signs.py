@@ -35,6 +35,19 @@ def flat(run: History) -> str | None:
     return "; ".join(parts)
 
 
+def no_longer_rises(run: History) -> str | None:
+    """Evaluations last as long as they can, and their return is hardly above that of the middle of the training."""
+    returns, lengths = run.evaluation_curve("return"), run.evaluation_curve("length")
+    if len(returns) < _LEAST_EVALUATIONS or run.progress < 0.5 or run.is_good:
+        return None
+    limit = run.env.max_steps if run.env is not None else None
+    third = len(returns) // 3
+    before, last = float(returns.values[third:-third].mean()), float(returns.values[-third:].mean())
+    if limit is None or lengths.values[-third:].mean() < 0.9 * limit or last - before > 0.1 * abs(last):
+        return None
+    return f"evaluations return {before:.4g} in the middle third and {last:.4g} in the last"
+
+
 def _rank_correlation(curve: Curve) -> float:
     ranks = np.argsort(np.argsort(curve.values))
     if np.ptp(curve.values) <= 1e-9 * max(1.0, float(np.abs(curve.values).max())):
