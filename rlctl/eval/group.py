@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from pydantic_core import to_jsonable_python
+
 from rlctl import output
 from rlctl.errors import AnswerIsNo, ArtifactError, RlctlError
 from rlctl.eval.evaluate import EvalRequest, Gates
@@ -110,13 +112,7 @@ def _list_cells(each: SeedScore) -> tuple[str, ...]:
 
 def as_json(result: GroupScore) -> dict[str, Any]:
     """Return the scores as plain data."""
-    spreads = {name: result.spread(key) for name, key in (("success", "success"), ("return", "mean_return"))}
-    return {
-        "group": str(result.group.path),
-        "task": result.group.task,
-        "seeds": [
-            {**dataclasses.asdict(each), "score": None if each.score is None else each.score.model_dump(mode="json")}
-            for each in result.seeds
-        ],
-        **{name: None if spread is None else dataclasses.asdict(spread) for name, spread in spreads.items()},
-    }
+    spreads = {"success": result.spread("success"), "return": result.spread("mean_return")}
+    content = {"group": result.group.path, "task": result.group.task, "seeds": result.seeds, **spreads}
+    plain: dict[str, Any] = to_jsonable_python(content)
+    return plain

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 from typing import Any
+
+from pydantic_core import to_jsonable_python
 
 from rlctl import output
 from rlctl.eval.evaluate import Evaluation
@@ -79,18 +80,12 @@ def _format_spread(spread: Spread) -> tuple[str, ...]:
 
 def as_json(result: Evaluation) -> dict[str, Any]:
     """Return the result as plain data."""
-    info = result.policy
-    return {
-        "task": {"name": result.spec.task, "parameters": dict(result.spec.parameters)},
-        **({"stage": result.spec.stage} if result.spec.stage else {}),
-        "policy": {"baseline": result.name}
-        if info is None
-        else {
-            "file": result.name,
-            "algo": info.algo,
-            "training_steps": info.training_steps,
-            "versions": info.versions,
-        },
+    info, policy = result.policy, {"baseline": result.name}
+    if info is not None:
+        policy = {"file": result.name, **info.model_dump(include={"algo", "training_steps", "versions"})}
+    content = {
+        "task": {"name": result.spec.task, "parameters": result.spec.parameters},
+        "policy": policy,
         "versions": collect_versions(),
         "randomized": any(result.events.values()),
         "events": result.events,
@@ -98,32 +93,31 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         "deterministic": result.deterministic,
         "success_rate": result.success_rate,
         "success_interval": result.success_interval,
-        "return": dataclasses.asdict(result.returns),
-        "length": dataclasses.asdict(result.lengths),
+        "return": result.returns,
+        "length": result.lengths,
         "terms": result.terms,
-        "final_distance": dataclasses.asdict(result.final_distance) if result.final_distance else None,
-        **(
-            {
-                "limits": {
-                    "file": str(result.limited_by),
-                    "success_rate_without": unlimited.success_rate,
-                    "return_without": dataclasses.asdict(unlimited.returns),
-                    "interventions": dict(count_interventions(result)),
-                }
-            }
-            if (unlimited := result.unlimited) is not None
-            else {}
-        ),
+        "final_distance": result.final_distance,
         "episodes": [
             {
                 "index": index,
-                "seed": episode.result.seed,
-                "success": episode.result.success,
-                "return": episode.result.total_reward,
-                "length": episode.result.length,
-                "terms": episode.result.terms,
-                "final_distance": episode.result.final_distance,
+                "seed": each.seed,
+                "success": each.success,
+                "return": each.total_reward,
+                "length": each.length,
+                "terms": each.terms,
+                "final_distance": each.final_distance,
             }
-            for index, episode in enumerate(result.episodes)
+            for index, each in enumerate(episode.result for episode in result.episodes)
         ],
     }
+    if result.spec.stage:
+        content["stage"] = result.spec.stage
+    if (unlimited := result.unlimited) is not None:
+        content["limits"] = {
+            "file": result.limited_by,
+            "success_rate_without": unlimited.success_rate,
+            "return_without": unlimited.returns,
+            "interventions": count_interventions(result),
+        }
+    plain: dict[str, Any] = to_jsonable_python(content)
+    return plain

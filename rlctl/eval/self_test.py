@@ -15,6 +15,7 @@ from rlctl import output
 from rlctl.deploy.serve import make_loop, serve_until
 from rlctl.deploy.server import PolicyServer
 from rlctl.errors import AnswerIsNo
+from rlctl.eval import report
 from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
 from rlctl.rollout.workers import available_cores
 
@@ -131,19 +132,6 @@ def show(result: SelfTest, json: str | None) -> None:
 
 
 def as_json(result: SelfTest) -> dict[str, Any]:
-    """Return a self-test as plain data."""
-    return {
-        "success_rate": result.served.success_rate,
-        "success_rate_without_server": result.direct.success_rate,
-        "success_interval_without_server": result.direct.success_interval,
-        "return": result.served.returns.mean,
-        "return_without_server": result.direct.returns.mean,
-        "control_dt": result.control_dt,
-        "round_trip_p50_s": result.round_trip_p50_s,
-        "round_trip_p99_s": result.round_trip_p99_s,
-        "requests": result.requests,
-        "deadline_misses": result.misses,
-        "not_running": result.not_running,
-        "load": result.load,
-        "problems": result.list_problems(),
-    }
+    """Return a self-test as plain data, with both evaluations as `rlctl eval` writes them."""
+    evaluations = {name: report.as_json(getattr(result, name)) for name in ("direct", "served")}
+    return {**vars(result), **evaluations, "problems": result.list_problems()}

@@ -90,5 +90,5 @@ def test_self_test_of_an_exported_policy(rlctl, tmp_path):
     assert rlctl("export", "reach", "--pretrained", "--onnx", "-o", "policy.onnx").returncode == 0
     done = rlctl("serve", "policy.onnx", "--self-test", "--episodes", 10, "--json", "-", timeout=300)
     content = json.loads(done.stdout)
-    assert content["success_rate"] == content["success_rate_without_server"] == 1.0
+    assert content["served"]["success_rate"] == content["direct"]["success_rate"] == 1.0
     assert (done.returncode == 0) == (content["problems"] == [])
