@@ -30,6 +30,10 @@ def show(result: Evaluation, json: str | None) -> None:
         rows.append(("final distance", *_format_spread(result.final_distance)))
     rows += [(f"term {name}", f"{mean:.4g}") for name, mean in result.terms.items()]
     output.print_table(("", "mean", "IQM", "std", "min", "max"), rows, left=("",))
+    reports = [episode.result.report for episode in result.episodes]
+    if held := sum(report.get("not_running", 0) for report in reports):
+        answers = sum(len(report["round_trips_s"]) for report in reports)
+        out.print(f"the server was holding or stopped in {held:,} of {answers:,} answers: not the policy's own actions")
     if result.unlimited is not None:
         _show_limits(result, result.unlimited)
 

@@ -66,6 +66,15 @@ def test_through_a_server_it_is_the_same(reach_server):
     assert len(served.episodes[0].result.report["round_trips_s"]) == served.episodes[0].result.length
 
 
+def test_a_server_that_does_not_run_its_policy_is_said_to(reach_server, rlctl):
+    reach_server.post("/stop")
+    try:
+        done = rlctl("eval", "reach", "--policy", f"ws://{reach_server.address}", "--episodes", 1)
+    finally:
+        reach_server.post("/resume")
+    assert "the server was holding or stopped in 120 of 120 answers: not the policy's own" in done.stdout
+
+
 def test_a_server_that_is_not_there_or_of_another_task(reach_server):
     with pytest.raises(UsageError, match="no policy server answers"):
         run_evaluation(EvalRequest("reach", baseline="ws://127.0.0.1:1"), Gates())
