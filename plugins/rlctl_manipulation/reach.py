@@ -71,11 +71,12 @@ class Reach(Task):
 
     def observe(self) -> dict[str, np.ndarray]:
         """Return the arm's state and where the goal is, seen from the hand."""
+        hand = self.arm.link_position(HAND)
         return {
             "joint_positions": self.arm.joint_positions,
             "joint_velocities": self.arm.joint_velocities,
-            "hand": self.arm.link_position(HAND),
-            "hand_to_goal": self.goal - self.arm.link_position(HAND),
+            "hand": hand,
+            "hand_to_goal": self.goal - hand,
         }
 
     def rewards(self, action: np.ndarray) -> dict[str, float]:
