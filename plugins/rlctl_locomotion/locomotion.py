@@ -18,7 +18,7 @@ from rlctl.task import Event, Joints, Sim, Task, events
 
 TARGET_X, TARGET_Y = 1000.0, 0.0  # [m], world frame: a direction rather than a place
 START_NOISE = 0.1  # [rad]
-AT_LIMIT = 0.99  # of the way from the middle of a joint's range to its end
+AT_LIMIT = float(np.float32(0.99))  # of the way from the middle of a joint's range to its end
 OBSERVED = 5.0  # what is observed is cut off beyond it
 
 
@@ -82,8 +82,8 @@ class Locomotion(Task):
             raise ValueError(f"{self.model}: name the motors one after the other, as the model has them")
         self.joints = slice(joints[0], joints[0] + len(joints))  # twice as fast as a list
         self.top_torques = np.array(list(self.motors.values()), self.torque_type)
-        self.joint_low = self.body.joint_low[self.joints]
-        self.joint_range = self.body.joint_high[self.joints] - self.joint_low
+        low = self.body.joint_low[self.joints]
+        self.joint_low, self.joint_range = low.tolist(), (self.body.joint_high[self.joints] - low).tolist()
         self.torques = np.zeros(len(self.body.joint_names))
         self.links = [link for link in self.body.link_names if link != "torso"]
         self.observed_high = np.full((2, len(self.motors)), OBSERVED, np.float32)  # faster than a plain number
@@ -105,9 +105,11 @@ class Locomotion(Task):
         xs, ys, _ = zip(first, self.body.mass_state("torso").position, *others, strict=True)
         x, y = np.add.reduce((xs, ys), 1) / (len(xs) + 1)  # the family's mean has the floor, at 0, among the parts
         self.to_target = np.array([TARGET_Y - y, TARGET_X - x])  # [m]
-        # -1 and 1 at the limits.
-        angles = 2 * (self.body.joint_positions[self.joints] - self.joint_low) / self.joint_range - 1
-        self.joint_states = np.array((angles, 0.1 * self.body.joint_velocities[self.joints]), np.float32)
+        # Plain floats, which are faster than arrays of so few; angles are -1 and 1 at the limits.
+        positions, speeds = self.body.joint_positions[self.joints], self.body.joint_velocities[self.joints]
+        ranges = zip(positions.tolist(), self.joint_low, self.joint_range, strict=True)
+        angles = [2 * (position - low) / between - 1 for position, low, between in ranges]
+        self.joint_states = np.array((angles, [0.1 * speed for speed in speeds.tolist()]), np.float32)
 
     def potential(self) -> float:
         """Minus the time [s] to the target at 1 m per control step; its change is the speed [m/s] towards it."""
@@ -132,7 +134,7 @@ class Locomotion(Task):
             "alive": self.alive(),
             "progress": self.potential() - self.last_potential,
             "electricity": self.power_weight * float(power) + self.torque_weight * float(torque),
-            "joints_at_limit": float(np.count_nonzero(np.abs(self.joint_states[0]) > AT_LIMIT)),
+            "joints_at_limit": float(sum(abs(angle) > AT_LIMIT for angle in self.joint_states[0].tolist())),
             "feet_collision": float(len(self.body.links_touching(self.body).intersection(self.feet))),
         }
 

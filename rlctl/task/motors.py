@@ -139,16 +139,15 @@ class Motors(Properties):
         """
         chosen = self.find_joints(joints)
         given = self._apply_strength(torques.tolist(), chosen)
-        if self._commanded is None:
-            self._commanded = [math.nan] * len(self.joint_indices)
-        for joint, torque in zip(chosen, given, strict=True):
-            self._commanded[joint] = torque
+        if joints:
+            self._commanded = self._commanded or [math.nan] * len(self.joint_indices)
+            for joint, torque in zip(chosen, given, strict=True):
+                self._commanded[joint] = torque
+        else:
+            self._commanded = given
+        links = [self.joint_indices[joint] for joint in chosen] if joints else self.joint_indices
         pybullet.setJointMotorControlArray(
-            self.id,
-            [self.joint_indices[joint] for joint in chosen],
-            pybullet.TORQUE_CONTROL,
-            forces=given,
-            physicsClientId=self.client,
+            self.id, links, pybullet.TORQUE_CONTROL, forces=given, physicsClientId=self.client
         )
 
     def cap_joint_speed(self, speed: float) -> None:
