@@ -90,7 +90,7 @@ def _model_faults(env: Any) -> Iterator[Message]:
 
     faults = [fault for body in env.unwrapped.sim.bodies.values() for fault in find_inertia_faults(body)]
     if faults:
-        more = f"; {len(faults) - 1} more links" if len(faults) > 1 else ""
+        more = f"; and {len(faults) - 1} more" if len(faults) > 1 else ""
         yield Finding("RL809", f"{faults[0].rstrip('.')}{more}", {"value": len(faults), "links": faults[:MOST_LINKS]})
 
 
