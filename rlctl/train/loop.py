@@ -22,11 +22,10 @@ from rlctl.train import measurements, status
 from rlctl.train.curriculum import Curriculum, begin_next_episodes
 from rlctl.train.display import Display
 from rlctl.train.evaluation import Evaluator
-from rlctl.train.pack import pack
 from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Rollouts
 from rlctl.train.saving import Packed, Saver
-from rlctl.train.snapshot import check_finite
+from rlctl.train.snapshot import check_finite, pack
 
 _OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
 

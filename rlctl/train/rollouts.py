@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.run.policy import PolicyInfo
 from rlctl.run.recipe import Recipe
-from rlctl.train.pack import observation_statistics, pack
 from rlctl.train.progress import Progress
+from rlctl.train.snapshot import observation_statistics, pack
 from rlctl.train.updates import choose_learner
 from rlctl.train.vec_env import WorkerVecEnv
 

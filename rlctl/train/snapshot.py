@@ -1,4 +1,4 @@
-"""Everything in a training's memory that decides how it goes on, as tensors and plain data, and back.
+"""Everything in a training's memory that decides how it goes on, as tensors and plain data, and back; and its policy.
 
 The environments' part is in `checkpoint.py`, the replay buffer's in `replay_segments.py`.
 """
@@ -14,9 +14,15 @@ import torch
 from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
 
+from rlctl.dict_spaces import split
+from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, DivergedError
-from rlctl.train.pack import observation_statistics
+from rlctl.run.env_info import EnvInfo
+from rlctl.run.policy import PolicyInfo, collect_versions
+from rlctl.run.torch_policy import describe_network, policy_name
 
 Tensors = dict[str, NDArray[Any]]
 
@@ -25,6 +31,38 @@ _COUNTERS = (
 )  # fmt: skip
 # Explained variance, for one, is not a number where rewards are constant, and nothing is wrong.
 _MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", "actor_loss", "critic_loss")
+
+
+def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> tuple[PolicyInfo, Tensors]:
+    """Return description and tensors of a model's policy, with the normalisation it has now.
+
+    The arrays are copies: training may go on.
+    """
+    tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in model.policy.state_dict().items()}
+    statistics = observation_statistics(model.get_vec_normalize_env())
+    for key, rms in statistics.items():
+        tensors[f"normalize/{key}/mean"] = rms.mean.copy()
+        tensors[f"normalize/{key}/var"] = rms.var.copy()
+    normalizer = model.get_vec_normalize_env()
+    info = PolicyInfo(
+        algo=algo,
+        policy=policy_name(algo, env.spaces()[0]),
+        policy_kwargs=describe_network(model.policy),
+        clip_observation=normalizer.clip_obs if normalizer is not None and statistics else None,
+        normalized_keys=list(statistics),
+        env=env,
+        spec=spec,
+        training_steps=model.num_timesteps,
+        versions=collect_versions(),
+    )
+    return info, tensors
+
+
+def observation_statistics(normalizer: VecNormalize | None) -> dict[str, RunningMeanStd]:
+    """Return the running statistics per observation key, "" for an observation that is no dict."""
+    if normalizer is None or not normalizer.norm_obs:
+        return {}
+    return split(normalizer.obs_rms)
 
 
 def learned_tensors(model: BaseAlgorithm) -> tuple[Tensors, Any]:
@@ -142,9 +180,7 @@ def _normalizer_tensors(model: BaseAlgorithm) -> Tensors:
         return {}
     tensors: Tensors = {"normalize/returns": normalizer.returns}
     for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
-        tensors[f"normalize/{key}/mean"] = np.asarray(rms.mean)
-        tensors[f"normalize/{key}/var"] = np.asarray(rms.var)
-        tensors[f"normalize/{key}/count"] = np.asarray(rms.count)
+        tensors |= {f"normalize/{key}/{part}": np.asarray(getattr(rms, part)) for part in ("mean", "var", "count")}
     return tensors
 
 

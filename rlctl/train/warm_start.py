@@ -100,7 +100,7 @@ def _load_weights(info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> N
 
 
 def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mapping[str, Any]) -> None:
-    from rlctl.train.pack import observation_statistics
+    from rlctl.train.snapshot import observation_statistics
 
     normalizer = model.get_vec_normalize_env()
     statistics = observation_statistics(normalizer)

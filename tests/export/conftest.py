@@ -13,7 +13,7 @@ from rlctl.run.policy import save_policy
 from rlctl.run.recipe import Normalize
 from rlctl.run.torch_policy import ALGORITHMS, policy_name
 from rlctl.train.algorithms import keep_compiler_out, wrap_normalize
-from rlctl.train.pack import pack
+from rlctl.train.snapshot import pack
 
 SMALL = f"{Path(__file__).parent / 'envs.py'}:Small"
 ON_POLICY = {

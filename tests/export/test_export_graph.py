@@ -187,7 +187,7 @@ def test_unscaling_of_a_squashed_action_in_numbers(small, train, write):
 
 def test_file_says_what_it_is(train, tmp_path):
     from rlctl.env_spec import EnvSpec
-    from rlctl.train.pack import pack
+    from rlctl.train.snapshot import pack
 
     spec = EnvSpec("reach", {"tolerance": 0.02})
     model = train("ppo", spec, steps=0)
@@ -239,7 +239,7 @@ def test_recurrent_state_goes_in_and_out_after_the_action(small, train, write):
     ],
 )  # fmt: skip
 def test_what_has_no_translation_is_named(observation, action, algo, policy_kwargs, message, small, train):
-    from rlctl.train.pack import pack
+    from rlctl.train.snapshot import pack
 
     spec = small(observation, action)
     model = train(algo, spec, steps=0, policy_kwargs=policy_kwargs)

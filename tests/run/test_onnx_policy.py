@@ -18,7 +18,7 @@ from rlctl.run.env_info import describe
 from rlctl.run.onnx_policy import OnnxPolicy
 from rlctl.run.policy import load_policy
 from rlctl.run.torch_policy import ALGORITHMS, policy_name
-from rlctl.train.pack import pack
+from rlctl.train.snapshot import pack
 
 PENDULUM = EnvSpec("Pendulum-v1")
 
