@@ -18,9 +18,7 @@ from rlctl.task import Event, Joints, Sim, Task, events
 
 TARGET_X, TARGET_Y = 1000.0, 0.0  # [m], world frame: a direction rather than a place
 START_NOISE = 0.1  # [rad]
-AT_LIMIT = float(
-    np.float32(0.99)
-)  # of the way from the middle of a joint's range to its end, rounded as angles are
+AT_LIMIT = float(np.float32(0.99))  # of the way from the middle of a joint's range to its end, rounded as angles are
 OBSERVED = 5.0  # what is observed is cut off beyond it
 
 
