@@ -91,6 +91,26 @@ def test_no_arguments_show_the_help(rlctl):
         (["evil"], 2, "No such command 'evil'. Did you mean 'eval'?"),
         (["tasks", "--chek"], 2, "No such option: --chek"),
         (["eval", "--episodes", "0"], 2, "Invalid value for '--episodes': Input should be greater than or equal to 1"),
+        (
+            ["runs", "--sort", "stepz"],
+            2,
+            "Invalid value for '--sort': Value error, 'stepz' is not one of 'newest', 'score', 'steps', 'minutes'",
+        ),
+        (
+            ["runs", "report", "latest", "--format", "pdf"],
+            2,
+            "Invalid value for '--format': Value error, 'pdf' is not one of 'html', 'md'",
+        ),
+        (
+            ["runs", "compare", "a", "b", "--gate", "better"],
+            2,
+            "Invalid value for '--gate': Value error, 'better' is not one of 'not-worse'",
+        ),
+        (
+            ["check-env", "reach", "--format", "xml"],
+            2,
+            "Invalid value for '--format': Value error, 'xml' is not one of 'text', 'json', 'sarif', 'github'",
+        ),
         (["train", "reech"], 2, "error: no task 'reech'. Did you mean 'reach'? Installed: "),
         (["train"], 2, "error: give a task to train, or --resume RUN to go on with a run; one of the two"),
         (["train", "reach", "--algo", "pppo"], 2, "error: command line: algo: expected ppo or a2c or "),

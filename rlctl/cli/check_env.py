@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -17,8 +17,8 @@ def check_env(
     ignore: Annotated[list[str], typer.Option(metavar="RULES", help="Leave these out: RL106.")] = [],
     strict: Annotated[bool, typer.Option("--strict", help="Exit 1 for warnings too.")] = False,
     form: Annotated[
-        str | None,
-        typer.Option("--format", metavar="text|json|sarif|github", help="Form of the report.", show_default="text"),
+        Literal["text", "json", "sarif", "github"] | None,
+        typer.Option("--format", help="Form of the report.", show_default="text"),
     ] = None,
     output: Annotated[
         str | None, typer.Option("--output", "-o", metavar="FILE", help="Where the report goes.", show_default="stdout")
@@ -43,8 +43,8 @@ def check_env(
         return
     if task is None:
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
-    form, target = formats.choose(form, output, json)
+    form_name, target = formats.choose(form, output, json)
     spec = parse_changes(settings).apply(EnvSpec(task))
     report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)
-    formats.show(report, form, target)
+    formats.show(report, form_name, target)
     raise typer.Exit(report.exit_code)

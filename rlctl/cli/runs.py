@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.core import TyperGroup
 
 from rlctl.cli.arguments import TASK_FORMS, EpisodeSeed, Json, Run, Set, claim_stdout, parse_changes
-from rlctl.errors import UsageError
 
 
 class _RunsGroup(TyperGroup):
@@ -27,7 +26,7 @@ app = typer.Typer(cls=_RunsGroup, help="List runs, show one, report and compare 
 @app.command("list")
 def list_runs(
     task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only the runs of this task.")] = None,
-    sort: Annotated[str, typer.Option(metavar="newest|score|steps|minutes", help="Order.")] = "newest",
+    sort: Annotated[Literal["newest", "score", "steps", "minutes"], typer.Option(help="Order.")] = "newest",
     json: Json = None,
 ) -> None:
     """List every run below ./runs. `rlctl runs` alone does the same."""
@@ -54,9 +53,7 @@ def report_runs(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="Default: report.html; md goes to stdout.")
     ] = None,
-    format: Annotated[
-        str, typer.Option("--format", metavar="html|md", help="A page, or text for pull requests.")
-    ] = "html",
+    format: Annotated[Literal["html", "md"], typer.Option(help="A page, or text for pull requests.")] = "html",
     pictures: Annotated[
         bool, typer.Option("--pictures/--no-pictures", help="Play episodes again, to draw them.")
     ] = True,
@@ -81,15 +78,11 @@ def compare_runs(
     threshold: Annotated[
         float | None, typer.Option(help="Success rate (or return) to be reached soon; 0.9 where success is known.")
     ] = None,
-    gate: Annotated[
-        str | None, typer.Option(metavar="not-worse", help="Exit 1 if one is worse than the first.")
-    ] = None,
+    gate: Annotated[Literal["not-worse"] | None, typer.Option(help="Exit 1 if one is worse than the first.")] = None,
     json: Json = None,
 ) -> None:
     """Say whether a policy, or a recipe trained with several seeds, is better than another."""
     claim_stdout()
-    if gate not in (None, "not-worse"):
-        raise UsageError(f"--gate {gate}: the only gate is not-worse")
     from rlctl.eval.evaluate import EvalRequest
     from rlctl.runs.comparison import compare
     from rlctl.runs.comparison_report import show

@@ -12,7 +12,7 @@ from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.run.directory import ROOT
 from rlctl.runs.summary import RunSummary, find_runs, summarize
 
-SORT_KEYS = {
+_SORT_KEYS = {
     "newest": lambda run: (run.started or run.path.name, run.path.name),
     "score": lambda run: run.score,
     "steps": lambda run: run.steps or 0,
@@ -29,10 +29,8 @@ def list_runs(
 ) -> list[RunSummary]:
     """Return the runs of a task, or all, best or newest first.
 
-    Raises `UsageError` for an unknown order or a task without runs, which may be one of `commands` misspelt.
+    Raises `UsageError` for a task without runs, which may be one of `commands` misspelt.
     """
-    if sort not in SORT_KEYS:
-        raise UsageError(f"--sort {sort}: give one of {', '.join(SORT_KEYS)}")
     found = [summarize(path) for path in find_runs(root)]
     if task is not None:
         every = found
@@ -42,7 +40,7 @@ def list_runs(
             names = sorted({run.task for run in every})
             close = did_you_mean(task, [*names, *commands])
             raise UsageError(f"no run of {task!r} under {root.resolve()}, and no such command of rlctl runs.{close}")
-    return sorted(found, key=SORT_KEYS[sort], reverse=True)
+    return sorted(found, key=_SORT_KEYS[sort], reverse=True)
 
 
 def show(runs: list[RunSummary], json: str | None) -> None:

@@ -64,8 +64,6 @@ def test_order_and_selection(write_run):
         list_runs("reech")
     with pytest.raises(UsageError, match=r"no such command of rlctl runs\. Did you mean 'show'"):
         list_runs("shwo", commands=["list", "show", "compare"])
-    with pytest.raises(UsageError, match="--sort stepz: give one of newest, score, steps, minutes"):
-        list_runs(sort="stepz")
 
 
 def test_no_runs_yet(tmp_path, monkeypatch):

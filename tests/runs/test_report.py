@@ -119,8 +119,6 @@ def test_run_in_progress_is_reported_as_such(group, hold_lock):
 
 
 def test_what_cannot_be_reported(group, write_run):
-    with pytest.raises(UsageError, match=r"--format pdf: give html or md"):
-        write(group[0], form="pdf")
     other = write_run("ant/2026-11-21_10-00-00_s0")
     with pytest.raises(UsageError, match="runs of several tasks, ant, reach"):
         write(group[0], other)

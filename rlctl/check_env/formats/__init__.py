@@ -9,7 +9,7 @@ from pathlib import Path
 from rlctl import output
 from rlctl.check_env.check import Report
 from rlctl.check_env.formats import github, plain, sarif, structured
-from rlctl.errors import UsageError, did_you_mean
+from rlctl.errors import UsageError
 from rlctl.run import files
 
 FORMATS: dict[str, Callable[[Report], str]] = {
@@ -26,10 +26,7 @@ def choose(form: str | None, target: str | None, json: str | None) -> tuple[str,
         if form not in (None, "json") or target is not None:
             raise UsageError("--json FILE is --format json -o FILE: leave out --format and -o")
         return "json", json
-    form = form or "text"
-    if form not in FORMATS:
-        raise UsageError(f"--format {form}: not one of {', '.join(FORMATS)}.{did_you_mean(form, FORMATS)}")
-    return form, target
+    return form or "text", target
 
 
 def show(report: Report, form: str, target: str | None) -> None:

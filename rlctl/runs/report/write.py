@@ -5,16 +5,15 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rlctl import output
-from rlctl.errors import RlctlError, UsageError, did_you_mean
+from rlctl.errors import RlctlError
 from rlctl.run import files
 from rlctl.runs.report import content
 from rlctl.runs.report.content import Report
 from rlctl.runs.show import describe_robustness, tabulate
 
-FORMATS = ("html", "md")
 DEFAULT_FILE = Path("report.html")
 
 _PICTURES = 6
@@ -22,15 +21,12 @@ _PICTURES = 6
 
 
 def write_report(
-    runs: Sequence[str], form: str = "html", target: Path | None = None, *, pictures: bool = True
+    runs: Sequence[str], form: Literal["html", "md"] = "html", target: Path | None = None, *, pictures: bool = True
 ) -> Path | None:
     """Write a report and return its file, by default report.html; None for Markdown that was printed.
 
-    Raises `UsageError` for an unknown format and runs of several tasks, `ArtifactError` for a damaged run or one that
-    has nothing yet.
+    Raises `UsageError` for runs of several tasks, `ArtifactError` for a damaged run or one that has nothing yet.
     """
-    if form not in FORMATS:
-        raise UsageError(f"--format {form}: give html or md.{did_you_mean(form, FORMATS)}")
     report = content.collect(runs)
     is_html = form == "html"
     text = _render(f"report.{form}.jinja", is_html, _values(report, is_html, pictures))
