@@ -84,7 +84,8 @@ def show(run: RunDescription, json: str | None) -> None:
         if output.write_result_json(json, {**content, **found, "robustness": measured, "bytes": sizes}):
             return
     out.print(f"[bold]{summary.name}[/bold]: {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}")
-    out.print(f"{summary.steps or 0:,} steps in {(summary.seconds or 0) / 60:.1f} minutes, started {summary.started}")
+    duration = output.format_duration(summary.seconds or 0.0)
+    out.print(f"{summary.steps or 0:,} steps in {duration}, started {summary.started}")
     if summary.best_return is not None:
         success = "" if summary.best_success is None else f"success {summary.best_success:.1%}, "
         out.print(f"best evaluation at step {summary.best_step:,}: {success}return {summary.best_return:.4g}")
