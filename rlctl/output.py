@@ -70,8 +70,8 @@ def _make_console(stream: TextIO | None) -> Console:
 
     terminal = (stream or sys.stderr).isatty()
     width = None if terminal else _PIPED_WIDTH
-    # No emoji: "car.py:Car: no findings" would have one in it.
-    options: dict[str, Any] = {"highlight": False, "emoji": False, "soft_wrap": not terminal}
+    # Neither markup nor emoji: "car.py:Car: no findings" would have one in it, and "joint[left]" would lose its end.
+    options: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False, "soft_wrap": not terminal}
     return Console(file=stream, stderr=stream is None, width=width, **options)
 
 
@@ -118,7 +118,7 @@ def format_count(count: int, noun: str) -> str:
 def print_notes(notes: Iterable[str]) -> None:
     """Print lines for people to stderr."""
     for note in notes:
-        err().print(note, markup=False, style="dim")
+        err().print(note, style="dim")
 
 
 def print_table(

@@ -26,9 +26,9 @@ def test_a_terminal_that_is_not_utf8(encoding):
     assert b"Traceback" not in done.stderr
 
 
-def test_the_name_of_a_class_is_no_emoji(capsys):
-    output.err().print("arms.py:Robot: no findings", markup=False)
-    assert capsys.readouterr().err == "arms.py:Robot: no findings\n"
+def test_what_others_named_is_printed_as_it_is(capsys):
+    output.err().print("arms.py:Robot: no joint [left]")
+    assert capsys.readouterr().err == "arms.py:Robot: no joint [left]\n"
 
 
 def test_progress_in_ascii(monkeypatch, capsys):

@@ -64,7 +64,7 @@ def report_runs(
     from rlctl.runs.report.write import write_report
 
     if (path := write_report(runs, format, output, pictures=pictures)) is not None:
-        streams.out().print(f"report: {path}", markup=False)
+        streams.out().print(f"report: {path}")
 
 
 @app.command("compare")

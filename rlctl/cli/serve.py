@@ -65,7 +65,7 @@ def serve(
 
     def show(address: str) -> None:
         out = output.out()
-        out.print(f"{found.file}: serving at ws://{address}, live page at http://{address}/", markup=False)
+        out.print(f"{found.file}: serving at ws://{address}, live page at http://{address}/")
         out.file.flush()
 
     return run_server(server, show)

@@ -88,7 +88,6 @@ def show(result: GroupScore, json: str | None) -> None:
     episodes = f", {output.format_count(scores[0].episodes, 'episode')} each, seed {scores[0].seed}" if scores else ""
     out.print(
         f"{result.group.task}: {result.group.path}, {output.format_count(len(result.seeds), 'seed')}{episodes}",
-        markup=False,
     )
     success, returns = result.spread("success"), result.spread("mean_return")
     rows = [_list_cells(each) for each in result.seeds]

@@ -46,7 +46,7 @@ def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
     if without is not None and now is not None:
         success = f"success rate {without:.1%} without them, {now:.1%} with them; "
     returns = f"return {unlimited.returns.mean:.4g} without them, {result.returns.mean:.4g} with them"
-    out.print(f"limits of {result.limited_by}: {success}{returns}", markup=False)
+    out.print(f"limits of {result.limited_by}: {success}{returns}")
     steps = sum(episode.result.length for episode in result.episodes)
     rows = [(name, f"{1000 * count / steps:.4g}") for name, count in count_interventions(result).most_common()]
     if rows:
@@ -66,7 +66,7 @@ def count_interventions(result: Evaluation) -> collections.Counter[str]:
 def _show_head(result: Evaluation) -> None:
     out = output.out()
     mode = "" if result.deterministic else ", sampled actions"
-    out.print(f"{result.spec.task}: {describe_policy(result)}", markup=False)
+    out.print(f"{result.spec.task}: {describe_policy(result)}")
     randomization = describe_randomization(result.events)
     episodes = output.format_count(len(result.episodes), "episode")
     out.print(f"{episodes}, seed {result.seed}{mode}{randomization and f', {randomization}'}")

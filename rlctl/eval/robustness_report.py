@@ -20,7 +20,7 @@ def show(result: Robustness, json: str | None) -> None:
     if json is not None and output.write_result_json(json, result.model_dump(mode="json")):
         return
     out = output.out()
-    out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})", markup=False)
+    out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})")
     mode = "" if result.deterministic else ", sampled actions"
     out.print(
         f"{output.format_count(result.episodes, 'episode')} in every cell, the same seeds (seed {result.seed}){mode}"
@@ -32,12 +32,12 @@ def show(result: Robustness, json: str | None) -> None:
         _show_map(each, worst[1] if worst else None)
     if worst is not None:
         found, cell = worst
-        out.print(f"\nworst: {found.name_cell(cell)}: {format_outcome(cell)}", markup=False)
+        out.print(f"\nworst: {found.name_cell(cell)}: {format_outcome(cell)}")
         settings = " ".join(
             f"--set {axis.setting}={value:g}" for axis, value in zip(found.axes, cell.values, strict=True)
         )
         alone = f"rlctl eval {result.policy_file} --set randomize=false {settings}"
-        out.print(f"the same episodes alone: {alone}", markup=False)
+        out.print(f"the same episodes alone: {alone}")
     if result.push is not None:
         out.print()
         _show_push(result.push)
@@ -130,7 +130,7 @@ def _color_cells(found: RobustnessMap) -> list[str]:
 def _show_push(push: PushTest) -> None:
     out = output.out()
     what = push.body if push.link is None else f"{push.link} of {push.body}"
-    out.print(f"push on {what} in the middle of the episode, {push.duration_s:g} s, from a random side", markup=False)
+    out.print(f"push on {what} in the middle of the episode, {push.duration_s:g} s, from a random side")
     held = "success" if push.measure == "success" else "up to the end"
     speeds = [level.impulse / push.mass if push.mass else 0.0 for level in push.levels]
     rows = [
@@ -138,4 +138,4 @@ def _show_push(push: PushTest) -> None:
         for level, speed in zip(push.levels, speeds, strict=True)
     ]
     output.print_table(("push [N s]", "of a speed of [m/s]", held, "return"), rows)
-    out.print(push.verdict, markup=False)
+    out.print(push.verdict)

@@ -118,7 +118,7 @@ def show(result: SelfTest, json: str | None) -> None:
         return
     out, direct, served = output.out(), result.direct, result.served
     episodes = output.format_count(len(served.episodes), "episode")
-    out.print(f"{direct.spec.task}: {direct.name}, {episodes}, through a server", markup=False)
+    out.print(f"{direct.spec.task}: {direct.name}, {episodes}, through a server")
     if served.success_rate is not None:
         out.print(f"success rate {served.success_rate:.1%}, {direct.success_rate:.1%} without the server")
     out.print(f"return {served.returns.mean:.4g}, {direct.returns.mean:.4g} without the server")

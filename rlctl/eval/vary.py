@@ -146,7 +146,7 @@ def _keep(file: Path, result: Robustness) -> None:
     try:
         robustness.write(file, result)
     except OSError as error:
-        output.err().print(f"warning: {file}: not written: {error.strerror}", markup=False)
+        output.err().print(f"warning: {file}: not written: {error.strerror}")
 
 
 def check_gates(result: Robustness, gates: Gates) -> None:

@@ -63,10 +63,10 @@ def show(report: PolicyFileReport, json: str | None) -> None:
     if json is not None and output.write_result_json(json, as_json(report)):
         return
     out, info, provenance = output.out(), report.info, report.provenance
-    out.print(f"exported {report.path} ({format_bytes(report.size)}): the actor of {provenance.run}", markup=False)
-    out.print(f"{info.algo} for {info.spec.task}, step {info.training_steps:,}", markup=False)
+    out.print(f"exported {report.path} ({format_bytes(report.size)}): the actor of {provenance.run}")
+    out.print(f"{info.algo} for {info.spec.task}, step {info.training_steps:,}")
     for name, score in {"policy": provenance.score, **provenance.baselines}.items():
-        out.print(f"{name:8} {describe_score(score)}", markup=False)
+        out.print(f"{name:8} {describe_score(score)}")
     out.print(
         f"{output.format_count(provenance.score.episodes, 'episode')}, seed {provenance.score.seed}; 95 % intervals"
     )

@@ -85,20 +85,19 @@ def show(result: ReplayResult, json: str | None) -> None:
     out = output.out()
     randomization = describe_randomization(result.episodes[0].events) if result.episodes else ""
     parts = [each for each in (result.policy_file or result.policy, randomization) if each]
-    out.print(f"{result.task}: {', '.join(parts)}" if parts else result.task, markup=False)
+    out.print(f"{result.task}: {', '.join(parts)}" if parts else result.task)
     if result.choice:
         out.print(result.choice)
     for episode in result.episodes:
-        out.print(_line(episode), markup=False)
+        out.print(_line(episode))
     if film := result.film:
         out.print(
             f"{film.file}: {film.pictures} pictures of {film.width}x{film.height}, {film.rate:.3g} per second; "
             f"drawn at {film.drawn_per_s:.3g} per second",
-            markup=False,
         )
     if command := open_command(result):
-        out.print(f"open with: {command}", markup=False)
-        out.print(f"without a display, in a browser: {command.replace('rerun', 'rerun --serve-web', 1)}", markup=False)
+        out.print(f"open with: {command}")
+        out.print(f"without a display, in a browser: {command.replace('rerun', 'rerun --serve-web', 1)}")
 
 
 def _line(episode: ReplayedEpisode) -> str:
@@ -112,9 +111,9 @@ def _line(episode: ReplayedEpisode) -> str:
 def _show_verification(result: ReplayResult, verification: Verification) -> None:
     out, (episode,) = output.out(), result.episodes
     verdict = "identical, bit for bit" if verification.difference is None else "not identical"
-    out.print(f"{verification.episode}: {result.task}, {_line(episode)}: {verdict}", markup=False)
+    out.print(f"{verification.episode}: {result.task}, {_line(episode)}: {verdict}")
     for name, (recorded, now) in verification.other_versions.items():
-        out.print(f"recorded with {name} {recorded}, here is {now or 'none'}", markup=False)
+        out.print(f"recorded with {name} {recorded}, here is {now or 'none'}")
 
 
 def open_command(result: ReplayResult) -> str | None:

@@ -24,7 +24,7 @@ from rlctl.run.episode import RecordedEpisode
 
 def print_warning(message: str) -> None:
     """Print a message to stderr."""
-    output.err().print(message, markup=False)
+    output.err().print(message)
 
 
 def record_episode(

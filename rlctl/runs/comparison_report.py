@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from rich.text import Text
+
 from rlctl import output
 from rlctl.eval.statistics import Spread
 from rlctl.runs.comparison import Candidate, Comparison, EvaluatedRun, Quantity, Side
@@ -39,10 +41,10 @@ def _show_seeds(result: Comparison) -> None:
     output.print_table(columns, rows, left=("recipe",))
     for side in result.sides:
         scores = "; ".join(_format_aggregate(side, quantity) for quantity in result.candidates[0].differences)
-        output.out().print(f"{side.name}: {len(side.runs)} seeds, {scores}", markup=False)
+        output.out().print(f"{side.name}: {len(side.runs)} seeds, {scores}")
         if side.mixed:
             mixed = ", ".join(side.mixed)
-            output.out().print(f"warning: {side.name} is not one recipe: its runs differ in {mixed}", markup=False)
+            output.out().print(f"warning: {side.name} is not one recipe: its runs differ in {mixed}")
 
 
 def _or_dash(value: float | None, form: str) -> str:
@@ -68,13 +70,14 @@ def _format_aggregate(side: Side, quantity: Quantity) -> str:
 
 def _show_candidate(result: Comparison, candidate: Candidate) -> None:
     out = output.out()
-    out.print(f"\n{candidate.side.name} against {result.baseline.name}: [bold]{candidate.verdict}[/bold]")
+    question = f"\n{candidate.side.name} against {result.baseline.name}: "
+    out.print(Text.assemble(question, (candidate.verdict, "bold")))
     for quantity, difference in candidate.differences.items():
         out.print(f"  {quantity}: {format_difference(difference, as_percent=quantity == 'success')}")
     if candidate.verdict is Verdict.CANNOT_TELL:
         out.print(f"  {format_needed(candidate, result.of_recipes)}")
     for key, (value, before) in candidate.recipe_changes.items():
-        out.print(f"  recipe: {key}: {before} -> {value}", markup=False)
+        out.print(f"  recipe: {key}: {before} -> {value}")
     if not candidate.recipe_changes:
         out.print("  recipe: the same")
 

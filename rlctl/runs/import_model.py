@@ -165,4 +165,4 @@ def show(result: ImportedPolicy, json: str | None) -> None:
         out.print("it also observes the part of the episode that is left, the time feature of rl-zoo3")
     out.print("next:")
     for command in (f"rlctl eval {result.file}", f"rlctl export {result.file} --onnx", f"rlctl replay {result.file}"):
-        out.print(f"  {command}", markup=False)
+        out.print(f"  {command}")

@@ -81,7 +81,7 @@ def remove_with_report(removal: Removal, *, yes: bool) -> None:
     """
     out = output.out()
     for path in removal.paths:
-        out.print(str(path), markup=False)
+        out.print(str(path))
     if not removal.paths:
         out.print("nothing to remove")
         return

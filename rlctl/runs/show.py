@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rich.filesize import decimal as format_bytes
+from rich.text import Text
 
 from rlctl import output
 from rlctl.errors import ArtifactError
@@ -83,28 +84,29 @@ def show(run: RunDescription, json: str | None) -> None:
         measured = None if run.robustness is None else run.robustness.model_dump(mode="json")
         if output.write_result_json(json, {**content, **found, "robustness": measured, "bytes": sizes}):
             return
-    out.print(f"[bold]{summary.name}[/bold]: {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}")
+    what = f": {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}"
+    out.print(Text.assemble((summary.name, "bold"), what))
     duration = output.format_duration(summary.seconds or 0.0)
     out.print(f"{summary.steps or 0:,} steps in {duration}, started {summary.started}")
     if summary.best_return is not None:
         success = "" if summary.best_success is None else f"success {summary.best_success:.1%}, "
         out.print(f"best evaluation at step {summary.best_step:,}: {success}return {summary.best_return:.4g}")
     if isinstance(source, dict):
-        out.print(f"began with {source.get('policy')}, step {source.get('training_steps')}", markup=False)
+        out.print(f"began with {source.get('policy')}, step {source.get('training_steps')}")
     for key, value in summary.changes.items():
-        out.print(f"differs from the task's recipe: {key} = {value}", markup=False)
+        out.print(f"differs from the task's recipe: {key} = {value}")
     for warning in run.warnings:
-        out.print(f"warning: {warning}", markup=False)
+        out.print(f"warning: {warning}")
     for name in ("success", "return"):
         if curve := plot(run, name):
-            out.print(curve, markup=False)
+            out.print(curve)
     _show_evaluations(run.evaluations)
     for line in () if run.robustness is None else describe_robustness(run.robustness):
-        out.print(f"robustness: {line}", markup=False)
+        out.print(f"robustness: {line}")
     for finding in run.findings:
-        out.print("\n".join(format_finding(finding)), markup=False)
+        out.print("\n".join(format_finding(finding)))
     files = "  ".join(f"{name} {format_bytes(size)}" for name, size in sizes.items())
-    out.print(f"files: {files}  in {summary.path}", markup=False)
+    out.print(f"files: {files}  in {summary.path}")
 
 
 def plot(run: RunDescription, name: str) -> str:

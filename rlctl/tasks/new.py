@@ -71,7 +71,7 @@ def show(plugin: NewPlugin, json: str | None) -> None:
             return
     out = output.out()
     for file in plugin.files:
-        out.print(f"wrote {plugin.folder / file}", markup=False)
+        out.print(f"wrote {plugin.folder / file}")
     out.print("A planar arm that brings its tip to a goal. Every CHANGE in task.py marks a place to make it your own.")
     out.print("next:")
     for command in (
@@ -80,7 +80,7 @@ def show(plugin: NewPlugin, json: str | None) -> None:
         f"rlctl train {plugin.name}",
         f"pytest {plugin.folder}",
     ):
-        out.print(f"  {command}", markup=False)
+        out.print(f"  {command}")
 
 
 def _check(name: str, package: str) -> None:

@@ -30,7 +30,7 @@ def show(result: TrainResult, json: str | None) -> None:
         f"  tensorboard --logdir {result.run.tensorboard}",
     ]
     for line in lines:
-        output.out().print(line, markup=False)
+        output.out().print(line)
 
 
 def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:

@@ -39,7 +39,8 @@ def text(report: Report) -> str:
     from rich.console import Console
 
     stream = io.StringIO()
-    _print(Console(file=stream, width=1000, soft_wrap=True, highlight=False, color_system=None, emoji=False), report)
+    plain: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False, "soft_wrap": True}
+    _print(Console(file=stream, width=1000, color_system=None, **plain), report)
     return stream.getvalue()
 
 
@@ -56,9 +57,9 @@ def summary(report: Report) -> str:
 def _print(out: Console, report: Report) -> None:
     for _, findings in itertools.groupby(report.verdict.findings, key=lambda each: (each.severity, each.rule)):
         _print_rule(out, list(findings))
-    out.print(summary(report), style="bold" if out.is_terminal else None, markup=False)
+    out.print(summary(report), style="bold" if out.is_terminal else None)
     for line in _facts(report):
-        out.print(line, markup=False)
+        out.print(line)
 
 
 def _print_rule(out: Console, findings: list[Finding]) -> None:

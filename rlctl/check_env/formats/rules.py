@@ -24,7 +24,7 @@ def show_list() -> None:
                 severity = Text(f"{rule.severity:<8}", STYLES[rule.severity])
                 out.print(Text(f"  {rule.id}  ").append_text(severity).append(rule.name))
     counts = ", ".join(f"{sum(rule.severity is each for rule in RULES.values())} {each}s" for each in Severity)
-    out.print(f"{len(RULES)} rules: {counts}. rlctl check-env --explain {next(iter(RULES))} says more.", markup=False)
+    out.print(f"{len(RULES)} rules: {counts}. rlctl check-env --explain {next(iter(RULES))} says more.")
 
 
 def explain(code: str) -> None:
@@ -35,9 +35,9 @@ def explain(code: str) -> None:
     out.print(Text(f"{rule.id}  {rule.name}", "bold"))
     out.print(Text(f"{rule.severity}, {FAMILIES[rule.id[:3]]}", STYLES[rule.severity]))
     for paragraph in rule.meaning.split("\n\n"):
-        out.print("\n" + textwrap.fill(" ".join(paragraph.split()), 100), markup=False)
-    out.print(f"\nfix: {textwrap.fill(rule.fix, 100)}", markup=False)
-    out.print(f'waive: rlctl_ignore = {{"{rule.id}": "why this is meant"}} on the class', style="dim", markup=False)
+        out.print("\n" + textwrap.fill(" ".join(paragraph.split()), 100))
+    out.print(f"\nfix: {textwrap.fill(rule.fix, 100)}")
+    out.print(f'waive: rlctl_ignore = {{"{rule.id}": "why this is meant"}} on the class', style="dim")
 
 
 _PAGE = """# The rules of check-env

@@ -22,11 +22,11 @@ def show(result: Identification, json: str | None) -> None:
     out = output.out()
     out.print(f"{result.task}: {result.log}, {result.rows:,} rows, {result.seconds:.1f} s", highlight=False)
     for line in _list_lines(result):
-        out.print(line, highlight=False, markup=False)
+        out.print(line, highlight=False)
     if sys.stdout.isatty():
-        out.print(draw_curves(result), highlight=False, markup=False)
+        out.print(draw_curves(result), highlight=False)
     out.print("\nto train on what was found, in a recipe:", highlight=False)
-    out.print(write_fragment(result), end="", highlight=False, markup=False)
+    out.print(write_fragment(result), end="", highlight=False)
 
 
 def write_fragment(result: Identification) -> str:
@@ -74,4 +74,4 @@ def show_excitation(result: Excitation, json: str | None) -> None:
         f"play its actions on the robot, log in the same columns, then: rlctl identify {result.task} --log FILE",
     ]
     for line in lines:
-        output.out().print(line, highlight=False, markup=False)
+        output.out().print(line, highlight=False)
