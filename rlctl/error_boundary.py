@@ -38,7 +38,7 @@ def flush() -> None:
 
 
 def close_stdout() -> None:
-    """Lead a stdout that was closed nowhere: what is buffered for it must not raise when the interpreter ends."""
+    """Discard what is buffered for a stdout that was closed: it must not raise when the interpreter ends."""
     from rlctl import output
 
     nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -71,7 +71,7 @@ class EpisodeFailed(TaskError):
         self.step = step
         """Number of the step that failed, from 1; 0 for the reset."""
         self.actions: Any = None
-        """The actions of the episode, that of the failed step last, shape (step, ...); None if nobody knows them."""
+        """The actions of the episode, that of the failed step last, shape (step, ...); None where they are unknown."""
 
     def with_hint(self, hint: str) -> EpisodeFailed:
         """Return the same error with another hint."""

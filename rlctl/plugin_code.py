@@ -101,7 +101,7 @@ def _survive_import(task: str) -> Iterator[None]:
     leave, process = os._exit, os.getpid()
 
     def refuse(status: int) -> NoReturn:
-        if os.getpid() != process:  # a child of the module's own may leave so
+        if os.getpid() != process:  # a process that the module forked may end so
             leave(status)
         raise SystemExit(f"os._exit({status})")
 

@@ -64,7 +64,7 @@ def describe(error: BaseException) -> str:
 
 
 def lacks_display(failure: Failure) -> bool:
-    """Say whether a process ended for want of a display."""
+    """Say whether a process ended because it has no display."""
     return failure.kind == "died" and NO_DISPLAY.search(failure.details or "") is not None
 
 

@@ -120,7 +120,7 @@ class Command:
             start = self.position
         elif action is not None:
             start = self._bounds.offset + action * self._bounds.factor
-        else:  # nobody knows where it is
+        else:  # where it is is not measured
             return self._safe if self._home is None else self._home
         self._reference = np.minimum(np.maximum(start, self._bounds.low), self._bounds.high)
         away = np.abs(self._reference - start)

@@ -38,8 +38,8 @@ class LimitedPlayer(Player):
             self._safety.resume()
             self._safety.reset()
             self._before = self._safety.counts
-        believed = self._safety.observe(observation)
-        wanted = self._player.act(observation, seed, step)[1] if believed else None
+        is_usable = self._safety.observe(observation)
+        wanted = self._player.act(observation, seed, step)[1] if is_usable else None
         action = self._safety.limit(wanted)
         return action, action
 

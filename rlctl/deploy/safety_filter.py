@@ -168,7 +168,7 @@ class SafetyFilter:
         return self._observed and not self._fault
 
     def observe(self, observation: Any, age_s: float = 0.0) -> bool:
-        """Check an observation, as the policy takes it; None: there is none. Return whether it may be believed.
+        """Check an observation, as the policy takes it; None: there is none. Return whether it may be used.
 
         `age_s` is its age [s].
         """

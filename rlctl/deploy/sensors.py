@@ -1,4 +1,4 @@
-"""Whether an observation may be believed: finite, in range, not frozen, not old."""
+"""Whether an observation may be used: finite, in range, not frozen, not old."""
 
 from __future__ import annotations
 

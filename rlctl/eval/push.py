@@ -150,7 +150,7 @@ def _cross(impulses: Sequence[float], rates: NDArray[np.float64]) -> float | Non
     falling = isotonic_regression(rates, increasing=False).x
     if falling[-1] > 0.5:
         return None
-    return float(np.interp(-0.5, -falling, impulses))  # which wants rising values
+    return float(np.interp(-0.5, -falling, impulses))  # which needs rising values
 
 
 def _judge(

@@ -1,4 +1,4 @@
-"""Honest numbers from a list of episodes.
+"""Statistics of a list of episodes.
 
 Formulas of a line or two are written out: importing scipy.stats takes longer than many an evaluation.
 """

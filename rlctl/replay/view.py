@@ -49,7 +49,7 @@ class _Pictures:
             raise UsageError(f"the environment's render() raised {describe_exception(error)}") from None
         if picture.ndim != 3 or picture.shape[2] != 3:
             raise UsageError(f"the environment's render() returned {picture.dtype} of shape {picture.shape}")
-        height, width = (size - size % 2 for size in picture.shape[:2])  # encoders want even sizes
+        height, width = (size - size % 2 for size in picture.shape[:2])  # encoders need even sizes
         return np.ascontiguousarray(picture[:height, :width].astype(np.uint8))
 
 

@@ -130,7 +130,7 @@ class RunDirectory:
         return file
 
     def recover(self) -> None:
-        """Put right what a killed process left half-done; only for the holder of the lock."""
+        """Repair what a killed process left half-done; only for the holder of the lock."""
         for folder in [self.path, *(each for each in self.path.glob("*") if each.is_dir()), self.replay_segments]:
             files.recover(folder)
 

@@ -1,4 +1,4 @@
-"""What a policy must know of its environment, as plain data: spaces, names, units, timing."""
+"""What a policy file says of its environment, as plain data: spaces, names, units, timing."""
 
 from __future__ import annotations
 

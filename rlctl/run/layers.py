@@ -1,6 +1,6 @@
 """The layers of a policy's actor as data: NumPy plays them on one observation, `rlctl.export` writes them as ONNX.
 
-Arrays are used where they lie: if they are in shared memory, new numbers written there act once `prepare` was called.
+Arrays are used in place: if they are in shared memory, new numbers written there act once `prepare` was called.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""ONNX files of rlctl: sealed by a sha256 when they are written, and checked before a runtime gets to see them."""
+"""ONNX files of rlctl: sealed by a sha256 when they are written, and checked before a runtime reads them."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def collect_versions() -> dict[str, str]:
     return dict(_read_versions())
 
 
-@functools.cache  # each is read from a file, and every checkpoint wants them
+@functools.cache  # each is read from a file, and every checkpoint needs them
 def _read_versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "rlctl": rlctl.__version__}
     for name in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet"):

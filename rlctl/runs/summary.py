@@ -58,8 +58,7 @@ class RunSummary:
     @property
     def score(self) -> tuple[float, float]:
         """Return what to rank runs of one task by: success first, then return."""
-        success = -1.0 if self.best_success is None else self.best_success
-        return success, -float("inf") if self.best_return is None else self.best_return
+        return _score(self.best_success, self.best_return)
 
 
 def find_runs(root: Path = ROOT) -> Iterator[Path]:
@@ -161,11 +160,11 @@ def list_points(rows: Rows, column: str) -> list[tuple[float, float]]:
 def best_row(rows: Rows) -> dict[str, float | None] | None:
     """Return the evaluation with the best success, then return."""
     scored = [row for row in rows if row.get("return") is not None]
-    return max(scored, key=lambda row: (_or_lowest(row.get("success")), _or_lowest(row["return"])), default=None)
+    return max(scored, key=lambda row: _score(row.get("success"), row["return"]), default=None)
 
 
-def _or_lowest(value: float | None) -> float:
-    return -float("inf") if value is None else value
+def _score(success: float | None, total_reward: float | None) -> tuple[float, float]:
+    return -math.inf if success is None else success, -math.inf if total_reward is None else total_reward
 
 
 def last_row(path: Path) -> dict[str, str] | None:

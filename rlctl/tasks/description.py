@@ -43,7 +43,7 @@ class Description:
 def describe(task: str) -> Description:
     """Describe what `task` names, with the parameters of its recipe; its environment is built and closed.
 
-    Raises `UsageError` for a name that stands for nothing, `TaskError` for a task that cannot be built.
+    Raises `UsageError` for an unknown name, `TaskError` for a task that cannot be built.
     """
     constructor: Any = registry.load(task)
     recipe = recipe_sources.resolve_packaged(task)

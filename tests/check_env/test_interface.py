@@ -62,8 +62,8 @@ def test_no_limit_is_told_with_what_is_known():
 @pytest.mark.parametrize(
     ("name", "rule", "severity", "text"),
     [
-        ("Gui", "RL216", "error", "in the constructor, for want of a display: 'cannot connect to X server'"),
-        ("GuiInReset", "RL216", "error", "in reset, for want of a display: 'cannot connect to X server'"),
+        ("Gui", "RL216", "error", "in the constructor, because there is no display: 'cannot connect to X server'"),
+        ("GuiInReset", "RL216", "error", "in reset, because there is no display: 'cannot connect to X server'"),
     ],
 )
 def test_what_ends_the_process_is_said_once(name, rule, severity, text, monkeypatch):

@@ -188,6 +188,6 @@ def _find_lost_display(records: Records) -> Iterator[Finding]:
     for failure in records.failures:
         if lacks_display(failure):
             line = next(line for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)).strip()
-            yield Finding("RL216", f"{failure.message}, for want of a display: {line!r}", failure.place)
+            yield Finding("RL216", f"{failure.message}, because there is no display: {line!r}", failure.place)
             return
     records.require_built()

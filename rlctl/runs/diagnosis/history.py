@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 LEAST_ROWS = 10
 """Of `metrics.csv`; of a shorter training most signs say nothing."""
 _GOOD = 0.8
-"""From this success rate on a training has done what was wanted, whatever its records look like."""
+"""From this success rate on a training has succeeded, whatever its records look like."""
 EPISODES = 4
 """Recorded episodes that are looked at: of the last two evaluations, as each keeps its first and its worst."""
 

@@ -42,7 +42,7 @@ class Report:
 
 
 def collect(texts: Sequence[str]) -> Report:
-    """Read the runs that some words stand for.
+    """Read the runs that some words name.
 
     Raises `ArtifactError` for a damaged run and one that has nothing yet, `UsageError` for runs of several tasks.
     """
