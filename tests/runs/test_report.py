@@ -46,7 +46,7 @@ def write(*runs, **options):
 
 def test_page_has_everything_and_needs_nothing_else(group):
     page = write(group[2])
-    assert "The best policy succeeds in 100.0% of 100 evaluation episodes" in page
+    assert "In the evaluation that chose it the best policy succeeds in 100.0% of 100 episodes, with" in page
     for plot in ("return over training steps", "success over training steps", "reward terms over training steps"):
         assert f'aria-label="{plot}"' in page
     assert page.count("<svg") == page.count("</svg>") == 3
@@ -62,7 +62,7 @@ def test_page_has_everything_and_needs_nothing_else(group):
 def test_group_is_drawn_with_a_band(group):
     page = write(group[0].parent)
     assert "reach, ppo, seeds 0, 1, 2" in page
-    assert "The best policies of 3 trainings succeed in 90.0% of the evaluation episodes (80.0% to 100.0%)" in page
+    assert "the best policies of 3 trainings succeed in 90.0% of the episodes (80.0% to 100.0%)" in page
     assert "Mean of 3 trainings, from the lowest to the highest." in page
     assert "rlctl train reach --seeds 0,1,2 --set algo_kwargs.learning_rate=0.001" in page
 
@@ -166,4 +166,4 @@ def test_browser_shows_it(group, tmp_path, width):
     content, inside = re.search(r"<title>(\d+) of (\d+)</title>", done.stdout).groups()
     assert int(content) <= int(inside)  # nothing to scroll sideways
     assert done.stdout.count("<svg") == 3
-    assert "The best policies of 3 trainings" in done.stdout
+    assert "the best policies of 3 trainings" in done.stdout

@@ -77,25 +77,31 @@ def _find_notes(runs: Sequence[RunDescription]) -> list[str]:
 
 
 def summarize_result(report: Report) -> str:
-    """Return the result as a sentence."""
+    """Return the result as a sentence.
+
+    It says where its figures come from: the best of several evaluations is better than new episodes will be.
+    """
     scored = [each for each in report.runs if each.summary.best_return is not None]
     if not scored:
         return "No evaluation yet."
     if len(scored) == 1:
         summary = scored[0].summary
         best = next(row for row in scored[0].evaluations if row.get("steps") == summary.best_step)
-        count = f"{best['episodes']:,.0f}" if best.get("episodes") else "the"
-        success = "" if summary.best_success is None else f"succeeds in {summary.best_success:.1%} of "
-        start = f"The best policy {success}" if success else "The best policy, over "
-        middle = f"{count} evaluation episodes"
-        return f"{start}{middle}; its mean return is {summary.best_return:.4g}, at step {summary.best_step:,}."
+        count = f"{best['episodes']:,.0f}" if best.get("episodes") else "its"
+        success = (
+            "" if summary.best_success is None else f"succeeds in {summary.best_success:.1%} of {count} episodes, "
+        )
+        of_return = f"a mean return of {summary.best_return:.4g}, at step {summary.best_step:,}"
+        has = f"{success}with" if success else "has"
+        return f"In the evaluation that chose it the best policy {has} {of_return}."
     successes = [each.summary.best_success for each in scored if each.summary.best_success is not None]
     returns = [each.summary.best_return for each in scored if each.summary.best_return is not None]
     of_returns = f"a mean return of {np.mean(returns):.4g} ({min(returns):.4g} to {max(returns):.4g})"
+    start = f"In the evaluations that chose them the best policies of {len(scored)} trainings"
     if len(successes) < len(scored):
-        return f"The best policies of {len(scored)} trainings have {of_returns}."
-    rates = f"{np.mean(successes):.1%} of the evaluation episodes ({min(successes):.1%} to {max(successes):.1%})"
-    return f"The best policies of {len(scored)} trainings succeed in {rates}, with {of_returns}."
+        return f"{start} have {of_returns}."
+    rates = f"{np.mean(successes):.1%} of the episodes ({min(successes):.1%} to {max(successes):.1%})"
+    return f"{start} succeed in {rates}, with {of_returns}."
 
 
 def collect_findings(report: Report) -> list[tuple[Finding, list[str]]]:
