@@ -86,9 +86,8 @@ def show(result: GroupScore, json: str | None) -> None:
     out = output.out()
     scores = [each.score for each in result.seeds if each.score is not None]
     episodes = f", {output.format_count(scores[0].episodes, 'episode')} each, seed {scores[0].seed}" if scores else ""
-    out.print(
-        f"{result.group.task}: {result.group.path}, {output.format_count(len(result.seeds), 'seed')}{episodes}",
-    )
+    seeds = output.format_count(len(result.seeds), "seed")
+    out.print(f"{result.group.task}: {result.group.path}, {seeds}{episodes}")
     success, returns = result.spread("success"), result.spread("mean_return")
     rows = [_list_cells(each) for each in result.seeds]
     for label in ("mean", "IQM", "std"):

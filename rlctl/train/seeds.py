@@ -69,10 +69,11 @@ def train_seeds(
     `UsageError` for seeds that are none, `RecipeError` for a recipe that is wrong, and `Interrupted` after a signal,
     when all have saved their checkpoints.
     """
-    if seeds is None:
+    if seeds is not None:
+        group, options = _begin(request, seeds), []
+    else:
         check_arguments(request)
-    group = _begin(request, seeds) if seeds is not None else read_group(Path(str(request.resume)))
-    options = [] if seeds is not None else list_options(request)
+        group, options = read_group(Path(str(request.resume))), list_options(request)
     waiting = [seed for seed in group.seeds if not group.is_done(seed) or options]
     jobs = _choose_jobs(group, len(waiting), jobs)
     failed = _Trainings(jobs).run({seed: _make_command(group, seed, options) for seed in waiting}, group.path)
