@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from rlctl.errors import ArtifactError, DivergedError, RecipeError, TaskError, UsageError
+from rlctl.errors import ArtifactError, DivergedError, TaskError, UsageError
 from rlctl.run import recipe as recipes
 from rlctl.run import recipe_sources
 from rlctl.run.acting import PolicyPlayer
@@ -229,33 +229,6 @@ def test_divergence_is_reported(train, small_ppo):
         train("Exploding", settings)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"algo_kwargs": {"n_step": 16}}, "no key 'algo_kwargs.n_step' for ppo. Did you mean 'n_steps'?"),
-        ({"algo": "sac", "algo_kwargs": {"n_epochs": 3}}, "no key 'algo_kwargs.n_epochs' for sac."),
-        ({"policy_kwargs": {"net_arc": [8]}}, "no key 'policy_kwargs.net_arc' for ppo. Did you mean 'net_arch'?"),
-        ({"policy_kwargs": {"activation_fn": "rellu"}}, "or silu, got 'rellu'. Did you mean 'relu'?"),
-        ({"algo_kwargs": {"learning_rate": "lin_fast"}}, "a number in (0, 1] or lin_NUMBER, got 'lin_fast'"),
-        ({"algo": "dqn"}, "dqn cannot be used here: "),
-        ({"task": {"colour": 1}}, "task.colour: "),
-        ({"reward_weights": {"speed": 1.0}}, "is a plain Gymnasium environment; only tasks have them"),
-    ],
-)
-def test_recipe_errors_name_the_key(train, small_ppo, settings, message):
-    if settings.get("algo", "ppo") != "ppo":
-        small_ppo.pop("algo_kwargs")
-    with pytest.raises(RecipeError) as caught:
-        train("Line", recipes.merge(small_ppo, settings))
-    assert message in str(caught.value)
-
-
-def test_task_and_resume_exclude_each_other():
-    for request in (TrainRequest(None), TrainRequest("reach", resume="latest")):
-        with pytest.raises(UsageError, match="give a task to train, or --resume RUN"):
-            run_training(request)
-
-
 def test_defaults_for_an_environment_without_a_recipe():
     resolved = recipe_sources.resolve(f"{ENVS}:Line", None, {})
     assert resolved.algo == "ppo"
@@ -273,14 +246,6 @@ def test_live_policy_and_saved_policy_act_the_same(finished):
     player = PolicyPlayer(*read_policy(finished.run.last_policy))
     played = [player.act(observation, 0, 0)[1] for observation in episode.observations[:-1]]
     np.testing.assert_array_equal(played, episode.actions)
-
-
-@pytest.mark.parametrize(
-    ("device", "message"), [("gpu", "--device 'gpu': no such device"), ("cuda:99", "--device cuda:99: ")]
-)
-def test_a_device_that_is_not_there(train, small_ppo, device, message):
-    with pytest.raises(UsageError, match=message):
-        train("Line", small_ppo, device=device)
 
 
 @pytest.mark.parametrize(
