@@ -1,5 +1,8 @@
 """Updates whose gradients are computed without autograd: Stable-Baselines3's own, but for rounding."""
 
+import os
+import threading
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rlctl.dict_spaces import split
+from rlctl.train.updates import choose_learner
 from rlctl.train.updates.ppo import PpoUpdate
 from rlctl.train.updates.sac import SacUpdate
 from rlctl.train.updates.tqc import TqcUpdate
@@ -145,6 +149,32 @@ def test_off_policy_updates_as_sb3(name):
     assert_same_weights(weights(one), weights(other), before)
     expected, logged = one.logger.name_to_value, other.logger.name_to_value
     assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
+
+
+WIDE = {"network": {"net_arch": [300, 300]}, "batch_size": 128}
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC])
+def test_wide_networks_are_updated_on_two_cores_to_the_same_bit(algorithm):
+    def train():
+        set_random_seed(1)
+        model = make_ppo(**WIDE) if algorithm is PPO else make_off_policy(algorithm, **WIDE)
+        learner, arguments = choose_learner(model), {} if algorithm is PPO else {"gradient_steps": 3, "batch_size": 128}
+        before = threading.active_count()
+        learner.train(**arguments)
+        return weights(model), threading.active_count() - before
+
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        on_one, threads = train()
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert threads == 0
+    on_two, threads = train()
+    assert threads == (1 if len(cores) > 1 else 0)
+    assert all(torch.equal(on_one[name], on_two[name]) for name in on_one)
 
 
 def test_what_sb3_updates_itself():

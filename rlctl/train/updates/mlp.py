@@ -30,6 +30,10 @@ class Mlp:
             else:
                 self._uses_tanh = isinstance(module, nn.Tanh)
 
+    def count_weights(self) -> int:
+        """Return how many weights the layers have: the products of a forward pass, for each row of a batch."""
+        return sum(layer.weight.numel() for layer in self._layers)
+
     def run(self, inputs: Tensor) -> list[Tensor]:
         """Return the inputs, shape (batch, features), and what each layer makes of them; the outputs come last."""
         values = [inputs]

@@ -7,6 +7,7 @@ gradient is of stands in its name: `to_mean` is the gradient of the loss with re
 from __future__ import annotations
 
 import collections
+import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,6 +21,7 @@ from torch import Tensor
 
 from rlctl.dict_spaces import join, split
 from rlctl.train.updates.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
+from rlctl.train.updates.side_by_side import SideBySide
 
 _FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
 
@@ -34,6 +36,7 @@ class PpoUpdate:
         self._actor = Mlp(_actor_modules(policy))
         self._critic = Mlp(_critic_modules(policy))
         self._gradients = share_gradients(policy.parameters())
+        self._side_by_side = SideBySide([self._actor, self._critic], model.batch_size)
 
     @staticmethod
     def supports(model: Any) -> bool:
@@ -88,8 +91,27 @@ class PpoUpdate:
         self, batch: dict[str, Tensor], clip_range: float, clip_range_vf: float | None, logged: dict[str, list[float]]
     ) -> bool:
         """Learn from a minibatch; return False, and do not, where the policy has moved further than `target_kl`."""
+        model = self._model
+        of_actor, of_critic = self._side_by_side.run(
+            [
+                functools.partial(self._compute_actor_gradients, batch, clip_range),
+                functools.partial(self._compute_critic_gradients, batch, clip_range_vf),
+            ]
+        )
+        losses = of_actor | of_critic
+        for name, loss in losses.items():
+            logged[name].append(loss)
+        entropy_loss = model.ent_coef * losses["entropy_loss"]
+        logged["loss"] = [losses["policy_gradient_loss"] + entropy_loss + model.vf_coef * losses["value_loss"]]
+        if model.target_kl is not None and losses["approx_kl"] > 1.5 * model.target_kl:
+            return False
+        self._step()
+        return True
+
+    def _compute_actor_gradients(self, batch: dict[str, Tensor], clip_range: float) -> dict[str, float]:
+        """Set the gradients of the actor's weights; return the losses that SB3 logs."""
         model, size = self._model, len(batch["actions"])
-        actor, critic = self._actor.run(batch["features"]), self._critic.run(batch["features"])
+        actor = self._actor.run(batch["features"])
         std = self._compute_std(actor)
         z = (batch["actions"] - actor[-1]) / std
         log_std = std.log()
@@ -102,33 +124,30 @@ class PpoUpdate:
         log_ratio = log_prob - batch["log_probs"]
         ratio = log_ratio.exp()
         unclipped, clipped = advantages * ratio, advantages * ratio.clamp(1 - clip_range, 1 + clip_range)
-        policy_loss = -torch.minimum(unclipped, clipped).mean().item()
+        # Where the clipped term is the smaller one, the loss does not depend on the policy.
+        to_log_prob = (unclipped * (unclipped <= clipped) / -size).unsqueeze(1)
+        self._actor.backpropagate(actor, to_log_prob * z / std)
+        self._set_std_gradient(actor, std, to_log_prob * (z.square() - 1) - model.ent_coef / size)
+        return {
+            "policy_gradient_loss": -torch.minimum(unclipped, clipped).mean().item(),
+            "entropy_loss": -entropy.mean().item(),
+            "clip_fraction": ((ratio - 1).abs() > clip_range).float().mean().item(),
+            "approx_kl": (ratio - 1 - log_ratio).mean().item(),
+        }
+
+    def _compute_critic_gradients(self, batch: dict[str, Tensor], clip_range_vf: float | None) -> dict[str, float]:
+        """Set the gradients of the critic's weights; return its loss."""
+        critic = self._critic.run(batch["features"])
         values = critic[-1].flatten()
         to_value = values - batch["returns"]
         if clip_range_vf is not None:
             moved = values - batch["values"]
             to_value = batch["values"] + moved.clamp(-clip_range_vf, clip_range_vf) - batch["returns"]
-        value_loss = to_value.square().mean().item()
-        entropy_loss = -entropy.mean().item()
-        approx_kl = (ratio - 1 - log_ratio).mean().item()
-        logged["policy_gradient_loss"].append(policy_loss)
-        logged["value_loss"].append(value_loss)
-        logged["entropy_loss"].append(entropy_loss)
-        logged["clip_fraction"].append(((ratio - 1).abs() > clip_range).float().mean().item())
-        logged["approx_kl"].append(approx_kl)
-        logged["loss"] = [policy_loss + model.ent_coef * entropy_loss + model.vf_coef * value_loss]
-        if model.target_kl is not None and approx_kl > 1.5 * model.target_kl:
-            return False
-
+        loss = to_value.square().mean().item()
         if clip_range_vf is not None:
             to_value = to_value * (moved.abs() <= clip_range_vf)
-        self._critic.backpropagate(critic, to_value.unsqueeze(1) * (2 * model.vf_coef / size))
-        # Where the clipped term is the smaller one, the loss does not depend on the policy.
-        to_log_prob = (unclipped * (unclipped <= clipped) / -size).unsqueeze(1)
-        self._actor.backpropagate(actor, to_log_prob * z / std)
-        self._set_std_gradient(actor, std, to_log_prob * (z.square() - 1) - model.ent_coef / size)
-        self._step()
-        return True
+        self._critic.backpropagate(critic, to_value.unsqueeze(1) * (2 * self._model.vf_coef / len(values)))
+        return {"value_loss": loss}
 
     def _compute_std(self, actor: list[Tensor]) -> Tensor:
         """Return the standard deviation of actions: of all alike, or with gSDE of each, shape (batch, actions)."""

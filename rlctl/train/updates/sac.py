@@ -6,6 +6,7 @@ T. Haarnoja et al., Soft Actor-Critic Algorithms and Applications, 2018, https:/
 from __future__ import annotations
 
 import collections
+import functools
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from stable_baselines3 import SAC
 from torch import Tensor
 
 from rlctl.train.updates.mlp import Mlp, is_mlp, share_gradients
+from rlctl.train.updates.side_by_side import SideBySide
 from rlctl.train.updates.squashed_actor import Sample, SquashedActor
 
 
@@ -29,6 +31,7 @@ class SacUpdate:
             [Mlp(network) for network in critic.q_networks] for critic in (model.critic, model.critic_target)
         )
         share_gradients(model.critic.parameters())
+        self._side_by_side = SideBySide(self._critics, model.batch_size)
         self._followed = [each.data for each in model.critic.parameters()]
         self._following = [each.data for each in model.critic_target.parameters()]
 
@@ -95,30 +98,39 @@ class SacUpdate:
         """Return what the critics are to expect, shape (batch, estimates)."""
         sample = self._actor.sample(next_features)
         inputs = torch.cat([next_features, sample.action], 1)
-        estimates = self._choose_estimates([target.run(inputs)[-1] for target in self._targets])
+        outputs = self._side_by_side.run([functools.partial(target.run, inputs) for target in self._targets])
+        estimates = self._choose_estimates([values[-1] for values in outputs])
         discount = self._model.gamma if batch.discounts is None else batch.discounts
         result: Tensor = batch.rewards + (1 - batch.dones) * discount * (estimates - coefficient * sample.log_prob)
         return result
 
     def _update_critics(self, inputs: Tensor, target: Tensor) -> float:
         """Return the sum of the critics' losses."""
-        loss = 0.0
-        for critic in self._critics:
-            values = critic.run(inputs)
-            loss_of_one, to_output = self._compare(values[-1], target)
-            critic.backpropagate(values, to_output)
-            loss += loss_of_one
+        losses = self._side_by_side.run(
+            [functools.partial(self._compute_critic_gradients, critic, inputs, target) for critic in self._critics]
+        )
         self._model.critic.optimizer.step()
+        return sum(losses)
+
+    def _compute_critic_gradients(self, critic: Mlp, inputs: Tensor, target: Tensor) -> float:
+        """Set the gradients of a critic's weights; return its loss."""
+        values = critic.run(inputs)
+        loss, to_output = self._compare(values[-1], target)
+        critic.backpropagate(values, to_output)
         return loss
 
     def _update_actor(self, features: Tensor, sample: Sample, coefficient: float) -> float:
         """Return the actor's loss."""
         inputs = torch.cat([features, sample.action], 1)
-        passes = [critic.run(inputs) for critic in self._critics]
+        passes = self._side_by_side.run([functools.partial(critic.run, inputs) for critic in self._critics])
         value, to_outputs = self._judge([values[-1] for values in passes])
-        to_action = torch.zeros_like(sample.action)
-        for critic, values, to_output in zip(self._critics, passes, to_outputs, strict=True):
-            to_action -= critic.input_gradient(values, to_output / len(value))[:, features.shape[1] :]
+        to_inputs = self._side_by_side.run(
+            [
+                functools.partial(critic.input_gradient, values, to_output / -len(value))
+                for critic, values, to_output in zip(self._critics, passes, to_outputs, strict=True)
+            ]
+        )
+        to_action = torch.stack(to_inputs).sum(0)[:, features.shape[1] :]
         self._actor.backpropagate(sample, to_action, coefficient / len(value))
         self._model.actor.optimizer.step()
         return (coefficient * sample.log_prob - value).mean().item()
