@@ -276,11 +276,14 @@ class Body(Motors):
 
     def set_joints(self, positions: Array, velocities: Array | None = None) -> None:
         """Place the joints: `positions` and `velocities` of shape (joints,), at rest without the latter."""
+        count = len(self.joint_indices)
+        at = self._read_values("positions", positions, count)
+        moving = [0.0] * count if velocities is None else self._read_values("velocities", velocities, count)
         pybullet.resetJointStatesMultiDof(
             self.id,
             self.joint_indices,
-            positions[:, None].tolist(),
-            (np.zeros_like(positions) if velocities is None else velocities)[:, None].tolist(),
+            [[each] for each in at],
+            [[each] for each in moving],
             physicsClientId=self.client,
         )
         self._cache.clear()

@@ -61,16 +61,19 @@ class Motors(Properties):
 
         `gain` is the part of the position error that a physics step takes away, in (0, 1].
         """
-        limits = (max_speed, max_force, gain)
+        # Tuples, because two arrays cannot be compared by `!=`.
+        speeds, forces = (None if each is None else tuple(each) for each in (max_speed, max_force))
+        limits = (speeds, forces, gain)
         plan = self._plans.get(tuple(joints))
         if plan is None or plan.limits != limits:
-            plan = self._plans[tuple(joints)] = self._plan_motors(joints, max_speed, max_force, gain)
+            plan = self._plans[tuple(joints)] = self._plan_motors(joints, speeds, forces, gain)
+        targets = self._read_values("positions", positions, len(plan.joints))
         self._forget_torques(plan.joints)
         pybullet.setJointMotorControlArray(
             self.id,
             plan.links,
             pybullet.POSITION_CONTROL,
-            targetPositions=positions.tolist(),  # half the time of an array
+            targetPositions=targets,
             forces=self._apply_strength(plan.impulses, plan.joints),
             positionGains=plan.gains,
             physicsClientId=self.client,
@@ -81,7 +84,8 @@ class Motors(Properties):
     ) -> _Plan:
         chosen = self.find_joints(joints)
         links = [self.joint_indices[joint] for joint in chosen]
-        speeds = self.joint_max_speed[chosen].tolist() if max_speed is None else max_speed
+        given = self.joint_max_speed[chosen] if max_speed is None else max_speed
+        speeds = self._read_values("max_speed", given, len(links))
         # Only the call for one joint takes a speed; the motor keeps it when the call for all sets the targets.
         for index, speed in zip(links, speeds, strict=True):
             pybullet.setJointMotorControl2(
@@ -98,20 +102,31 @@ class Motors(Properties):
         A velocity of 0 is a brake of that force.
         """
         chosen = self.find_joints(joints)
+        targets = self._read_values("velocities", velocities, len(chosen))
         self._forget_torques(chosen)
         pybullet.setJointMotorControlArray(
             self.id,
             [self.joint_indices[joint] for joint in chosen],
             pybullet.VELOCITY_CONTROL,
-            targetVelocities=velocities.tolist(),
+            targetVelocities=targets,
             forces=self._apply_strength(self._motor_impulses(chosen, max_force), chosen),
             physicsClientId=self.client,
         )
 
     def _motor_impulses(self, joints: list[int], max_force: Sequence[float] | None) -> list[float]:
         # PyBullet makes an impulse of a motor's force with the time of a whole step, and gives it in every substep.
-        forces = self.joint_max_force[joints].tolist() if max_force is None else max_force
-        return [force / self._substeps for force in forces]
+        forces = self.joint_max_force[joints] if max_force is None else max_force
+        return [force / self._substeps for force in self._read_values("max_force", forces, len(joints))]
+
+    def _read_values(self, name: str, values: Array | Sequence[float], count: int) -> list[float]:
+        # PyBullet's own message says neither of what body, nor how many there are. A list takes it half the time.
+        array = np.asarray(values, float)
+        if array.shape != (count,):
+            raise TaskError(
+                f"{self.file.name}: {name} of shape {array.shape} for {count} joints; joint_names of the body has all"
+            )
+        numbers: list[float] = array.tolist()
+        return numbers
 
     def _forget_torques(self, joints: list[int]) -> None:
         if self._commanded is not None:
@@ -138,7 +153,7 @@ class Motors(Properties):
         For joints whose motors are disabled: see `disable_motors`.
         """
         chosen = self.find_joints(joints)
-        given = self._apply_strength(torques.tolist(), chosen)
+        given = self._apply_strength(self._read_values("torques", torques, len(chosen)), chosen)
         if joints:
             self._commanded = self._commanded or [math.nan] * len(self.joint_indices)
             for joint, torque in zip(chosen, given, strict=True):

@@ -90,6 +90,30 @@ def test_a_cap_of_nothing(sim, tmp_path):
         wheels.cap_joint_speed(0)
 
 
+def test_a_value_too_few_or_too_many(sim, tmp_path):
+    wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
+    message = r"^model.urdf: {} of shape \({},\) for {} joints; joint_names of the body has all$"
+    for call, values, count in [
+        (wheels.set_joints, ("positions", 3), 2),
+        (wheels.drive_to, ("positions", 3), 2),
+        (wheels.drive_at, ("velocities", 1), 2),
+        (wheels.set_torques, ("torques", 3), 2),
+        (lambda values: wheels.set_joints(np.zeros(2), values), ("velocities", 3), 2),
+        (lambda values: wheels.drive_to(np.zeros(2), max_speed=values), ("max_speed", 3), 2),
+        (
+            lambda values: wheels.drive_at(np.zeros(1), max_force=values, joints=wheels.joint_names[:1]),
+            ("max_force", 2),
+            1,
+        ),
+    ]:
+        with pytest.raises(TaskError, match=message.format(*values, count)):
+            call(np.ones(values[1]))
+    wheels.set_joints([0.1, 0.2])  # a list will do
+    assert wheels.joint_positions == pytest.approx([0.1, 0.2])
+    for speed in (1.0, 2.0):  # and an array of its own for each call
+        wheels.drive_to(np.zeros(2), max_speed=np.full(2, speed), max_force=np.full(2, 3.0))
+
+
 def test_inverse_kinematics(sim):
     arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
     home = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])
