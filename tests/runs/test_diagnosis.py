@@ -257,6 +257,12 @@ def test_advice_has_the_recipes_value_beside_the_usual_ones(write_training):
     assert settings["clip_range"].value == 0.2  # SB3's default
 
 
+def test_advice_names_no_parameter_that_the_algorithm_does_not_have(write_training):
+    collapsed = {"return": np.concatenate([RISING[:15], np.full(15, -45.0)]), "success": None}
+    finding = next(each for each in diagnose(write_training(collapsed, recipe={"algo": "sac"})) if each.id == "Q11")
+    assert [each.name for each in finding.settings] == ["learning_rate"]  # SAC has no target_kl
+
+
 def test_every_sign_of_a_finding_exists():
     from rlctl.runs.diagnosis.findings import _texts
 

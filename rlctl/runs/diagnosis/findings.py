@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from rlctl.run.directory import RunDirectory
+from rlctl.run.hyperparameters import ON_POLICY
 from rlctl.runs.diagnosis import episode_signs, record_signs, signs, update_signs
 from rlctl.runs.diagnosis.history import History
 
@@ -113,11 +114,10 @@ def _holds(name: str, look: Callable[[str], str | None]) -> bool:
 def _settings(names: Iterable[str], history: History) -> Iterable[Setting]:
     for name in names:
         row = _texts()["settings"][name]
-        value = history.setting(name)
-        if value is None and row["common"] != "none":
-            continue  # this algorithm has no such parameter
+        if name not in history.parameters or (row.get("on_policy") and history.recipe.get("algo") not in ON_POLICY):
+            continue
         advice = f"usually {row['range']}, often {row['common']}; raise: {row['raise']}; lower: {row['lower']}"
-        yield Setting(name, value, advice)
+        yield Setting(name, history.parameters[name], advice)
 
 
 def format_finding(finding: Finding) -> list[str]:

@@ -123,13 +123,11 @@ class History:
         names = [name for name in (self.metrics[0] if self.metrics else {}) if name.startswith("term/")]
         return {name.removeprefix("term/"): self.curve(name) for name in names}
 
-    def setting(self, name: str) -> Any:
-        """Return a parameter of the algorithm as the recipe has it, or SB3's default; None if it has no such one."""
-        given = self.recipe.get("algo_kwargs") or {}
-        if name in given:
-            return given[name]
+    @functools.cached_property
+    def parameters(self) -> dict[str, Any]:
+        """The parameters of the algorithm as the recipe has them, or SB3's defaults."""
         fields = getattr(ALGORITHM_PARAMETERS.get(self.recipe.get("algo", "")), "model_fields", {})
-        return fields[name].default if name in fields else None
+        return {name: field.default for name, field in fields.items()} | (self.recipe.get("algo_kwargs") or {})
 
     @functools.cached_property
     def env(self) -> EnvInfo | None:

@@ -43,7 +43,7 @@ def gradients_explode(run: History) -> str | None:
 
 def _largest_value(run: History) -> float | None:
     """Return the most that discounted rewards can add up to, as the critic sees them; None where it is not known."""
-    gamma, settings = run.setting("gamma"), run.recipe.get("normalize")
+    gamma, settings = run.parameters.get("gamma"), run.recipe.get("normalize")
     if not isinstance(gamma, float) or not 0 <= gamma < 1 or not run.episodes:
         return None
     normalized = isinstance(settings, dict) and settings.get("reward", True)
