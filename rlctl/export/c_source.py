@@ -157,8 +157,8 @@ def _write_header(name: str, info: PolicyInfo, layout: _Layout, members: list[st
     about = [
         f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps. Written by rlctl "
         f"{rlctl.__version__}; do not edit.",
-        f"Robot: {info.env.robot}." if info.env.robot else "",
-        f"Call {name}_act every {control_dt!r} s." if control_dt is not None else "",
+        *([f"Robot: {info.env.robot}."] if info.env.robot else []),
+        *([f"Call {name}_act every {control_dt!r} s."] if control_dt is not None else []),
         "",
         f"observation, {layout.size} elements, raw: normalisation is inside"
         + (f"; one observation, the last {layout.frames} are stacked inside" if layout.frames > 1 else ""),
@@ -190,7 +190,7 @@ def _write_header(name: str, info: PolicyInfo, layout: _Layout, members: list[st
 
 def _write_comment(lines: list[str]) -> str:
     """Return a comment that ends where it is to end, whatever names a task has."""
-    plain = [" ".join(line.split()) if line.lstrip() == line else line for line in lines if line is not None]
+    plain = [" ".join(line.split()) if line.lstrip() == line else line for line in lines]
     safe = [re.sub(r"[\r\n\v\f\0]", " ", line).replace("*/", "* /").replace("/*", "/ *").rstrip("\\") for line in plain]
     return "/* " + "\n".join(f" * {line}".rstrip() for line in safe)[3:] + "\n */"
 
