@@ -181,6 +181,14 @@ def test_tasks_of_the_pages_run(page, tmp_path):
         env.close()
 
 
+def test_the_event_of_the_page_on_tasks_is_accepted():
+    (block,) = (each for each in find_blocks("python") if "def shift_base" in each.text)
+    code: dict[str, Any] = {}
+    exec(block.text, code)
+    assert list(code["shift"].ranges) == ["sideways"]
+    code["shift"].bind("shift")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TASK_PAGES)
 def test_tasks_of_the_pages_are_sound_and_train(page, tmp_path, rlctl):
