@@ -238,12 +238,10 @@ def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
 def _environment_tensors(env: WorkerVecEnv) -> Tensors:
     """Return the episodes that environments are in, what was done in them, and what was observed last."""
     histories = env.history.all()
-    nonempty = [actions for actions in histories if actions is not None and len(actions)]
-    row = env.workers.arrays.segment.action[0, :0]
     tensors = {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),
-        "environments/steps": np.array([-1 if actions is None else len(actions) for actions in histories], np.int64),
-        "environments/actions": np.concatenate([row, *nonempty]),
+        "environments/steps": np.array([len(actions) for actions in histories], np.int64),
+        "environments/actions": np.concatenate(histories),
     }
     for key, observation in env.workers.arrays.observation.items():
         tensors[f"environments/observation/{key}"] = observation
@@ -256,9 +254,6 @@ def _restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
     if len(steps) != env.num_envs:
         raise ArtifactError(f"it is of {len(steps)} environments, not {env.num_envs}")
     started = tensors["environments/episodes_started"].tolist()
-    if min(steps) < 0:
-        env.episodes_started = started
-        return f"environment {steps.index(-1)} is in an episode too long to be replayed"
     actions: list[NDArray[Any]] = np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])
     mismatch = set(env.replay_actions(started, actions))
     for key, observation in env.workers.arrays.observation.items():

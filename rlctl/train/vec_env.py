@@ -19,34 +19,25 @@ from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
 
-MAX_BYTES = 2**28
-"""Memory for actions, 256 MB, of which each environment has its part. A longer episode cannot be replayed."""
-
-
 class ActionHistory:
     """Stores the actions of each environment's running episode; `episodes` are those so far, shape (steps, ...)."""
 
     def __init__(self, episodes: Iterable[NDArray[Any]]) -> None:
         self._parts = [[actions] for actions in episodes]
-        self._bytes = [actions.nbytes for (actions,) in self._parts]
 
     def add_segment(self, actions: NDArray[Any], ended: Iterable[tuple[int, int]]) -> None:
         """Store a segment, shape (n_envs, steps, ...), in which episodes ended: (environment, row) each, by row."""
         last = dict(ended)
         for env, rows in enumerate(actions):
-            new = rows[last.get(env, -1) + 1 :].copy()
             if env in last:
-                self._parts[env], self._bytes[env] = [], 0
-            self._bytes[env] += new.nbytes
-            if self._bytes[env] <= MAX_BYTES // len(actions):
-                self._parts[env].append(new)
+                self._parts[env] = []
+            self._parts[env].append(rows[last.get(env, -1) + 1 :].copy())
 
-    def of(self, env: int) -> NDArray[Any] | None:
-        """Return the actions of an environment's episode so far, shape (steps, ...); None if they are too many."""
-        parts = self._parts[env]
-        return np.concatenate(parts) if sum(part.nbytes for part in parts) == self._bytes[env] else None
+    def of(self, env: int) -> NDArray[Any]:
+        """Return the actions of an environment's episode so far, shape (steps, ...)."""
+        return np.concatenate(self._parts[env])
 
-    def all(self) -> list[NDArray[Any] | None]:
+    def all(self) -> list[NDArray[Any]]:
         """Return `of` every environment."""
         return [self.of(env) for env in range(len(self._parts))]
 
@@ -146,14 +137,13 @@ class WorkerVecEnv(VecEnv):
         self.last_segment = segment.first(steps, ended)
         return self.last_segment
 
-    def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any] | None:
-        """Return the actions of a failed episode, that of the failed step last; None if it goes too far back."""
+    def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any]:
+        """Return the actions of a failed episode, that of the failed step last."""
         arrays = self.workers.arrays
         rows = int(arrays.inside[error.env, 2]) + 1
         if error.step <= rows:
             return arrays.segment.action[error.env, rows - error.step : rows].copy()
-        before = self.history.of(error.env)
-        return None if before is None else np.concatenate([before, arrays.segment.action[error.env, :rows]])
+        return np.concatenate([self.history.of(error.env), arrays.segment.action[error.env, :rows]])
 
     def step_async(self, actions: NDArray[Any]) -> None:
         raise NotImplementedError("workers play segments; nothing steps them one by one")
