@@ -38,7 +38,6 @@ class Curriculum:
         """What the environments of `goal_spec` are."""
         self._specs = specs
         self._progress = progress
-        self._warned = False
         if stages and not progress.stage:
             progress.stage = 1
 
@@ -106,18 +105,6 @@ class Curriculum:
         progress = self._progress
         progress.stage, progress.stage_began, progress.stage_episodes = progress.stage + 1, steps, []
         return self.title, f"after {steps:,} steps: {reason} over {format_count(rule.window, 'episode')}"
-
-    def warning(self) -> str | None:
-        """Return, once, what is wrong with a rule that nothing can fulfil."""
-        rule = self._rule
-        values = self._progress.stage_episodes
-        if rule is None or self._warned or len(values) < rule.window or any(each is not None for each in values):
-            return None
-        self._warned = True
-        return (
-            f"warning: {self.title}: promote.success waits for info['is_success'], which none of the last "
-            f"{rule.window} episodes has given; promote.return needs none"
-        )
 
 
 def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:

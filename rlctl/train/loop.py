@@ -124,8 +124,6 @@ class TrainingLoop:
         ended, env.ended = env.ended, []
         progress.recent += ended
         self.curriculum.count(ended)
-        if warning := self.curriculum.warning():
-            self._display.message(warning)
         if env.outside and not progress.observations_outside:
             self._display.message(
                 f"warning: {env.outside_message}; such observations are counted, and taken as they are"
