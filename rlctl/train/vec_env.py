@@ -19,6 +19,7 @@ from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
 
+
 class ActionHistory:
     """Stores the actions of each environment's running episode; `episodes` are those so far, shape (steps, ...)."""
 
