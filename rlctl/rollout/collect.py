@@ -71,9 +71,7 @@ def play_episodes(
 
     def play(env: int, seed: int) -> None:
         contacts = terms and running[env].index < _CONTACTS_MEASURED
-        workers.start_playing(
-            Play(steps, {env: seed}, exploration=exploration, until_end=True, record=terms, contacts=contacts)
-        )
+        workers.start_playing(Play(steps, {env: seed}, exploration=exploration, record=terms, contacts=contacts))
 
     for env in workers.first_envs:
         begin(env)

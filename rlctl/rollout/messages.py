@@ -94,8 +94,6 @@ class Play:
     """Per environment the number of the training episode that begins where one ends; empty: none begins."""
     run_seed: int = 0
     exploration: Exploration = dataclasses.field(default_factory=Exploration)
-    until_end: bool = False
-    """Whether to stop where an episode ends."""
     record: bool = False
     """Whether to write reward terms."""
     contacts: bool = False

@@ -192,8 +192,8 @@ class Worker:
         player.begin_segment(episode.seed, episode.step)
         inside[0] = episode.seed
         ended: list[EpisodeResult] = []
-        row, only_one = 0, asked.until_end or next_seeds is None
-        while row < asked.steps and not (only_one and ended):
+        row = 0
+        while row < asked.steps and not (ended and next_seeds is None):
             observation = single[row] if single is not None else {key: rows[row] for key, rows in now.items()}
             began = perf_counter()
             chosen, action = player.act(observation, episode.seed, episode.step)

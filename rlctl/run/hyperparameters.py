@@ -25,7 +25,6 @@ _Schedule = _PositiveFraction | Annotated[str, NumberAfter("lin_", _PositiveFrac
 _ClipSchedule = _ClipRange | Annotated[str, NumberAfter("lin_", _ClipRange)]
 _PositiveSchedule = _Positive | Annotated[str, NumberAfter("lin_", _Positive)]
 _EntropyCoefficient = _NotNegative | Literal["auto"] | Annotated[str, NumberAfter("auto_", _Positive)]
-_TrainFreq = _Count | tuple[_Count, Literal["step", "episode"]]
 
 
 def decide_by(rule: str) -> dict[str, Any]:
@@ -114,7 +113,7 @@ class _OffPolicy(Parameters):
     """Transitions per gradient step."""
     gamma: _PositiveFraction = 0.99
     """Discount per step."""
-    train_freq: _TrainFreq = Field(1, examples=["[1, episode]"], json_schema_extra=decide_by("1"))
+    train_freq: _Count = Field(1, json_schema_extra=decide_by("1"))
     """Steps of each environment between updates."""
     gradient_steps: _Count | Literal[-1] = Field(1, json_schema_extra=decide_by("-1"))
     """Gradient steps per update; -1: as many as environment steps were taken."""
@@ -196,7 +195,7 @@ class Dqn(_OffPolicy):
     batch_size: Whole = Field(32, ge=2, le=10**9)
     tau: _PositiveFraction = 1.0
     """Share of the online network in each update of the target network."""
-    train_freq: _TrainFreq = Field(4, examples=["[1, episode]"], json_schema_extra=decide_by("1"))
+    train_freq: _Count = Field(4, json_schema_extra=decide_by("1"))
     """Steps of each environment between updates."""
     target_update_interval: _Count = 10_000
     """Steps between updates of the target network."""

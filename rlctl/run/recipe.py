@@ -129,12 +129,6 @@ class Recipe(Section):
 
     @pydantic.model_validator(mode="after")
     def _fit_together(self) -> Recipe:
-        train_freq = self.algo_kwargs.get("train_freq")
-        if self.n_envs > 1 and isinstance(train_freq, list) and train_freq[1] == "episode":
-            raise ValueError(
-                f"algo_kwargs.train_freq: {train_freq} counts the episodes of one environment, and n_envs is "
-                f"{self.n_envs}; count steps, such as train_freq: {train_freq[0]}, or set n_envs: 1"
-            )
         dropped = self.algo_kwargs.get("top_quantiles_to_drop_per_net", 0)
         if dropped >= (quantiles := self.policy_kwargs.get("n_quantiles", _QUANTILES)):
             raise ValueError(

@@ -114,9 +114,7 @@ def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:
 
 
 def _convert(value: Any) -> Any:
-    if isinstance(value, str) and value.startswith("lin_"):
-        return _linear(value)
-    return tuple(value) if isinstance(value, list) else value
+    return _linear(value) if isinstance(value, str) and value.startswith("lin_") else value
 
 
 def _linear(text: str) -> Callable[[float], float]:

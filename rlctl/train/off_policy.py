@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from rlctl.dict_spaces import join, split_space
-from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.run.acting import Exploration
 from rlctl.run.network import DETERMINISTIC
 from rlctl.run.recipe import Recipe
@@ -17,12 +15,9 @@ from rlctl.train.progress import Progress
 from rlctl.train.rollouts import Check, Rollouts, to_network_layout
 from rlctl.train.vec_env import WorkerVecEnv
 
-_LONGEST = 1000
-"""Steps after which an episode without a time limit is stored in parts."""
-
 
 class OffPolicyRollouts(Rollouts):
-    """Plays `train_freq` steps or episodes, a chunk, into the replay buffer.
+    """Plays `train_freq` steps, a chunk, into the replay buffer.
 
     With `overlap` a chunk is played with the policy from before the updates that the chunk before it is due, while
     these are computed: it is one chunk older than without. The order follows from steps alone, so it repeats exactly.
@@ -39,15 +34,7 @@ class OffPolicyRollouts(Rollouts):
 
     def start(self) -> None:
         self.send_policy(self.acting_statistics())
-        frequency, unit = self.model.train_freq
-        self._episodes_left = frequency if unit == TrainFrequencyUnit.EPISODE else 0
-        if self._episodes_left:
-            self._start_episode()
-        else:
-            self.env.start(frequency, self._exploration())
-
-    def _start_episode(self) -> None:
-        self.env.start(self.env.workers.info.max_steps or _LONGEST, self._exploration(), until_end=True)
+        self.env.start(self.model.train_freq.frequency, self._exploration())
 
     def _exploration(self) -> Exploration:
         model = self.model
@@ -61,16 +48,8 @@ class OffPolicyRollouts(Rollouts):
         )
 
     def finish(self, check: Check | None) -> None:
-        while True:
-            segment = self.env.finish(check)
-            self._store(segment)
-            self._episodes_left -= len(segment.ended)
-            if self._episodes_left <= 0:
-                return
-            self._start_episode()
-
-    def _store(self, segment: SegmentArrays) -> None:
-        """Put a chunk into the replay buffer, raw, and do what SB3 does after each step."""
+        """Put the chunk into the replay buffer, raw, and do what SB3 does after each step."""
+        segment = self.env.finish(check)
         model, spaces = self.model, split_space(self.model.observation_space)
         observation = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.observation.items()}
         final = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.final.items()}

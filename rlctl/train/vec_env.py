@@ -79,7 +79,7 @@ class WorkerVecEnv(VecEnv):
         """What `finish` returned last; its arrays are overwritten by the next."""
         self.waited_s = 0.0
         """Time spent waiting for the environments to play [s], since it was set to 0."""
-        self._steps, self._until_end = 0, False
+        self._steps = 0
         self.render_mode = None
         super().__init__(workers.n_envs, *workers.info.spaces())
 
@@ -109,13 +109,11 @@ class WorkerVecEnv(VecEnv):
         self.history = ActionHistory(actions)
         return ended
 
-    def start(self, steps: int, exploration: Exploration, *, until_end: bool = False) -> None:
-        """Begin to play up to `steps` steps, with `until_end` only up to the end of the running episode."""
-        self._steps, self._until_end = steps, until_end
+    def start(self, steps: int, exploration: Exploration) -> None:
+        """Begin to play `steps` steps of each environment."""
+        self._steps = steps
         going_on, following = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
-        self.workers.start_playing(
-            Play(steps, going_on, following, self.run_seed, exploration=exploration, until_end=until_end)
-        )
+        self.workers.start_playing(Play(steps, going_on, following, self.run_seed, exploration=exploration))
 
     def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
         """Wait for what `start` has begun; `check` is called several times a second."""
@@ -126,8 +124,7 @@ class WorkerVecEnv(VecEnv):
             error.actions = self._failed_actions(error)
             raise
         self.waited_s += time.monotonic() - began
-        segment = self.workers.arrays.segment
-        steps = ended[0].row + 1 if self._until_end and ended else self._steps
+        segment, steps = self.workers.arrays.segment, self._steps
         for result in ended:
             self.episodes_started[result.env] += 1
         self.history.add_segment(segment.action[:, :steps], [(each.env, each.row) for each in ended])

@@ -34,7 +34,7 @@ ARGUMENTS = {
     # The ring of the replay buffer closes, and its segments are merged and removed.
     "sac": _line(
         *("algo_kwargs.learning_starts=8", "algo_kwargs.batch_size=8", "algo_kwargs.buffer_size=24"),
-        *("algo_kwargs.train_freq=[4,\"step\"]", "algo_kwargs.gradient_steps=1", "checkpoint.keep=2"),
+        *("algo_kwargs.train_freq=4", "algo_kwargs.gradient_steps=1", "checkpoint.keep=2"),
         algo="sac", steps=40, evaluate=24,
     ),
     # Five updates, and three checkpoints to fall back on.
@@ -44,7 +44,7 @@ ARGUMENTS = {
     ),
     "sac, kept": _line(
         *("algo_kwargs.learning_starts=8", "algo_kwargs.batch_size=8", "algo_kwargs.buffer_size=48"),
-        *("algo_kwargs.train_freq=[4,\"step\"]", "algo_kwargs.gradient_steps=1", "checkpoint.keep=3"),
+        *("algo_kwargs.train_freq=4", "algo_kwargs.gradient_steps=1", "checkpoint.keep=3"),
         algo="sac", steps=48, evaluate=16,
     ),
 }  # fmt: skip

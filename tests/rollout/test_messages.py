@@ -27,7 +27,7 @@ EXPLORATION = Exploration(stochastic=True, epsilon=0.5)
         ),
         messages.LoadPolicy(other="zero"),
         messages.LimitActions({"low": [-math.inf]}),
-        messages.Play(40, {0: -1, 3: 7}, {0: 5}, run_seed=3, exploration=EXPLORATION, until_end=True),
+        messages.Play(40, {0: -1, 3: 7}, {0: 5}, run_seed=3, exploration=EXPLORATION),
         messages.ComputeRewards(b"\xff\n"),
     ],
     ids=lambda message: type(message).__name__,

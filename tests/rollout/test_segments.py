@@ -86,17 +86,6 @@ def test_episodes_of_one_step(spec, start):
     assert (played["observation"] == 0.0).all()
 
 
-def test_a_segment_up_to_the_end_of_an_episode(spec, start):
-    """As off-policy algorithms play whose `train_freq` counts episodes: the next one has begun then."""
-    workers = start(spec("Walk"), 1)
-    workers.set_policy(*linear(workers.info, WEIGHT))
-    workers.start_playing(Play(50, {0: seed(0, 0)}, {0: 1}, run_seed=3, until_end=True))
-    (result,) = workers.finish_playing()
-    assert result.row + 1 == result.length < 50
-    first, _ = spec("Walk").make().reset(seed=seed(0, 1))
-    np.testing.assert_array_equal(workers.observations()[0], first)
-
-
 def test_an_environment_stops_where_its_episode_ends_without_a_next_one(spec, start):
     workers = start(spec("Walk"), 2, n_workers=1)
     workers.set_policy(*linear(workers.info, WEIGHT))

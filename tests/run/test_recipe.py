@@ -148,7 +148,7 @@ def test_what_cannot_be(values, message):
         {"learning_rate": "lin_3e-4"},
         {"ent_coef": "auto_0.1"},
         {"n_steps": 1e3},
-        {"train_freq": [1, "episode"]},
+        {"train_freq": 8},
         {"gradient_steps": -1},
     ],
 )
