@@ -41,37 +41,20 @@ class Table:
         """Write the rows that wait; with `sync` down to the disk itself. All of them, or `OSError` and none."""
         if self._waiting:
             # Whoever edits or removes the file while a training runs loses rows, but no more than that.
-            size = self._count_whole_rows()
+            size = min(self.size, _read_size(self.path))
             columns = self._read_columns() if size else None
-            if size and columns is None:
+            if columns is not None and next(iter(self._waiting[0])) not in columns:
                 files.set_aside(self.path)
-                size = 0
+                size, columns = 0, None
             content = self._format_rows(columns).encode()
             files.append(self.path, content, size)
             self.size, self._waiting = size + len(content), []
         if sync and self.size:
             files.sync(self.path)
 
-    def _count_whole_rows(self) -> int:
-        """Return how many bytes of the file are rows of ours: fewer than `size` if somebody has cut or edited it."""
-        size = min(self.size, _read_size(self.path))
-        if not size:
-            return 0
-        with self.path.open("rb") as file:
-            file.seek(size - 1)
-            if file.read(1) == b"\n":
-                return size
-            file.seek(0)
-            return file.read(size).rfind(b"\n") + 1
-
-    def _read_columns(self) -> list[str] | None:
-        """Return the file's header; None if it is not the one of these rows any more."""
-        with self.path.open(newline="", encoding="utf-8", errors="replace") as file:
-            try:
-                columns = next(csv.reader(file), [])
-            except csv.Error:
-                return None
-        return columns if next(iter(self._waiting[0])) in columns else None
+    def _read_columns(self) -> list[str]:
+        with self.path.open(encoding="utf-8", errors="replace") as file:
+            return next(csv.reader([file.readline()]), [])
 
     def _format_rows(self, columns: list[str] | None) -> str:
         text = io.StringIO()

@@ -80,7 +80,6 @@ CHANGES = {
     "episodes removed": lambda run: shutil.rmtree(run.episodes),
     "metrics removed": lambda run: run.metrics_file.unlink(),
     "metrics emptied": lambda run: edited(run.metrics_file, lambda content: b""),
-    "metrics cut": lambda run: edited(run.metrics_file, lambda content: content[:-7]),
     "metrics longer": lambda run: edited(run.metrics_file, lambda content: content + b"a note, by hand\n"),
     "metrics sorted out": lambda run: edited(run.metrics_file, lambda content: content.replace(b",", b";")),
     "evals removed": lambda run: run.evals_file.unlink(),

@@ -80,7 +80,6 @@ def test_the_next_checkpoint_is_whole(trials, whole, change, name, what, after):
     [
         ("metrics removed", [64, 80]),
         ("metrics emptied", [64, 80]),
-        ("metrics cut", [16, 32, 64, 80]),
         ("metrics longer", [16, 32, 48, 64, 80]),
         ("metrics sorted out", [64, 80]),
     ],
