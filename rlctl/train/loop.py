@@ -13,7 +13,6 @@ from typing import Any
 
 from rlctl.errors import ArtifactError, Interrupted, RlctlError, TaskError, UsageError
 from rlctl.eval.statistics import mean_return, success_rate
-from rlctl.output import format_count
 from rlctl.rollout.collect import Episode
 from rlctl.run.policy import Score
 from rlctl.run.recipe import ON_POLICY, Recipe
@@ -260,7 +259,8 @@ class TrainingLoop:
 
     def _save_the_end(self) -> None:
         self.progress.done = True
-        if not self.saver.retry(self.save_checkpoint):
+        # Once more: after the last checkpoint there is no next one.
+        if not self.save_checkpoint() and not self.save_checkpoint():
             raise ArtifactError(
                 f"{self.saver.run.path}: the training is done, but could not be saved: {self.saver.problem}"
             )
@@ -276,8 +276,7 @@ class TrainingLoop:
 
     def write_end(self, recordings: int) -> list[Path]:
         """Write that the training is done; return the requested recordings of the last evaluation's episodes."""
-        if count := self.progress.observations_outside:
-            self._display.message(f"warning: outside their space: {format_count(count, 'observation')}")
-        write = lambda: status.write_end(self.saver.run, self.steps, self.progress)  # noqa: E731
-        self.saver.retry(lambda: self.saver.attempt("run.json", write))
+        for _ in range(2):  # once more, if the disk has not taken it
+            if self.saver.attempt("run.json", lambda: status.write_end(self.saver.run, self.steps, self.progress)):
+                break
         return self._evaluator.record(recordings)

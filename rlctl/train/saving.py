@@ -20,9 +20,6 @@ Packed = tuple[PolicyInfo, Tensors]
 
 CHECKPOINT_TIME_SHARE = 0.02
 """Part of the training's time that checkpoints may take."""
-PAUSES_S = (1.0, 5.0)
-"""How long to wait before what ends a training is tried once more."""
-_REMIND_EVERY_S = 60.0
 
 
 class Saver:
@@ -41,7 +38,8 @@ class Saver:
         self._next_checkpoint = time.monotonic()
         self._uncounted_checkpoints = 1
         """Checkpoints that come whether they are due or not: the last one."""
-        self._reminded = 0.0
+        self._reported: set[str] = set()
+        """Problems that were reported since everything was saved."""
         self._unsaved_best: Packed | None = None
         """The best policy, until the disk takes it."""
 
@@ -60,18 +58,10 @@ class Saver:
         return True
 
     def _report(self, problem: str) -> None:
-        if problem != self.problem or time.monotonic() - self._reminded > _REMIND_EVERY_S:
+        if problem not in self._reported:
             self._warn(f"warning: not saved: {problem}; training goes on")
-            self._reminded = time.monotonic()
+        self._reported.add(problem)
         self.problem = problem
-
-    def retry(self, write: Callable[[], bool]) -> bool:
-        """Call `write` until it returns True, a few times: after the last checkpoint there is no next one."""
-        for pause in (*PAUSES_S, 0.0):
-            if write():
-                return True
-            time.sleep(pause)
-        return False
 
     def row(self, table: Table, row: dict[str, Any]) -> None:
         """Add a row to a table; one that the disk does not take now is written with the next."""
@@ -106,9 +96,9 @@ class Saver:
         return saved
 
     def _report_saved_again(self) -> None:
-        if self.problem:
+        if self._reported:
             self._warn(f"saved again, at step {self.saved_step:,}")
-        self.problem = ""
+        self._reported.clear()
 
     def _write_checkpoint(self, packed: Packed, progress: Progress) -> None:
         # Whoever goes on from a checkpoint will not come by here again: everything before it must be on the disk.

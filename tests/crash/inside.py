@@ -24,7 +24,6 @@ def run(arguments, plan):
     from rlctl.train import saving
 
     saving.CHECKPOINT_TIME_SHARE = plan.get("time_for_checkpoints", 1e9)  # at every boundary
-    saving.PAUSES_S = (0.0, 0.0)
     _announce(saving.Saver, log)
     files.os = FaultyOs(log, **plan.get("disk", {}))
     files.shutil = FaultyShutil(files.os)

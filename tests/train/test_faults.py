@@ -144,7 +144,6 @@ def test_observations_outside_their_space_are_counted_and_reported(train, capfd)
     ) in printed
     # Each of two environments took 32 steps, in four episodes; three had a fifth step.
     assert run.status()["observations_outside"] == 2 * 3
-    assert "warning: outside their space: 6 observations" in printed
 
 
 def test_a_file_system_without_locks_is_warned_of(train, monkeypatch, capfd):
