@@ -94,18 +94,11 @@ def remove_with_report(removal: Removal, *, yes: bool) -> None:
 
 
 def remove(removal: Removal) -> None:
-    """Remove the folders; raises `UsageError` for a run that is being trained by now."""
+    """Remove the folders; each under another name first, so that a half-removed one is not taken for a run."""
     for path in removal.paths:
-        if is_being_written(path if (path / ".lock").exists() else path.parent):
-            raise UsageError(f"{path}: this run is being trained; it was not removed")
-        _remove_folder(path)
-
-
-def _remove_folder(path: Path) -> None:
-    """Remove a folder; under another name first, so that a half-removed one is not taken for a run."""
-    beside = path.with_name(f".{path.name}.removed")
-    try:
-        path.rename(beside)
-        shutil.rmtree(beside)
-    except OSError as error:
-        raise ArtifactError(f"{path}: cannot be removed: {error.strerror}") from None
+        beside = path.with_name(f".{path.name}.removed")
+        try:
+            path.rename(beside)
+            shutil.rmtree(beside)
+        except OSError as error:
+            raise ArtifactError(f"{path}: cannot be removed: {error.strerror}") from None
