@@ -264,13 +264,7 @@ def main(connection: Connection, job: dict[str, Any]) -> None:
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # lines are forwarded at once
     try:
         _serve(connection, Worker(messages.Job(**job)))
-    except (BrokenPipeError, ConnectionResetError):  # the main process needs no more answers
-        return
-    except OSError as error:
-        reason = error.strerror
-        write_stderr(
-            f"no connection to rlctl any more ({reason}): did an environment close a file descriptor of rlctl?"
-        )
+    except OSError:  # the main process needs no more answers, or an environment has closed the connection
         sys.exit(1)
 
 

@@ -94,10 +94,9 @@ def test_a_reset_that_hangs(fail):
     assert ", step 0; " in str(error)
 
 
-def test_connections_closed_by_the_environment(fail, capfd):
+def test_connections_closed_by_the_environment(fail):
     error, _ = fail(fault="closes files")
     assert "worker 1 ended with exit code 1 while " in str(error)
-    assert "did an environment close a file descriptor of rlctl?" in capfd.readouterr().err
 
 
 def test_an_environment_that_cannot_be_built_leaves_no_run(train, tmp_path):
