@@ -22,6 +22,8 @@ Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
 """Shape and dtype per name."""
 
 _ALIGNMENT = 64  # [bytes], a cache line: two workers never write one
+_ROWS = ("stored", "action", "reward", "terminated", "truncated", "terms")
+"""The arrays of a segment that have a row for each step."""
 
 
 def observation_fields(space: spaces.Space[Any]) -> Layout:
@@ -87,12 +89,7 @@ class SharedArrays:
         self.segment = SegmentArrays(
             {key: arrays[f"segment/observation/{key}"] for key in observation},
             {key: arrays[f"segment/final/{key}"] for key in observation},
-            arrays["segment/stored"],
-            arrays["segment/action"],
-            arrays["segment/reward"],
-            arrays["segment/terminated"],
-            arrays["segment/truncated"],
-            arrays["segment/terms"],
+            **{name: arrays[f"segment/{name}"] for name in _ROWS},
         )
 
 
@@ -133,13 +130,8 @@ class SegmentArrays:
         return SegmentArrays(
             {key: rows[observed] for key, rows in self.observation.items()},
             {key: rows[index] for key, rows in self.final.items()},
-            self.stored[index],
-            self.action[index],
-            self.reward[index],
-            self.terminated[index],
-            self.truncated[index],
-            self.terms[index],
-            ended,
+            **{name: getattr(self, name)[index] for name in _ROWS},
+            ended=ended,
         )
 
 
