@@ -54,9 +54,9 @@ def test_a_function_acts_within_the_space(functions):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("of_another_shape", r"it returned \[1.0\], an action has shape \(2,\), float32"),
-        ("nothing", "it returned None, an action has shape"),
-        ("not_a_number", r"it returned \[nan, 0.0\], which is not finite"),
+        ("of_another_shape", r"it returned \[1.0\], the actions are Box\(-1.0, 1.0, \(2,\), float32\)"),
+        ("nothing", "it returned None, the actions are Box"),
+        ("not_a_number", r"it returned \[nan, 0.0\], the actions are Box"),
         ("raises", "KeyError: 'hand'"),
     ],
 )
@@ -67,7 +67,7 @@ def test_what_a_function_does_wrong(functions, name, message):
 
 
 def test_a_discrete_action_is_one_of_the_space(functions):
-    with pytest.raises(PolicyError, match="an action has shape"):
+    with pytest.raises(PolicyError, match="the actions are Discrete"):
         act(f"{functions}:to_goal", spaces.Discrete(2))
 
 
@@ -97,7 +97,7 @@ def test_a_baseline_is_evaluated_as_a_policy_is(functions):
     ones = run_evaluation(EvalRequest("reach", baseline=f"{functions}:seven", episodes=2), Gates())
     assert [each.result.seed for each in ones.episodes] == [each.result.seed for each in zero.episodes]
     assert ones.returns.mean != zero.returns.mean
-    with pytest.raises(PolicyError, match=r"shape \(7,\), float32\nin environment 0, episode seed \d+, step 0$"):
+    with pytest.raises(PolicyError, match=r"\(7,\), float32\)\nin environment 0, episode seed \d+, step 0$"):
         run_evaluation(EvalRequest("reach", baseline=f"{functions}:to_goal", episodes=1), Gates())
 
 
