@@ -58,12 +58,6 @@ class _Loader(yaml.SafeLoader):
     def construct_float(self, node: yaml.ScalarNode) -> float:
         return float(self.construct_scalar(node).replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan"))
 
-    def construct_text(self, node: yaml.ScalarNode) -> str:
-        text: str = self.construct_scalar(node)
-        if any("\ud800" <= character <= "\udfff" for character in text):
-            raise _make_error(f"{short_repr(ascii(text))} has an unpaired surrogate, which no file can hold", node)
-        return text
-
 
 def _make_error(message: str, node: Any) -> yaml.YAMLError:
     return yaml.constructor.ConstructorError(problem=message, problem_mark=node.start_mark)
@@ -73,17 +67,11 @@ def _check_key(node: yaml.Node) -> str:
     if node.tag != f"{_PREFIX}str" or not isinstance(node.value, str):
         given = short_repr(node.value) if isinstance(node.value, str) else "a list or a mapping"
         raise _make_error(f"{given} cannot be a key: keys are text, numbers in quotes", node)
-    if node.value == "<<":
-        raise _make_error("merge keys (<<) are not supported: write the values out", node)
     return node.value
 
 
-for _tag, _construct in (
-    ("int", _Loader.construct_int),
-    ("float", _Loader.construct_float),
-    ("str", _Loader.construct_text),
-):
-    _Loader.add_constructor(f"{_PREFIX}{_tag}", _construct)
+_Loader.add_constructor(f"{_PREFIX}int", _Loader.construct_int)
+_Loader.add_constructor(f"{_PREFIX}float", _Loader.construct_float)
 # https://yaml.org/spec/1.2.2/#103-core-schema, and digits grouped by underscores.
 for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
