@@ -57,8 +57,6 @@ class _OnPolicy(Parameters):
     """State-dependent exploration (gSDE)."""
     sde_sample_freq: _Count | Literal[-1] = -1
     """Steps between new gSDE noise; -1: once per rollout."""
-    stats_window_size: _Count = 100
-    """Episodes in the running means of TensorBoard."""
 
 
 class Ppo(_OnPolicy):
@@ -137,8 +135,6 @@ class _MaximumEntropy(_Continuous):
     """Steps between new gSDE noise; -1: once per rollout."""
     use_sde_at_warmup: Switch = False
     """Whether to use gSDE instead of random actions before `learning_starts`."""
-    stats_window_size: _Count = 100
-    """Episodes in the running means of TensorBoard."""
 
 
 class Sac(_MaximumEntropy):
@@ -184,8 +180,6 @@ class Td3(Ddpg):
     """Standard deviation of the noise that smooths the target policy."""
     target_noise_clip: _NotNegative = 0.5
     """That noise is clipped to this."""
-    stats_window_size: _Count = 100
-    """Episodes in the running means of TensorBoard."""
 
 
 class Dqn(_OffPolicy):
@@ -207,8 +201,6 @@ class Dqn(_OffPolicy):
     """Share of random actions at the end."""
     max_grad_norm: _Positive = 10.0
     """Gradients are clipped to this norm."""
-    stats_window_size: _Count = 100
-    """Episodes in the running means of TensorBoard."""
 
 
 ALGORITHM_PARAMETERS: dict[str, type[Parameters]] = {

@@ -44,7 +44,6 @@ NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
         ("ppo", "normalize_advantage=1", "expected true or false, got 1"),
         ("ppo", "use_sde=on", "expected true or false, got 'on'"),
         ("ppo", "sde_sample_freq=-2", "expected a whole number in [1, 1e9] or -1, got -2"),
-        ("ppo", "stats_window_size=0", "expected a whole number in [1, 1e9], got 0"),
         ("a2c", "rms_prop_eps=0", "expected a number in (0, 1], got 0"),
         ("a2c", "use_rms_prop=null", "expected true or false, got None"),
         ("sac", "ent_coef=autoo", "expected a number >= 0 or auto or auto_NUMBER, got 'autoo'"),

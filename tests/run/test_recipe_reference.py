@@ -16,6 +16,7 @@ from rlctl.run.torch_policy import ALGORITHMS as CLASSES
 NOT_FOR_RECIPES = {
     *("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log", "policy_kwargs", "_init_setup_model"),
     "optimize_memory_usage",  # a checkpoint needs the whole buffer
+    "stats_window_size",  # of means that nothing shows: metrics have those since the row before
     *("rollout_buffer_class", "rollout_buffer_kwargs", "replay_buffer_class", "replay_buffer_kwargs"),
 }
 NOT_FOR_POLICIES = {
