@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import VecTransposeImage
-from torch.overrides import TorchFunctionMode
 
 from rlctl.dict_spaces import Observations, join, split
 from rlctl.errors import ArtifactError, short_repr
@@ -140,29 +138,7 @@ class _NoOptimizer:
         del parameters, settings
 
 
-class _NoLargerThan(TorchFunctionMode):
-    """While it is active, refuses to make tensors that are out of all proportion to a file of `elements`.
-
-    Networks are built before their tensors are put in: a description must not make one that no file belongs to.
-    """
-
-    def __init__(self, elements: int) -> None:
-        super().__init__()
-        # A network is built of its parameters, their initial values, and what these are computed with.
-        self._left = 4 * elements + 1_000_000
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func in _MAKERS:
-            sizes = (kwargs or {}).get("size", args[0] if args and isinstance(args[0], list | tuple) else args)
-            self._left -= max(math.prod(size for size in sizes if isinstance(size, int)), _LEAST_COST)
-            if self._left < 0:
-                raise ArtifactError("its description is of a network larger than its tensors")
-        return func(*args, **(kwargs or {}))
-
-
-_MAKERS = frozenset({torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn})
 _NOTHING = np.zeros(0)
-_LEAST_COST = 1000  # also many small tensors take memory
 
 
 class TorchPolicy(Policy):
@@ -195,9 +171,8 @@ class TorchPolicy(Policy):
 
     @classmethod
     def _build(cls, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> TorchPolicy:
-        """Build the network that a description asks for, and try it; never one larger than its tensors."""
-        with _NoLargerThan(sum(value.size for value in tensors.values())):
-            network = build_network(info)
+        """Build the network that a description asks for, and try it."""
+        network = build_network(info)
         prefix = "policy/"
         state = {
             name[len(prefix) :]: torch.from_numpy(value.copy())
