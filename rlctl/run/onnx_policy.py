@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from rlctl.dict_spaces import Observations, split
 from rlctl.env_spec import LARGEST_SPACE
 from rlctl.errors import ArtifactError, UsageError, short_repr
-from rlctl.run import memory, onnx_file, untrusted
+from rlctl.run import onnx_file, untrusted
 from rlctl.run.onnx_file import METADATA_KEY
 from rlctl.run.policy import Policy, PolicyInfo, parse_info
 
@@ -28,7 +27,6 @@ STATE_OUTPUTS = ("state_h_out", "state_c_out")
 
 _FATAL_ONLY = 4
 _LARGEST = 2 * 2**30  # [bytes] of a file, the most that its format can hold
-_MEMORY = 2 * 2**30  # [bytes]
 
 
 class OnnxPolicy(Policy):
@@ -110,7 +108,6 @@ def _open_session(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, s
     except ValueError as error:
         raise ArtifactError(f"{path}: damaged, or not an ONNX file of rlctl: {error}") from None
     try:
-        _limit_memory()
         session = onnxruntime.InferenceSession(content, _make_options(), providers=["CPUExecutionProvider"])
         return session, session.get_modelmeta().custom_metadata_map
     except Exception as error:  # onnxruntime's own errors have no public base class
@@ -120,23 +117,10 @@ def _open_session(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, s
         ) from None
 
 
-@functools.cache
-def _limit_memory() -> None:
-    """Bound what all graphs of this process may take: a small file can ask for any amount."""
-    there = memory.available()
-    limit = _MEMORY if there is None else min(_MEMORY, there // 2)
-    place = onnxruntime.OrtMemoryInfo(
-        "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
-    )
-    settings = dict.fromkeys(("arena_extend_strategy", "initial_chunk_size_bytes", "max_dead_bytes_per_chunk"), -1)
-    onnxruntime.create_and_register_allocator(place, onnxruntime.OrtArenaCfg({"max_mem": limit, **settings}))
-
-
 def _make_options() -> onnxruntime.SessionOptions:
     options = onnxruntime.SessionOptions()
     # These networks are too small to share among threads, and the result must not depend on the machine's cores.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    options.add_session_config_entry("session.use_env_allocators", "1")  # which `_limit_memory` bounds
     options.log_severity_level = _FATAL_ONLY
     return options
