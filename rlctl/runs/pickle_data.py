@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_OPCODES = 2_000_000
-_DEEPEST = 50
 
 
 class NotPlainData(ValueError):
@@ -229,16 +228,14 @@ def read_dtype(value: Any) -> np.dtype[Any]:
     return dtype.newbyteorder(">") if byte_order == ">" else dtype
 
 
-def read_plain(value: Any, depth: int = 0) -> Any:
+def read_plain(value: Any) -> Any:
     """Return numbers, text, lists and mappings as they are; raises `NotPlainData` for anything else."""
-    if depth > _DEEPEST:
-        raise NotPlainData("nested too deeply")
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list | tuple):
-        return [read_plain(each, depth + 1) for each in value]
+        return [read_plain(each) for each in value]
     if isinstance(value, Call) and str(value.function) == "collections.OrderedDict":
         value = value.items
     if isinstance(value, dict):
-        return {str(key): read_plain(each, depth + 1) for key, each in value.items()}
+        return {str(key): read_plain(each) for key, each in value.items()}
     raise NotPlainData(f"{value if isinstance(value, Name) else getattr(value, 'function', type(value).__name__)}")
