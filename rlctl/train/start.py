@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from rlctl.train.checkpoint import Checkpoint
 
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
-_MAY_CHANGE = ("total_timesteps", "stop_success")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,15 +170,13 @@ def _check_resume(request: TrainRequest) -> None:
     if request.initial_policy is not None:
         raise UsageError("--from begins a new run, and --resume goes on with one: give one of the two")
     for key in request.settings:
-        if key not in _MAY_CHANGE:
+        if key != "total_timesteps":
             raise UsageError(f"--resume goes on with the run's own recipe: {key} cannot be changed, only -n")
 
 
 def _reopen(found: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:
     """Let a training that was done go on, if it is asked for more than it was."""
-    stricter = recipe.stop_success != before.stop_success
-    longer = recipe.total_timesteps > before.total_timesteps
-    if not found.progress.done or found.state.step >= recipe.total_timesteps or not (stricter or longer):
+    if not found.progress.done or recipe.total_timesteps <= max(found.state.step, before.total_timesteps):
         return found
     progress = dataclasses.replace(found.progress, done=False, good_in_a_row=0)
     return dataclasses.replace(found, state=found.state.model_copy(update={"progress": progress}))
