@@ -90,6 +90,7 @@ class SharedArrays:
             {key: arrays[f"segment/observation/{key}"] for key in observation},
             {key: arrays[f"segment/final/{key}"] for key in observation},
             **{name: arrays[f"segment/{name}"] for name in _ROWS},
+            ended=(),
         )
 
 
