@@ -81,9 +81,6 @@ def has_whole_episode(buffer: ReplayBuffer) -> bool:
     if not isinstance(buffer, HerReplayBuffer) or (buffer.ep_length > 0).any():
         return True
     if buffer.full:
-        size, advice = (
-            buffer.buffer_size * buffer.n_envs,
-            f"give it twice the steps of an episode, times {buffer.n_envs}",
-        )
-        raise RecipeError(_no_room(size, buffer.n_envs, advice))
+        advice = f"give it twice the steps of an episode, times {buffer.n_envs}"
+        raise RecipeError(_no_room(buffer.buffer_size * buffer.n_envs, buffer.n_envs, advice))
     return False
