@@ -121,7 +121,11 @@ def remove_runs(
     runs: Annotated[list[str] | None, typer.Argument(metavar="RUN...", help="Folders of runs.")] = None,
     keep_best: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Remove all finished or failed runs but the N best of each task.", min=0),
+        typer.Option(
+            metavar="N",
+            help="Remove all finished or failed runs but the N best of each task; groups stay whole.",
+            min=0,
+        ),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:

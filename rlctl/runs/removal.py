@@ -11,7 +11,7 @@ from rich.filesize import decimal as format_bytes
 
 from rlctl import output
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.run.directory import ROOT, RunDirectory, is_being_written
+from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, is_being_written
 from rlctl.runs.listing import list_runs
 from rlctl.runs.summary import RunSummary
 
@@ -25,7 +25,8 @@ class Removal:
 
 
 def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Path = ROOT) -> Removal:
-    """Find the runs to remove: those given, or per task all but the `keep_best` best that are finished or failed.
+    """Find the runs to remove: those given, or per task all but the `keep_best` best that are finished or failed, groups
+    left out.
 
     Raises `UsageError` where nothing or both is asked for, or a run is being trained; `ArtifactError` for a folder that
     is not a run.
@@ -49,13 +50,15 @@ def _checked(path: Path, root: Path) -> Path:
     is_below_root = found.resolve().parent.parent == root.resolve() and found.is_dir()
     if found.is_symlink() or not (is_run or is_below_root):
         raise ArtifactError(f"{path}: not the folder of a run; `rlctl runs` lists them")
-    if is_run:
+    if is_run and not is_below_root:
         RunDirectory(found).status()
     return found
 
 
 def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:
-    ended = [run for run in runs if run.state in ("done", "failed") and not is_being_written(run.path)]
+    # The seeds of a group stay together: without those that did worse it would say of its recipe what is not true.
+    alone = [run for run in runs if not (run.path.parent / GROUP_FILE).exists()]
+    ended = [run for run in alone if run.state in ("done", "failed") and not is_being_written(run.path)]
     by_task: dict[str, list[RunSummary]] = {}
     for run in sorted(ended, key=lambda run: run.score, reverse=True):
         by_task.setdefault(run.task, []).append(run)

@@ -24,6 +24,19 @@ def test_keeps_the_best_of_each_task(write_run):
     assert [path.exists() for path in (best, second, third, other, stopped)] == [True, True, False, True, True]
 
 
+def test_keeping_the_best_leaves_groups_whole(write_run):
+    seed = write_run("reach/2026-01-01_00-00-00_seeds/2026-01-01_00-00-00_s0")
+    (seed.parent / "group.json").write_text("{}")
+    alone = write_run("reach/2026-01-01_00-00-01_s0")
+    assert [path.name for path in plan_removal([], keep_best=0).paths] == [alone.name]
+
+
+def test_removes_a_run_whose_status_is_damaged(write_run):
+    run = write_run("reach/2026-01-01_00-00-00_s0")
+    (run / "run.json").write_text('{"status": "fini')
+    assert plan_removal([str(run)]).paths == [run]
+
+
 def test_never_removes_a_run_that_is_being_trained(write_run, hold_lock):
     run = write_run("reach/2026-01-01_00-00-00_s0", "running")
     hold_lock(run)
