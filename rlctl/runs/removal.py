@@ -25,8 +25,9 @@ class Removal:
 
 
 def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Path = ROOT) -> Removal:
-    """Find the runs to remove: those given, or per task all but the `keep_best` best that are finished or failed, groups
-    left out.
+    """Find the runs to remove: those given, or per task all but the `keep_best` best that are finished or failed.
+
+    The seeds of a group are left out of `keep_best`.
 
     Raises `UsageError` where nothing or both is asked for, or a run is being trained; `ArtifactError` for a folder that
     is not a run.
@@ -97,8 +98,13 @@ def remove_with_report(removal: Removal, *, yes: bool) -> None:
 
 
 def remove(removal: Removal) -> None:
-    """Remove the folders; each under another name first, so that a half-removed one is not taken for a run."""
+    """Remove the folders; each under another name first, so that a half-removed one is not taken for a run.
+
+    Raises `UsageError` for a run that is being trained by now: the question may have waited long for its answer.
+    """
     for path in removal.paths:
+        if is_being_written(path if (path / ".lock").exists() else path.parent):
+            raise UsageError(f"{path}: this run is being trained; it was not removed")
         beside = path.with_name(f".{path.name}.removed")
         try:
             path.rename(beside)
