@@ -104,7 +104,10 @@ class EnvSpec:
             parameters["render_mode"] = render_mode
         env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
         if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
-            raise TaskError(f"{self.task}: {type(env).__name__} is not a Gymnasium environment (reset, step, spaces)")
+            raise TaskError(
+                f"{self.task}: {type(env).__name__} is neither a Gymnasium environment (reset, step, spaces) "
+                "nor a subclass of rlctl.task.Task"
+            )
         return env
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import traceback
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 _LONGEST = 400  # characters of somebody else's message
 _MOST_LINES = 80  # of somebody else's traceback
 _OURS = Path(__file__).parent
+_IMPORTLIB = Path(importlib.__file__).parent
 
 
 class RlctlError(Exception):
@@ -113,15 +115,19 @@ def describe_exception(error: BaseException) -> str:
 def format_plugin_traceback(error: BaseException) -> str:
     """Return a traceback that begins where rlctl calls somebody else's code; empty if it never does."""
     frames = error.__traceback__
-    while frames is not None and Path(frames.tb_frame.f_code.co_filename).is_relative_to(_OURS):
+    while frames is not None and _is_not_theirs(frames.tb_frame.f_code.co_filename):
         frames = frames.tb_next
-    if frames is None:
+    if frames is None and not isinstance(error, SyntaxError):  # which names its line itself
         return ""
     lines = "".join(traceback.format_exception(type(error), error, frames)).splitlines(keepends=True)
     left_out = len(lines) - _MOST_LINES
     if left_out > 0:  # functions that call each other until the stack is full
         lines[_MOST_LINES // 2 : -_MOST_LINES // 2] = [f"  ... {left_out} lines left out ...\n"]
     return "".join(lines)
+
+
+def _is_not_theirs(file: str) -> bool:
+    return file.startswith("<frozen importlib") or any(Path(file).is_relative_to(each) for each in (_OURS, _IMPORTLIB))
 
 
 def did_you_mean(word: str, options: Iterable[str]) -> str:

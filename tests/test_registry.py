@@ -135,7 +135,8 @@ def test_places_that_are_not_there(my_env, tmp_path):
     )
     assert error(UsageError, "my_env.py:number") == "my_env.py:number: number is a int, not a class or a function"
     assert error(TaskError, "my_env.py:NoEnv") == (
-        "my_env.py:NoEnv: NoEnv is not a Gymnasium environment (reset, step, spaces)"
+        "my_env.py:NoEnv: NoEnv is neither a Gymnasium environment (reset, step, spaces) nor "
+        "a subclass of rlctl.task.Task"
     )
 
 
@@ -224,7 +225,8 @@ def test_a_plugin_that_raises(write_module, source, message):
         with pytest.raises(TaskError) as caught:
             EnvSpec("broken.py:E").make()
         assert str(caught.value) == f"task 'broken.py:E': {message}"
-        assert "Traceback" in caught.value.details
+        assert 'broken.py", line' in caught.value.details
+        assert "importlib" not in caught.value.details
         assert caught.value.exit_code == 3
 
 

@@ -83,13 +83,14 @@ def _show_candidate(result: Comparison, candidate: Candidate) -> None:
 
 
 def format_difference(difference: Difference, *, as_percent: bool) -> str:
-    """Return `+3.0 % (95 % interval +1.0 % to +5.0 %), p = 0.012`."""
+    """Return `+3.0 points (95 % interval +1.0 to +5.0), p = 0.012`; points are percentage points, of success."""
 
     def number(value: float) -> str:
-        return f"{value * 100:+.1f} %" if as_percent else f"{value:+.4g}"
+        return f"{value * 100:+.1f}" if as_percent else f"{value:+.4g}"
 
+    unit = " points" if as_percent else ""
     text = (
-        f"{number(difference.mean)} (95 % interval {number(difference.low)} to {number(difference.high)}), "
+        f"{number(difference.mean)}{unit} (95 % interval {number(difference.low)} to {number(difference.high)}), "
         f"p = {difference.p:.2g}"
     )
     if isinstance(difference, SeedDifference):
