@@ -54,7 +54,7 @@ class HalfCheetah(Locomotion):
     }  # [N m]
     action_space = Box(-1.0, 1.0, (6,), np.float32)
     events = pushes(force=37.0, link="torso")
-    rlctl_ignore = PLANAR
+    rlctl_ignore = {**PLANAR, "RL804": "its motors are strong enough to push a foot through the springs at its limits"}
 
     def stands(self, height: float, pitch: float) -> bool:
         """The pitch is below 1 rad, and only feet touch the floor."""
