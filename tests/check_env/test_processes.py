@@ -43,7 +43,7 @@ def in_root(monkeypatch):
         (
             f"{BROKEN}:NoEnvironment",
             "RL003",
-            "is not a Gymnasium environment",
+            "is neither a Gymnasium environment",
             "Inherit from gymnasium.Env",
         ),
         (f"{BROKEN}:ExitsWhenBuilt", "RL004", "the process ended with exit code 7 in the constructor", "input"),
