@@ -115,7 +115,7 @@ def describe_exception(error: BaseException) -> str:
 def format_plugin_traceback(error: BaseException) -> str:
     """Return a traceback that begins where rlctl calls somebody else's code; empty if it never does."""
     frames = error.__traceback__
-    while frames is not None and _is_not_theirs(frames.tb_frame.f_code.co_filename):
+    while frames is not None and not _is_plugin_file(frames.tb_frame.f_code.co_filename):
         frames = frames.tb_next
     if frames is None and not isinstance(error, SyntaxError):  # which names its line itself
         return ""
@@ -126,8 +126,10 @@ def format_plugin_traceback(error: BaseException) -> str:
     return "".join(lines)
 
 
-def _is_not_theirs(file: str) -> bool:
-    return file.startswith("<frozen importlib") or any(Path(file).is_relative_to(each) for each in (_OURS, _IMPORTLIB))
+def _is_plugin_file(file: str) -> bool:
+    if file.startswith("<frozen importlib"):
+        return False
+    return not any(Path(file).is_relative_to(folder) for folder in (_OURS, _IMPORTLIB))
 
 
 def did_you_mean(word: str, options: Iterable[str]) -> str:

@@ -225,6 +225,7 @@ def test_a_plugin_that_raises(write_module, source, message):
         with pytest.raises(TaskError) as caught:
             EnvSpec("broken.py:E").make()
         assert str(caught.value) == f"task 'broken.py:E': {message}"
+        assert ("Traceback" in caught.value.details) == ("SyntaxError" not in message)
         assert 'broken.py", line' in caught.value.details
         assert "importlib" not in caught.value.details
         assert caught.value.exit_code == 3

@@ -11,7 +11,7 @@ from rich.filesize import decimal as format_bytes
 
 from rlctl import output
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, is_being_written
+from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
 from rlctl.runs.listing import list_runs
 from rlctl.runs.summary import RunSummary
 
@@ -58,7 +58,7 @@ def _checked(path: Path, root: Path) -> Path:
 
 def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:
     # The seeds of a group stay together: without those that did worse it would say of its recipe what is not true.
-    alone = [run for run in runs if not (run.path.parent / GROUP_FILE).exists()]
+    alone = [run for run in runs if not is_group(run.path.parent)]
     ended = [run for run in alone if run.state in ("done", "failed") and not is_being_written(run.path)]
     by_task: dict[str, list[RunSummary]] = {}
     for run in sorted(ended, key=lambda run: run.score, reverse=True):

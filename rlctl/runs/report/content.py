@@ -88,11 +88,11 @@ def summarize_result(report: Report) -> str:
         summary = scored[0].summary
         best = next(row for row in scored[0].evaluations if row.get("steps") == summary.best_step)
         count = f"{best['episodes']:,.0f}" if best.get("episodes") else "its"
-        has = "has"
+        verb = "has"
         if summary.best_success is not None:
-            has = f"succeeds in {summary.best_success:.1%} of {count} episodes, with"
+            verb = f"succeeds in {summary.best_success:.1%} of {count} episodes, with"
         of_return = f"a mean return of {summary.best_return:.4g}, at step {summary.best_step:,}"
-        return f"In the evaluation that chose it the best policy {has} {of_return}."
+        return f"In the evaluation that chose it the best policy {verb} {of_return}."
     successes = [each.summary.best_success for each in scored if each.summary.best_success is not None]
     returns = [each.summary.best_return for each in scored if each.summary.best_return is not None]
     of_returns = f"a mean return of {np.mean(returns):.4g} ({min(returns):.4g} to {max(returns):.4g})"
