@@ -7,7 +7,7 @@ import numpy as np
 
 from rlctl.task import Body, Sim, Task, TaskError, rewards, rough_heights
 
-LENGTH = 48.0  # [m] of rough ground, along x: further than any of them gets in an episode
+LENGTH = 96.0  # [m] of rough ground, along x: a biped runs at 1.4 m/s, so 28 m in an episode
 CELL = 0.12  # [m]
 
 

@@ -155,6 +155,11 @@ def test_what_is_randomised():
     env.close()
 
 
+def test_rough_ground_does_not_end_before_the_episode():
+    env = TaskEnv(Biped(roughness=0.03))
+    assert env.task.ground.terrain[..., 0].max() > 2 * env.task.top_speed * env.task.episode_s
+
+
 def test_rough_ground_is_walked_on():
     env = TaskEnv(Biped3D(roughness=0.05, terrain_seed=3))
     env.reset(seed=0)
