@@ -40,6 +40,17 @@ class Sound(Reach):
 
 
 @dataclass
+class Misspelled(Reach):
+    """Two names that have no effect, and one that is close to such a name and is used."""
+
+    episode_seconds = 2.0
+    marker = "hand"
+
+    def is_terminate(self):
+        return self.marker == "foot"
+
+
+@dataclass
 class WrongBody(Reach):
     events = {"mass": Event("reset", events.scale_mass, body="amr", factor=(0.8, 1.2))}
 

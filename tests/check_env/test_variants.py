@@ -39,6 +39,14 @@ def test_what_is_wrong_is_named(name, rule, message):
     assert finding.message.startswith(message), finding.message
 
 
+def test_names_that_have_no_effect_are_found():
+    assert {finding.message for finding in findings("broken_variants.py:Misspelled", "RL013")} == {
+        "Misspelled.episode_seconds is used by nothing. Did you mean 'episode_s'?",
+        "Misspelled.is_terminate is used by nothing. Did you mean 'is_terminated'?",
+    }
+    assert not findings(SOUND, "RL013")
+
+
 def test_a_task_that_randomises_is_judged_so(rlctl):
     task = f"{FOLDER}/broken_variants.py:BreaksDown"
     done = rlctl("check-env", task, "--select", "RL011,RL301", "--set", "randomize=true")

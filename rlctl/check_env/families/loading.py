@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import difflib
 import inspect
 import re
 import sys
 import textwrap
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -24,7 +26,7 @@ WAIVERS = "rlctl_ignore"
 """The class attribute that waives rules: rule id -> reason."""
 
 
-@experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL216", share=0.0)
+@experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL013", "RL216", share=0.0)
 def build(context: Context) -> Iterator[Message]:
     """Build the first instance, which the process keeps. Raises `UsageError` for a name that does not exist."""
     try:
@@ -38,6 +40,8 @@ def build(context: Context) -> Iterator[Message]:
         return
     yield describe_built(instance)
     yield from _base_class(instance)
+    if is_task(instance.env):
+        yield from _find_misspelled(type(find_author(instance.env)))
     if _count_windows():
         yield Finding("RL216", "PyBullet was connected with a window (p.GUI)", {"value": "GUI", "expected": "DIRECT"})
 
@@ -86,6 +90,23 @@ def _base_class(instance: Instance) -> Iterator[Finding]:
     for name, leaves in (("observation", instance.leaves), ("action", instance.action_leaves)):
         if "NoneType" in {leaf.kind for leaf in leaves}:
             yield Finding("RL003", f"there is no {name}_space")
+
+
+def _find_misspelled(author: type) -> Iterator[Finding]:
+    """Find names that a task's class defines and nothing uses, close to one that means something to rlctl."""
+    from rlctl.task import Task  # PyBullet comes with it
+
+    meant = {name for name in {*vars(Task), *Task.__annotations__} if not name.startswith("_")}
+    for cls in author.__mro__[: author.__mro__.index(Task)]:
+        try:
+            words = Counter(re.findall(r"\w+", inspect.getsource(inspect.getmodule(cls) or cls)))
+        except (OSError, TypeError):
+            continue  # typed in somewhere: there is no file to look for uses in
+        for name in vars(cls).keys() - meant:
+            close = difflib.get_close_matches(name, meant - vars(cls).keys(), n=1, cutoff=0.7)
+            if close and words[name] == 1:
+                evidence = {"value": name, "expected": close[0]}
+                yield Finding("RL013", f"{cls.__name__}.{name} is used by nothing. Did you mean {close[0]!r}?", evidence)
 
 
 def _count_windows() -> int:
