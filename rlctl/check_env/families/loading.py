@@ -106,7 +106,9 @@ def _find_misspelled(author: type) -> Iterator[Finding]:
             close = difflib.get_close_matches(name, meant - vars(cls).keys(), n=1, cutoff=0.7)
             if close and words[name] == 1:
                 evidence = {"value": name, "expected": close[0]}
-                yield Finding("RL013", f"{cls.__name__}.{name} is used by nothing. Did you mean {close[0]!r}?", evidence)
+                yield Finding(
+                    "RL013", f"{cls.__name__}.{name} is used by nothing. Did you mean {close[0]!r}?", evidence
+                )
 
 
 def _count_windows() -> int:
