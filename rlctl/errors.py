@@ -109,6 +109,8 @@ def describe_exception(error: BaseException) -> str:
         text = f"(message unavailable: {type(another).__name__})"
     if len(text) > _LONGEST:
         text = f"{text[:_LONGEST]}..."
+    # Of a file name that is not UTF-8 Python makes characters that no file of ours can hold.
+    text = text.encode(errors="backslashreplace").decode()
     return f"{name}: {text}" if text else name
 
 

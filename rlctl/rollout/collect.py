@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.dict_spaces import Observations, join, split
-from rlctl.errors import EpisodeFailed
+from rlctl.errors import EpisodeFailed, TaskError
 from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.workers import Workers
 from rlctl.run.acting import Exploration
 
 _CONTACTS_MEASURED = 10
 """Of recorded episodes, the first ones; it takes about 3 % of a step."""
+MOST_STEPS = 100_000
+"""Of an episode whose environment has no time limit; it may never end."""
 _SEGMENT = 1000
 """Steps after which the main process takes what was recorded of a long episode."""
 
@@ -55,7 +57,8 @@ def play_episodes(
 
     Each worker plays in its first environment. Which one plays which episode does not matter: an episode follows from
     its seed and the policy alone. `watch` is called with the number of episodes done, several times a second; it may
-    raise to leave, and the workers have to be closed then.
+    raise to leave, and the workers have to be closed then. Raises `TaskError` where an environment fails, and for an
+    episode that does not end.
     """
     steps = min(workers.info.max_steps or _SEGMENT, _SEGMENT)
     terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms
@@ -91,6 +94,12 @@ def play_episodes(
             recorder = running[env]
             recorder.add(workers, env, steps if result is None else result.row + 1)
             if result is None:
+                if workers.info.max_steps is None and recorder.steps >= MOST_STEPS:
+                    raise TaskError(
+                        f"task {workers.spec.task!r}: the episode of seed {seeds[recorder.index]} has not ended within "
+                        f"{recorder.steps:,} steps, and no time limit is known\n"
+                        "wrap it in gymnasium.wrappers.TimeLimit, or return truncated=True after a number of steps"
+                    )
                 play(env, -1)
                 continue
             del running[env]
@@ -107,12 +116,13 @@ class _Recorder:
         self.index = index
         """Of the episode in the list."""
         self._record = record
-        self._steps = 0
+        self.steps = 0
+        """How many were added."""
         self._parts: list[Trajectory] = []
 
     def add(self, workers: Workers, env: int, steps: int) -> None:
         """Copy the first steps of an environment's segment."""
-        self._steps += steps
+        self.steps += steps
         if self._record:
             segment = workers.arrays.segment
             first = 1 if self._parts else 0  # the last observation of the segment before
@@ -122,7 +132,7 @@ class _Recorder:
 
     def failed_actions(self, workers: Workers, error: EpisodeFailed) -> NDArray[Any]:
         """Return the actions up to that of the step that failed."""
-        last = workers.arrays.segment.action[error.env, : error.step - self._steps]
+        last = workers.arrays.segment.action[error.env, : error.step - self.steps]
         return np.concatenate([*(part.actions for part in self._parts), last])
 
     def finish(self) -> Trajectory | None:

@@ -38,7 +38,7 @@ class Exploration:
     action_noise: float = 0.0
     """Standard deviation of Gaussian noise on the scaled action, of off-policy algorithms."""
     sde_every: int = 0
-    """Steps after which gSDE draws a matrix again; 0: only where a segment or an episode begins."""
+    """Steps after which gSDE draws a matrix again; 0: only where a segment begins."""
 
 
 class Noise:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from collections.abc import Iterator
 from typing import Annotated, Any
 
@@ -22,6 +23,8 @@ Switch = pydantic.StrictBool
 
 
 def _make_whole(value: Any) -> Any:
+    if isinstance(value, numbers.Integral):  # of NumPy too
+        return value if isinstance(value, bool) else int(value)
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import DivergedError, EpisodeFailed
+from rlctl.errors import DivergedError, EpisodeFailed, TaskError
+from rlctl.rollout import collect
 from rlctl.rollout.collect import play_episodes
 from rlctl.run.acting import Exploration
 from tests.rollout.policies import linear
@@ -107,6 +108,14 @@ def test_an_episode_longer_than_a_segment_is_recorded_whole(spec, start):
     (episode,) = play_episodes(workers, [4], record=True)
     assert episode.result.length == len(episode.trajectory.actions) == 2345
     assert episode.trajectory.observations[:, 0].tolist() == list(range(2346))
+
+
+def test_an_episode_that_never_ends(spec, start, monkeypatch):
+    monkeypatch.setattr(collect, "MOST_STEPS", 2000)
+    workers = start(spec("Long", length=0), 1)
+    workers.set_policy(*linear(workers.info, TOWARDS_ZERO))
+    with pytest.raises(TaskError, match=r"the episode of seed 4 has not ended within 2,000 steps, and no time limit"):
+        play_episodes(workers, [4])
 
 
 def test_samples_follow_from_the_episode_and_the_step(spec, start):

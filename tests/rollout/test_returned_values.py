@@ -69,6 +69,7 @@ def test_what_is_returned(fault, message):
         ("raise", "RuntimeError: the gripper fell off"),
         ("unprintable", "Unprintable: (message unavailable: ZeroDivisionError)"),
         ("local class", "Local: nobody can import this"),
+        ("file name", r"ValueError: cannot open caf\udce9.stl"),
         ("long text", f"RuntimeError: one line and another {'x' * 379}..."),
         ("interrupt", "KeyboardInterrupt"),
         ("exit", "SystemExit: 0"),

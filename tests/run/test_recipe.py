@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
@@ -150,6 +151,7 @@ def test_what_cannot_be(values, message):
         {"n_steps": 1e3},
         {"train_freq": 8},
         {"gradient_steps": -1},
+        {"n_steps": np.int64(64)},
     ],
 )
 def test_what_can_be(kwargs):

@@ -65,6 +65,7 @@ DOES = {
     "raise": raising(RuntimeError, "the gripper fell off"),
     "unprintable": unprintable,
     "local class": local_class,
+    "file name": raising(ValueError, "cannot open caf\udce9.stl"),
     "long text": long_text,
     "interrupt": raising(KeyboardInterrupt),
     "exit": lambda: sys.exit(0),

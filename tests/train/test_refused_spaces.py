@@ -33,9 +33,16 @@ BOX = spaces.Box(-1, 1, (2,))
             spaces.Dict({"gripper": spaces.Discrete(4, start=2), "arm": BOX}),
             BOX,
             "observation 'gripper' is Discrete(4, start=2), and Stable-Baselines3 counts categories from 0: "
-            "observe value - 2 in Discrete(4)",
+            "leave start out of the space, and observe values less start",
         ),
-        ("ppo", spaces.Discrete(4, start=-1), BOX, "the observation is Discrete(4, start=-1), and "),
+        ("ppo", spaces.MultiDiscrete([4, 4], start=[0, 1]), BOX, "the observation is MultiDiscrete([4 4], start=[0 1])"),
+        (
+            "ppo",
+            BOX,
+            spaces.Discrete(3, start=-1),
+            "the action is Discrete(3, start=-1), and Stable-Baselines3 counts categories from 0: "
+            "leave start out of the space, and add start in step",
+        ),
     ],
 )
 def test_spaces_that_are_refused(algo, observation, action, message):
@@ -46,7 +53,7 @@ def test_spaces_that_are_refused(algo, observation, action, message):
 
 def test_spaces_that_are_not():
     for algo in ("ppo", "a2c"):
-        check_spaces(algo, spaces.Dict({"gripper": spaces.Discrete(4), "arm": BOX}), spaces.Discrete(3, start=1))
+        check_spaces(algo, spaces.Dict({"gripper": spaces.Discrete(4), "arm": BOX}), spaces.Discrete(3))
     check_spaces("dqn", BOX, spaces.Discrete(3))
     check_spaces("td3", BOX, BOX)
 
