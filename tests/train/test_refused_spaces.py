@@ -35,7 +35,12 @@ BOX = spaces.Box(-1, 1, (2,))
             "observation 'gripper' is Discrete(4, start=2), and Stable-Baselines3 counts categories from 0: "
             "leave start out of the space, and observe values less start",
         ),
-        ("ppo", spaces.MultiDiscrete([4, 4], start=[0, 1]), BOX, "the observation is MultiDiscrete([4 4], start=[0 1])"),
+        (
+            "ppo",
+            spaces.MultiDiscrete([4, 4], start=[0, 1]),
+            BOX,
+            "the observation is MultiDiscrete([4 4], start=[0 1])",
+        ),
         (
             "ppo",
             BOX,
