@@ -89,10 +89,10 @@ class ChildProcess:
             raise
         self.connection = Connection(ours.detach())
 
-    def describe_end(self, timeout_s: float = 5.0) -> str:
+    def describe_end(self) -> str:
         """Wait for the end of a child whose connection has closed, and return how it ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(timeout=timeout_s)
+            self.process.wait(timeout=5.0)
         code = self.process.poll()
         if code is None:
             return "closed its connection"

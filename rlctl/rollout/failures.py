@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from rlctl import errors
 from rlctl.errors import (
-    DivergedError,
     EpisodeFailed,
-    PolicyError,
     RlctlError,
     TaskError,
     describe_exception,
@@ -46,11 +44,10 @@ def make_error(failure: Failure, task: str) -> RlctlError:
     if kind is TaskError and task not in message.partition("\n")[0]:
         message = f"task {task!r}: {message}"
     if failure.where is not None:
-        failed = EpisodeFailed(message, *failure.where, hint=format_hint(task), details=details)
         if kind is TaskError:
-            return failed
-        # What the policy has done wrong, check-env does not show.
-        message = str(failed).rpartition("; ")[0] if kind in (DivergedError, PolicyError) else str(failed)
+            return EpisodeFailed(message, *failure.where, hint=format_hint(task), details=details)
+        # Of the policy, or the server that it is on: check-env would not show it.
+        message += "\nin environment {}, episode seed {}, step {}".format(*failure.where)
     result: RlctlError = kind(message, details=details)
     return result
 

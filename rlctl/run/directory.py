@@ -222,7 +222,7 @@ def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
             continue
         except OSError as error:
             raise ArtifactError(f"{folder}: cannot make a run folder: {error.strerror}") from None
-        point_latest_to(root, folder / name)
+        _point_latest_to(root, folder / name)
         return RunDirectory(folder / name)
     raise ArtifactError(f"{folder}: cannot make a run folder")
 
@@ -232,7 +232,7 @@ def is_group(path: Path) -> bool:
     return (path / GROUP_FILE).is_file()
 
 
-def point_latest_to(root: Path, run: Path) -> None:
+def _point_latest_to(root: Path, run: Path) -> None:
     """Let the link `latest` lead to a run."""
     beside = root / f".latest.{os.getpid()}"
     try:

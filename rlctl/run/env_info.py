@@ -18,7 +18,6 @@ from rlctl.joints import Joints
 
 _ONE_HOT = 10
 """How many elements of a Box an alternative of a discrete space counts for."""
-_DIMENSIONS = 32  # what the oldest numpy can do
 
 
 class EnvInfo(pydantic.BaseModel):
@@ -185,6 +184,6 @@ def _check_whole(value: Any) -> int:
 
 def _check_shape(sizes: Any) -> tuple[int, ...]:
     shape = tuple(_check_whole(size) for size in (sizes if isinstance(sizes, list) else [sizes]))
-    if min(shape, default=0) < 0 or len(shape) > _DIMENSIONS:
+    if min(shape, default=0) < 0:
         raise ValueError(f"shape {short_repr(list(shape))}")
     return shape

@@ -15,7 +15,7 @@ from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 from rlctl.output import format_duration
-from rlctl.run.directory import ROOT, RunDirectory, is_group, point_latest_to
+from rlctl.run.directory import ROOT, RunDirectory, is_group
 from rlctl.run.policy import PolicyInfo, read_info
 from rlctl.run.shipped import PRETRAINED, find_shipped_policy
 from rlctl.run.task_version import describe_task_changes
@@ -43,13 +43,13 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
     """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing."""
     if text is None or text == "latest":
         # The link first: names go by a clock, which may have been set back since.
-        newest = _read_latest(root) or _repair_latest(root)
+        newest = _read_latest(root) or next(iter(_list_newest_first(root, "*/*/run.json", "*/*/*_s*/run.json")), None)
         if newest is None:
             raise ArtifactError(f"no run yet under {root.resolve()}; train one: rlctl train reach")
         return newest
     if (Path(text) / "run.json").is_file():
         return RunDirectory(Path(text))
-    if Path(text).name == "latest" and _dangles(Path(text)):
+    if Path(text).name == "latest" and Path(text).is_symlink():  # to a run that was removed
         return find_run("latest", Path(text).parent)
     if is_group(Path(text)):
         raise UsageError(f"{text}: a group of runs; name one of them: {text.rstrip('/')}/..._s0")
@@ -182,18 +182,6 @@ def _read_latest(root: Path) -> RunDirectory | None:
         if (root / "latest").resolve().is_relative_to(root.resolve()) and (run / "run.json").is_file():
             return RunDirectory(run)
     return None
-
-
-def _repair_latest(root: Path) -> RunDirectory | None:
-    """Return the newest run, and point to it where the run that `latest` points to was removed."""
-    newest = next(iter(_list_newest_first(root, "*/*/run.json", "*/*/*_s*/run.json")), None)
-    if newest is not None and _dangles(root / "latest"):
-        point_latest_to(root, newest.path)
-    return newest
-
-
-def _dangles(link: Path) -> bool:
-    return link.is_symlink() and not link.exists()
 
 
 def _list_newest_first(root: Path, *patterns: str) -> list[RunDirectory]:

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 from pydantic import Field
@@ -114,7 +114,7 @@ class Recipe(Section):
     """Stop after two evaluations in a row at this success rate; null: never."""
     checkpoint: Checkpoints = Checkpoints()
     """Which checkpoints are kept."""
-    stages: list[Stage] = []
+    stages: Annotated[list[Stage], pydantic.AfterValidator(check_promotions)] = []
     """Curriculum: what each stage changes, and when it ends."""
 
     @pydantic.field_validator("algo_kwargs", "policy_kwargs")
@@ -144,12 +144,6 @@ class Recipe(Section):
         if value is not None and algo is not None and algo not in IN_HINDSIGHT:
             raise ValueError(f"{algo} cannot learn in hindsight; {', '.join(IN_HINDSIGHT)} can")
         return value
-
-    @pydantic.field_validator("stages")
-    @classmethod
-    def _check_promotions(cls, values: list[Stage]) -> list[Stage]:
-        check_promotions(values)
-        return values
 
     def env_specs(self, task: str, named_by: str = "") -> list[EnvSpec]:
         """Return what environments are made from, stage by stage; of a recipe without stages a list of one.

@@ -95,15 +95,10 @@ def read(path: Path) -> dict[str, Any]:
     """Read a recipe file as plain data, unchecked."""
     if not path.exists():
         raise ArtifactError(f"no recipe file {path}; presets: {', '.join(list_presets())}")
-    return _check_mapping(yaml_text.load(yaml_text.read_text(path), str(path)), path)
-
-
-def _check_mapping(content: Any, path: Path) -> dict[str, Any]:
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
+    content = yaml_text.load(yaml_text.read_text(path), str(path))
+    if content is not None and not isinstance(content, dict):
         raise RecipeError(f"{path}: a recipe is a mapping of keys to values, this is a {type(content).__name__}")
-    return content
+    return content or {}
 
 
 def list_presets() -> list[str]:

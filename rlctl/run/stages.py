@@ -61,8 +61,8 @@ class Stage(Section):
         return ", ".join(changes) or "the recipe's own task"
 
 
-def check_promotions(stages: Sequence[Stage]) -> None:
-    """Raise `ValueError` unless every stage but the last says when it ends, and the last does not."""
+def check_promotions(stages: list[Stage]) -> list[Stage]:
+    """Return stages; raises `ValueError` unless every stage but the last says when it ends, and the last does not."""
     for number, stage in enumerate(stages, start=1):
         last = number == len(stages)
         if stage.promote is None and not last:
@@ -72,6 +72,7 @@ def check_promotions(stages: Sequence[Stage]) -> None:
             )
         if stage.promote is not None and last:
             raise ValueError(f"stage {number} of {len(stages)} ({stage}) is the last: leave out its promote")
+    return stages
 
 
 def format_title(number: int, stages: Sequence[Stage]) -> str:

@@ -58,9 +58,9 @@ _NOT_KEPT = frozenset(
 )
 
 
-def pin_threads(threads: int = 1) -> None:
-    """Fix torch's thread count: the last bit of a result depends on it, and small networks gain nothing by more."""
-    torch.set_num_threads(threads)
+def pin_threads() -> None:
+    """Let torch use one thread: the last bit of a result depends on how many, and small networks gain nothing."""
+    torch.set_num_threads(1)
 
 
 def policy_name(algo: str, observation_space: spaces.Space[Any]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -111,18 +110,15 @@ def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: 
 
 
 def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:
-    kwargs = {name: _convert(value) for name, value in recipe.algo_kwargs.items()}
-    kwargs.pop("action_noise", None)  # the workers add it
-    return kwargs
+    given = recipe.algo_kwargs.items()
+    return {name: _make_schedule(value) for name, value in given if name != "action_noise"}  # which workers add
 
 
-def _convert(value: Any) -> Any:
-    return _linear(value) if isinstance(value, str) and value.startswith("lin_") else value
-
-
-def _linear(text: str) -> Callable[[float], float]:
-    """A schedule that falls from a value to zero over the training, written `lin_3e-4` as rl-zoo does."""
-    start = float(text.removeprefix("lin_"))
+def _make_schedule(value: Any) -> Any:
+    """Return what falls to zero over the training for `lin_3e-4`, as rl-zoo writes it; other values as they are."""
+    if not isinstance(value, str) or not value.startswith("lin_"):
+        return value
+    start = float(value.removeprefix("lin_"))
     # The last rollout may go past the end, and a negative rate would unlearn.
     return lambda remaining: max(remaining, 0.0) * start
 

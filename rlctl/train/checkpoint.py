@@ -237,7 +237,7 @@ def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
 
 def _environment_tensors(env: WorkerVecEnv) -> Tensors:
     """Return the episodes that environments are in, what was done in them, and what was observed last."""
-    histories = env.history.all()
+    histories = [env.history.of(index) for index in range(env.num_envs)]
     tensors = {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),
         "environments/steps": np.array([len(actions) for actions in histories], np.int64),

@@ -28,7 +28,7 @@ from rlctl.run import files
 Tensors = dict[str, NDArray[Any]]
 
 SEGMENT_BYTES = 8 * 2**20
-"""Segments grow to this size by being written again together: that keeps a checkpoint cheap, and segments few."""
+"""Size of a segment; the last one is written again, longer, until it has it."""
 _FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _NAME = re.compile(r"^\d{12}-\d{12}\.safetensors$")
 
@@ -70,17 +70,12 @@ class ReplaySegments:
         segments = [each for each in self._segments if each.last > oldest]
         if not all((self.folder / each.name).exists() for each in segments):  # somebody has removed some
             segments, self._written = [], 0
-        first = max(self._written, oldest)
-        while first < added and segments and self._should_merge(segments[-1], first, added):
-            first = max(min(first, segments.pop().first), oldest)
-        for low in range(first, added, self._most_rows):
-            segments.append(self._write(low, min(low + self._most_rows, added)))
+        rows = self._most_rows
+        first = max(self._written // rows * rows, oldest)
+        segments = [each for each in segments if each.first < first]
+        segments += [self._write(low, min(low + rows, added)) for low in range(first, added, rows)]
         self._segments, self._written = segments, added
         return list(segments)
-
-    def _should_merge(self, before: Segment, first: int, last: int) -> bool:
-        # Like a binary counter: a transition is written as often as its segment doubles, and no more.
-        return before.last - before.first <= last - first and last - before.first <= self._most_rows
 
     def _write(self, first: int, last: int) -> Segment:
         indices = np.arange(first, last) % self.buffer.buffer_size
@@ -141,30 +136,18 @@ def _arrays(buffer: ReplayBuffer) -> Tensors:
 
 
 def hindsight_tensors(buffer: ReplayBuffer) -> Tensors:
-    """Return which episodes a HER buffer may sample from, (environment, start, length) each, and where each runs."""
+    """Return where the episodes of a HER buffer are, and where those that run began; nothing of another buffer."""
     if not isinstance(buffer, HerReplayBuffer):
         return {}
-    # An episode whose first transition is written over is not sampled from any more, and one that runs not yet.
-    begins = (buffer.ep_start == np.arange(buffer.buffer_size)[:, None]) & (buffer.ep_length > 0)
-    starts, envs = np.nonzero(begins)
     return {
-        "hindsight/episodes": np.stack([envs, starts, buffer.ep_length[starts, envs]], axis=1),
+        "hindsight/start": buffer.ep_start,
+        "hindsight/length": buffer.ep_length,
         "hindsight/running": buffer._current_ep_start,
     }
 
 
 def restore_hindsight(buffer: ReplayBuffer, tensors: Tensors) -> None:
     """Give a HER buffer, whose transitions are there, the episodes that `hindsight_tensors` returned."""
-    if not isinstance(buffer, HerReplayBuffer):
-        return
-    buffer._current_ep_start = tensors["hindsight/running"].copy()
-    for env, start in enumerate(buffer._current_ep_start.tolist()):
-        buffer.ep_start[_ring(start, buffer.pos, buffer.buffer_size), env] = start
-    for env, start, length in tensors["hindsight/episodes"].tolist():
-        indices = _ring(start, start + length, buffer.buffer_size)
-        buffer.ep_start[indices, env] = start
-        buffer.ep_length[indices, env] = length
-
-
-def _ring(first: int, last: int, size: int) -> NDArray[np.int64]:
-    return np.arange(first, last if last >= first else last + size) % size
+    if isinstance(buffer, HerReplayBuffer):
+        for name, array in hindsight_tensors(buffer).items():
+            array[...] = tensors[name]

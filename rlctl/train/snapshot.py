@@ -5,7 +5,6 @@ The environments' part is in `checkpoint.py`, the replay buffer's in `replay_seg
 
 from __future__ import annotations
 
-import random
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +77,6 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
     plain = {
         "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
         "parameters": structure,
-        "randomness": {"python": _python_state(), "action_space": model.action_space.np_random.bit_generator.state},
     }
     return tensors, plain
 
@@ -94,19 +92,16 @@ def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> No
         for name in _COUNTERS:  # no other: a file does not choose what is set
             if name in plain["counters"]:
                 setattr(model, name, plain["counters"][name])
-        _restore_randomness(model, tensors, plain)
+        _restore_randomness(tensors)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise ArtifactError(f"does not fit this recipe: {' '.join(str(error).split())[:200]}") from None
 
 
-def _restore_randomness(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
-    """Restore all random generators; gSDE's matrices need not be: updates draw them anew."""
+def _restore_randomness(tensors: Tensors) -> None:
+    """Restore the generators that updates draw from; gSDE's matrices need not be: updates draw them anew."""
     torch.set_rng_state(torch.from_numpy(tensors["randomness/torch"].copy()))
     keys, position, has_gauss, cached = (tensors[f"randomness/numpy/{part}"] for part in _NUMPY)
     np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(cached)))  # noqa: NPY002 (SB3 draws there)
-    version, numbers, gauss = plain["randomness"]["python"]
-    random.setstate((version, tuple(numbers), gauss))
-    model.action_space.np_random.bit_generator.state = plain["randomness"]["action_space"]
 
 
 _NUMPY = ("keys", "position", "has_gauss", "cached")
@@ -118,11 +113,6 @@ def _randomness_tensors() -> Tensors:
     tensors = {f"randomness/numpy/{part}": np.asarray(value) for part, value in zip(_NUMPY, state, strict=True)}
     tensors["randomness/torch"] = torch.get_rng_state().numpy()
     return tensors
-
-
-def _python_state() -> list[Any]:
-    version, numbers, gauss = random.getstate()
-    return [version, list(numbers), gauss]
 
 
 def _array(tensor: torch.Tensor) -> NDArray[Any]:

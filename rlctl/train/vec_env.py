@@ -38,10 +38,6 @@ class ActionHistory:
         """Return the actions of an environment's episode so far, shape (steps, ...)."""
         return np.concatenate(self._parts[env])
 
-    def all(self) -> list[NDArray[Any]]:
-        """Return `of` every environment."""
-        return [self.of(env) for env in range(len(self._parts))]
-
 
 def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
     """Return how many observations, shape (n_envs, steps, ...), are outside their space, and what is wrong with one."""
@@ -80,7 +76,6 @@ class WorkerVecEnv(VecEnv):
         self.waited_s = 0.0
         """Time spent waiting for the environments to play [s], since it was set to 0."""
         self._steps = 0
-        self.render_mode = None
         super().__init__(workers.n_envs, *workers.info.spaces())
 
     def _seed(self, env: int, episode: int) -> int:
@@ -151,9 +146,6 @@ class WorkerVecEnv(VecEnv):
 
     def close(self) -> None:
         self.workers.close()
-
-    def seed(self, seed: int | None = None) -> list[int | None]:
-        return [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         if attr_name == "render_mode":
