@@ -162,6 +162,23 @@ def test_noise_stays_inside_the_bounds_of_its_observation(make):
     assert angles.max() == np.float32(0.05)
 
 
+def test_noise_on_pictures_ends_at_black_and_white(make):
+    class Camera(ByName):
+        observation_units = {}
+        events = {"noisy": Event("observation", events.noise, of="picture", std=50.0)}
+
+        def observe(self):
+            return {"picture": np.full((1, 1000), 0 if self.got else 255, np.uint8)}
+
+    env = make(Camera(), noisy={})
+    white, _ = env.reset(seed=0)
+    black = env.step(np.zeros(2))[0]
+    assert white["picture"].min() > 50
+    assert (white["picture"] == 255).mean() == pytest.approx(0.5, abs=0.1)
+    assert black["picture"].max() < 205
+    assert (black["picture"] == 0).mean() == pytest.approx(0.5, abs=0.1)
+
+
 def test_signals_act_in_the_order_of_the_task(make):
     class Chain(Clock):
         events = {

@@ -72,7 +72,8 @@ class Signals:
                 raise event.error(
                     f"events.{event.name}: only actions in a Box can be noisy or late, not {action_space}."
                 )
-        self._bounds = bounds
+        pictures = {name: (0, 255) for name, value in first.items() if np.asarray(value).dtype == np.uint8}
+        self._bounds = {**pictures, **bounds}
         self._observation_signals: list[tuple[list[str], Signal]] | None = []
         self._action_signals: list[Signal] = []
         self.drawn: dict[str, Drawn] = {}
