@@ -82,7 +82,7 @@ def is_utf8() -> bool:
 
 def confirm(question: str, refusal: str) -> bool:
     """Ask on the terminal; raises `UsageError`, with `refusal`, where nobody can be asked."""
-    if not sys.stdin.isatty():
+    if sys.stdin is None or not sys.stdin.isatty():
         raise UsageError(refusal)
     import typer
 

@@ -58,9 +58,12 @@ def evaluate(
     on instead of the one it was trained on. Further keywords are those keys of a recipe that are about the environment:
     `task` (its parameters), `reward_weights`, `randomize`, `events`.
     """
+    from rlctl.errors import UsageError
     from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
     from rlctl.run.recipe_sources import check_changes
 
+    if episodes < 1 or seed < 0:
+        raise UsageError(f"evaluate: episodes={episodes}, seed={seed}: one episode or more, and a seed from 0 on")
     request = EvalRequest(
         run=None if run is None else str(run),
         task=other_task,

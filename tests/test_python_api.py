@@ -3,7 +3,7 @@
 import pytest
 
 import rlctl
-from rlctl.errors import RecipeError
+from rlctl.errors import RecipeError, UsageError
 from tests.train.conftest import ENVS, TINY
 
 
@@ -27,3 +27,6 @@ def test_keys_are_checked_as_on_the_command_line():
         rlctl.train("reach", n_env=3)
     with pytest.raises(RecipeError, match=r"^evaluate n_envs: only task\.NAME, "):
         rlctl.evaluate("reach", n_envs=3)
+    for given in ({"episodes": 0}, {"seed": -1}):
+        with pytest.raises(UsageError, match=r"^evaluate: episodes="):
+            rlctl.evaluate("reach", **given)

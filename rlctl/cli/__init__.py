@@ -86,7 +86,7 @@ def run(arguments: list[str]) -> int:
         return code if isinstance(code, int) else 0
     except RlctlError as error:
         return error_boundary.report(error)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):  # Abort: at a question
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:

@@ -25,7 +25,9 @@ def identify(
         list[str],
         typer.Option("--event", metavar="NAME", help="Find the values of this event only; repeat it for more."),
     ] = [],
-    seconds: Annotated[float, typer.Option(help="Length of the trajectory of --excite [s].", min=1.0)] = 10.0,
+    seconds: Annotated[
+        float, typer.Option(help="Length of the trajectory of --excite [s].", min=1.0, max=3600.0)
+    ] = 10.0,
     settings: Set = [],
     seed: Annotated[int, typer.Option(help="Seed of the search, or of the trajectory.", min=0)] = 0,
     json: Json = None,

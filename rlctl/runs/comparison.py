@@ -152,7 +152,7 @@ def compare(texts: Sequence[str], request: EvalRequest, threshold: float | None 
 
 def find_runs_of(text: str) -> list[RunDirectory]:
     """Return the runs that a word stands for: those of a glob, a group or a folder of runs, or one run."""
-    if any(character in text for character in "*?["):
+    if any(character in text for character in "*?[") and not Path(text).exists():
         found = [RunDirectory(path) for path in map(Path, sorted(glob.glob(text))) if (path / "run.json").is_file()]
         if not found:
             raise ArtifactError(f"{text}: no run matches")

@@ -8,7 +8,7 @@ import pytest
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval.evaluate import EvalRequest
 from rlctl.run.recipe import merge
-from rlctl.runs.comparison import compare
+from rlctl.runs.comparison import compare, find_runs_of
 from rlctl.runs.comparison_report import as_json, format_needed
 from rlctl.runs.statistics import Verdict
 from rlctl.train.request import TrainRequest, run_training
@@ -60,6 +60,11 @@ def test_recipes_are_compared_seed_by_seed(root):
 def test_runs_of_several_recipes_as_one_are_pointed_out(root):
     result = compare([f"{root}/0.9*/Line/*_s0", f"{root}/0.9*/Line/*_s1"], EvalRequest(None, episodes=2))
     assert result.baseline.mixed == ["algo_kwargs.gamma"]
+
+
+def test_a_folder_whose_name_looks_like_a_glob(write_run):
+    run = write_run("reach [1]/2026-01-01_00-00-00_s0")
+    assert [found.path for found in find_runs_of(str(run))] == [run]
 
 
 def test_refusals(root, write_run):

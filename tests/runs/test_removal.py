@@ -1,3 +1,9 @@
+import contextlib
+import os
+import pty
+import subprocess
+import sys
+
 import pytest
 
 from rlctl.errors import ArtifactError, UsageError
@@ -67,9 +73,31 @@ def test_asks_only_on_a_terminal(write_run, rlctl):
     assert refused.returncode == 2
     assert "--yes" in refused.stderr
     assert run.exists()
+    closed = subprocess.run(
+        ["sh", "-c", 'exec "$0" -m rlctl runs rm "$1" <&-', sys.executable, run], capture_output=True, text=True
+    )
+    assert (closed.returncode, closed.stderr) == (2, refused.stderr)
     done = rlctl("runs", "rm", run, "--yes")
     assert done.returncode == 0
     assert not run.exists()
+
+
+@pytest.mark.parametrize("answer", ["\x03", "\x04"], ids=["Ctrl-C", "Ctrl-D"])
+def test_interrupted_at_the_question(write_run, answer):
+    run = write_run("reach/2026-01-01_00-00-00_s0")
+    process, terminal = pty.fork()
+    if process == 0:
+        os.execv(sys.executable, [sys.executable, "-m", "rlctl", "runs", "rm", str(run)])
+    shown = os.read(terminal, 4096)
+    while b"?" not in shown:
+        shown += os.read(terminal, 4096)
+    os.write(terminal, answer.encode())
+    with contextlib.suppress(OSError):  # how Linux reports that the other end has closed
+        while text := os.read(terminal, 4096):
+            shown += text
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 130
+    assert b"Traceback" not in shown
+    assert run.exists()
 
 
 def test_prune_frees_checkpoints_of_finished_runs_only(write_run):
