@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import time
 from typing import Any
@@ -13,7 +14,7 @@ from gymnasium import spaces
 
 from rlctl.deploy import messages
 from rlctl.deploy.serve import KEY_VARIABLE
-from rlctl.errors import PolicyError, UsageError, short_repr
+from rlctl.errors import PolicyError, UsageError, describe_exception, short_repr
 from rlctl.run.acting import Player
 from rlctl.run.env_info import space_from_json
 
@@ -47,7 +48,7 @@ class PolicyClient:
             return self._unpack(await self._socket.receive(_TIMEOUT_S))
         except (aiohttp.ClientError, OSError, ValueError) as error:
             await self._session.close()
-            raise UsageError(f"{self.url}: no policy server answers: {short_repr(str(error) or type(error))}") from None
+            raise UsageError(f"{self.url}: no policy server answers: {describe_exception(error)}") from None
 
     def _unpack(self, message: aiohttp.WSMessage) -> dict[str, Any]:
         if message.type is aiohttp.WSMsgType.TEXT:
@@ -75,7 +76,7 @@ class PolicyClient:
             await self._socket.send_bytes(content)
             return await self._socket.receive(_TIMEOUT_S)
         except (aiohttp.ClientError, OSError) as error:
-            raise PolicyError(f"{self.url}: the connection is lost: {short_repr(str(error))}") from None
+            raise PolicyError(f"{self.url}: the connection is lost: {describe_exception(error)}") from None
 
     def close(self) -> None:
         """Close the connection."""
@@ -92,12 +93,11 @@ class RemotePlayer(Player):
         self._action_space = action_space
         self._report: dict[str, Any] = {}
         env = self._client.metadata.get("env")
-        if isinstance(env, dict) and (
-            space_from_json(env["observation_space"]) != observation_space
-            or space_from_json(env["action_space"]) != action_space
-        ):
+        own = {"observation_space": observation_space, "action_space": action_space}
+        if isinstance(env, dict) and any(key in env and space_from_json(env[key]) != own[key] for key in own):
             raise UsageError(f"{url}: the policy that is served there is for other spaces than this task has")
-        self._control_dt = self._client.metadata.get("control_dt")
+        dt = self._client.metadata.get("control_dt")
+        self._control_dt = dt if isinstance(dt, int | float) else math.inf
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
         request = dict(observation) if isinstance(observation, dict) else {"observation": observation}
@@ -108,15 +108,17 @@ class RemotePlayer(Player):
         answer = self._client.act(request)
         taken_s = time.perf_counter() - begin
         self._report["round_trips_s"].append(taken_s)
-        self._report["misses"] += self._control_dt is not None and taken_s > self._control_dt
+        self._report["misses"] += taken_s > self._control_dt
         self._report["not_running"] += answer.get("state", "running") != "running"
         if "error" in answer:
             raise PolicyError(f"{self._client.url}: {short_repr(answer['error'], 300)}")
-        action = np.asarray(answer.get("actions"))[:1]
-        shape = self._action_space.shape or ()
-        if action.size != int(np.prod(shape)):
-            raise PolicyError(f"{self._client.url}: actions of shape {action.shape}, the task takes {shape}")
-        action = action.reshape(shape).astype(self._action_space.dtype)
+        given, shape = answer.get("actions"), self._action_space.shape or ()
+        try:
+            action = np.asarray(given, self._action_space.dtype)[:1].reshape(shape)
+        except (ValueError, TypeError, IndexError, OverflowError):
+            raise PolicyError(
+                f"{self._client.url}: actions {short_repr(given)}; the task takes a list of them, each of shape {shape}"
+            ) from None
         return action, action
 
     def close(self) -> None:

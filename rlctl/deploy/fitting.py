@@ -135,18 +135,22 @@ def _merge(limits: Limits, name: str, known: dict[str, Any]) -> JointLimits:
 
 
 def _list_known(limits: Limits, joints: Joints | None, index: int) -> dict[str, Any]:
-    """Return the limits of one joint that the task's model of the robot has, as far as they can be kept."""
+    """Return the limits of one joint that the task's model of the robot has, as far as they can be kept.
+
+    Model files write a limit that is none as one of 0, or as a lower end that is not below the upper.
+    """
     found: dict[str, Any] = {}
     if joints is None:
         return found
     measured = limits.measured.position is not None
     moves = limits.command in ("position", "step", "speed")
     if joints.low and joints.high and (limits.command == "position" or (moves and measured)):
-        found["position"] = joints.low[index], joints.high[index]
+        low, high = joints.low[index], joints.high[index]
+        found |= {"position": (low, high)} if low < high else {}
     if joints.max_speed and moves and measured:
-        found["speed"] = joints.max_speed[index]
+        found |= {"speed": speed} if (speed := joints.max_speed[index]) > 0 else {}
     if joints.max_torque and limits.command == "torque":
-        found["torque"] = joints.max_torque[index]
+        found |= {"torque": torque} if (torque := joints.max_torque[index]) > 0 else {}
     return found
 
 

@@ -117,6 +117,10 @@ class SafetyFilter:
             action = np.asarray(action, np.float64).ravel()
             if action.shape != self._zeros.shape or not np.isfinite(action).all():
                 raise ValueError(f"an action by hand has {len(self._zeros)} finite numbers")
+            if self._command is None:
+                choice = self._choose(action)
+                if not self._space.contains(choice) or (choice.ravel() != action).any():
+                    raise ValueError(f"an action by hand is one of {self._space}, not {action.tolist()}")
         if (action is None) != (self._manual is None):
             self.begin_blend()
             self._record("state", "policy" if action is None else "override")

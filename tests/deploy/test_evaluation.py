@@ -1,10 +1,18 @@
 """What limits cost a policy in simulation, and a policy played through its server."""
 
+import asyncio
+import contextlib
 import json
+import threading
 
+import numpy as np
 import pytest
+from aiohttp import web
+from gymnasium import spaces
 
-from rlctl.errors import RecipeError, UsageError
+from rlctl.deploy import messages
+from rlctl.deploy.client import RemotePlayer
+from rlctl.errors import PolicyError, RecipeError, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.eval.report import as_json, count_interventions
 from rlctl.eval.self_test import run_self_test
@@ -80,6 +88,46 @@ def test_a_server_that_is_not_there_or_of_another_task(reach_server):
         run_evaluation(EvalRequest("reach", baseline="ws://127.0.0.1:1"), Gates())
     with pytest.raises(UsageError, match="is for other spaces than this task has"):
         run_evaluation(EvalRequest("Pendulum-v1", baseline=f"ws://{reach_server.address}", episodes=1), Gates())
+
+
+@pytest.mark.parametrize("actions", [None, 0.5, [], [["left", "right"]], [[0.1], [0.1, 0.2]], [[0.1, 0.2, 0.3]]])
+def test_a_server_that_is_not_ours_and_gives_no_action(actions):
+    with serve_answer({"env": {}, "control_dt": "10 ms"}, {"actions": actions}) as url:
+        player = RemotePlayer(url, spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,)))
+        with pytest.raises(PolicyError, match=r"actions .*; the task takes a list of them, each of shape \(2,\)$"):
+            player.act(np.zeros(3), 0, 0)
+        player.close()
+
+
+@contextlib.contextmanager
+def serve_answer(metadata, answer):
+    """A policy server that gives each request the same answer."""
+
+    async def serve(request):
+        connection = web.WebSocketResponse()
+        await connection.prepare(request)
+        await connection.send_bytes(messages.pack(metadata))
+        async for _ in connection:
+            await connection.send_bytes(messages.pack(answer))
+        return connection
+
+    async def start():
+        app = web.Application()
+        app.router.add_get("/", serve)
+        runner = web.AppRunner(app)
+        await runner.setup()
+        await web.TCPSite(runner, "127.0.0.1", 0).start()
+        return runner
+
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    runner = asyncio.run_coroutine_threadsafe(start(), loop).result()
+    yield f"ws://127.0.0.1:{runner.addresses[0][1]}"
+    asyncio.run_coroutine_threadsafe(runner.cleanup(), loop).result()
+    loop.call_soon_threadsafe(loop.stop)
+    thread.join()
+    loop.close()
 
 
 def test_self_test(tmp_path):

@@ -118,6 +118,15 @@ def test_what_the_task_knows_of_its_joints(write, arm):
         SafetyFilter(arm, write("{command: speed, offset: 1}"))
 
 
+def test_a_joint_without_limits_of_its_own(write, arm):
+    known = Joints(["hip", "knee"], low=[0, -2], high=[-1, 0], max_speed=[0, 9], max_torque=[0, 3])
+    arm = arm.model_copy(update={"joints": known})
+    safety = SafetyFilter(arm, write("command: step\nmeasured: {position: positions}"))
+    safety.observe(observe_at(0, 0))
+    assert safety.limit([5.0, 5.0]) == pytest.approx([5.0, 0.0])
+    assert SafetyFilter(arm, write("command: torque")).limit([5.0, 5.0]) == pytest.approx([5.0, 3.0])
+
+
 def test_without_a_control_dt(write):
     info = EnvInfo(observation_space=make_arm().observation_space, action_space=space_to_json(spaces.Box(-1, 1, (2,))))
     with pytest.raises(RecipeError, match="does not say its control_dt"):

@@ -158,6 +158,16 @@ def test_a_stop_is_left_on_purpose_only(arm):
     ]  # fmt: skip
 
 
+def test_a_hand_chooses_what_the_policy_could_choose(arm):
+    choices = arm.model_copy(update={"action_space": space_to_json(spaces.Discrete(3))})
+    safety = SafetyFilter(choices)
+    for action in ([3], [-1], [1.5]):
+        with pytest.raises(ValueError, match=r"one of Discrete\(3\)"):
+            safety.override(action)
+    safety.override([2])
+    assert run_filter(safety, REST, 0) == 2
+
+
 def test_a_hand_takes_over_gradually_and_within_limits(arm):
     safety = make_filter(arm, command="position", blend_in_s=0.1, limits={"all": {"position": [-1, 1]}})
     for _ in range(3):
