@@ -25,7 +25,8 @@ ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
 """What can learn in hindsight: what has a replay buffer, except crossq, which has no network for Dict spaces."""
 
-_ABSENT = "(not set)"
+NOT_SET = "(not set)"
+"""What `find_difference` has for a key that a recipe does not have."""
 _QUANTILES = 25  # per critic, where a recipe does not say
 _MOST_STEPS = 10**12
 _MOST_ENVS = 10_000
@@ -250,7 +251,7 @@ def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:
     """Return per dotted key that differs the value in `recipe` and the one in `base`; the seed is not compared."""
     ours, theirs = (dict(_flatten(each.model_dump(mode="json", by_alias=True))) for each in (recipe, base))
     keys = dict.fromkeys([*theirs, *ours])
-    pairs = {key: (ours.get(key, _ABSENT), theirs.get(key, _ABSENT)) for key in keys if key != "seed"}
+    pairs = {key: (ours.get(key, NOT_SET), theirs.get(key, NOT_SET)) for key in keys if key != "seed"}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 

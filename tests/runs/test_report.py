@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import shlex
 import shutil
 import subprocess
 
@@ -10,6 +11,8 @@ import pytest
 
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import robustness
+from rlctl.run.recipe import find_difference
+from rlctl.run.recipe_sources import parse_settings, resolve, resolve_packaged
 from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.runs.report import content
 from rlctl.runs.report.write import write_report
@@ -57,6 +60,16 @@ def test_page_has_everything_and_needs_nothing_else(group):
     assert "<b>&" not in page  # what a run says is text
     assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//|@import|url\(\s*["']?http|<script|<link""", page)
     assert len(page) < LARGEST
+
+
+def test_command_for_another_algorithm_trains_the_same_recipe(write_run):
+    other = resolve("reach", None, {"algo": "sac", "task": {"tolerance": 0.1}, "seed": 3})
+    changes = {key: value for key, (value, _) in find_difference(other, resolve_packaged("reach")).items()}
+    run = write_run("reach/2026-11-21_10-00-00_s3", seed=3, recipe_changes=changes)
+    (command,) = content.list_commands(content.collect([str(run)]))
+    words = shlex.split(command)
+    assert words[:6] == ["rlctl", "train", "reach", "--seed", "3", "--set"]
+    assert resolve("reach", None, {"seed": 3, **parse_settings(words[6::2])}) == other
 
 
 def test_group_is_drawn_with_a_band(group):

@@ -12,7 +12,7 @@ import numpy as np
 
 from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.run.episode import RecordedEpisode
-from rlctl.run.recipe import find_mixed
+from rlctl.run.recipe import NOT_SET, find_mixed
 from rlctl.runs.comparison import find_runs_of
 from rlctl.runs.diagnosis import Finding
 from rlctl.runs.show import RunDescription
@@ -121,6 +121,7 @@ def list_commands(report: Report) -> list[str]:
         changes = [
             f"{key}={value if isinstance(value, str) else json.dumps(value)}"
             for key, value in each.summary.changes.items()
+            if value != NOT_SET  # another algorithm's, which its own `algo` leaves out
         ]
         source = each.status.get("from")
         start = ["--from", str(source.get("policy"))] if isinstance(source, dict) else []
