@@ -104,13 +104,15 @@ def read_limits(path: Path) -> Limits:
     try:
         return Limits.model_validate(content)
     except pydantic.ValidationError as error:
-        problem, schema = error.errors(include_url=False)[0], Limits.model_json_schema()
-        place = schema_text.locate(problem, schema)
-        line = yaml_text.find_line(text, place)
-        raise RecipeError(f"{path}:{line}: {_explain(problem, place, schema, content)}") from None
+        schema = Limits.model_json_schema()
+
+        def explain(problem: Any, place: schema_text.Place) -> str:
+            return f"{path}:{yaml_text.find_line(text, place)}: {_explain(problem, place, schema, content)}"
+
+        raise RecipeError(schema_text.explain_all(error, schema, explain)) from None
 
 
-def _explain(problem: Any, place: tuple[str | int, ...], schema: schema_text.Schema, content: Any) -> str:
+def _explain(problem: Any, place: schema_text.Place, schema: schema_text.Schema, content: Any) -> str:
     key, given = ".".join(str(part) for part in place), problem["input"]
     found = re.search(r"\[(.+?)\]", schema_text.find_schema(schema, place).get("description", ""))
     unit = found[1] if found else ""

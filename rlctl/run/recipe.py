@@ -207,19 +207,21 @@ class Source:
 
 
 def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
-    """Check plain data; raises `RecipeError` that names the key, what was expected, and the closest name.
+    """Check plain data; raises `RecipeError` that names each wrong key, what was expected, and the closest name.
 
     `sources` are where values are from, topmost first: of the first that has the key the error names the place.
     """
     try:
         return Recipe.model_validate(values)
     except pydantic.ValidationError as error:
-        problem = error.errors()[0]
         schema = build_schema(values.get("algo", "ppo"))
-        path = schema_text.locate(problem, schema)
-        places = (each if isinstance(each, str) else each.find(path) for each in sources)
-        where = next((place for place in places if place), "recipe")
-        raise RecipeError(f"{where}: {_explain(problem, path, schema, values)}") from None
+
+        def explain(problem: Any, path: schema_text.Place) -> str:
+            origins = (each if isinstance(each, str) else each.find(path) for each in sources)
+            origin = next((each for each in origins if each), "recipe")
+            return f"{origin}: {_explain(problem, path, schema, values)}"
+
+        raise RecipeError(schema_text.explain_all(error, schema, explain)) from None
 
 
 def build_schema(algo: Any = None) -> schema_text.Schema:

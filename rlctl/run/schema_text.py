@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
+
+import pydantic
 
 from rlctl.errors import did_you_mean, short_repr
 from rlctl.run import yaml_text
 
 Schema = dict[str, Any]
+Place = tuple[str | int, ...]
+"""Keys and indices that lead to a value."""
+_MOST_LINES = 3
 
 
 def find_schema(root: Schema, path: Sequence[str | int]) -> Schema:
@@ -45,9 +50,17 @@ def describe_value(root: Schema, node: Schema) -> str:
     return " or ".join(dict.fromkeys(_describe(root, each) for each in _list_alternatives(root, node)))
 
 
-def locate(problem: Any, root: Schema) -> tuple[str | int, ...]:
-    """Return the path of the value that an error of pydantic is about."""
-    path: tuple[str | int, ...] = problem["loc"]
+def explain_all(error: pydantic.ValidationError, root: Schema, explain: Callable[[Any, Place], str]) -> str:
+    """Return a line for every value that is wrong, three at most, as `explain` says it of a problem and its place."""
+    problems: dict[Place, Any] = {}
+    for problem in error.errors(include_url=False):
+        problems.setdefault(_locate(problem, root), problem)  # pydantic has one for each type that a value may be of
+    lines = [explain(problem, place) for place, problem in problems.items()]
+    return "\n".join(lines if len(lines) <= _MOST_LINES else [*lines[:2], f"and {len(lines) - 2} more mistakes"])
+
+
+def _locate(problem: Any, root: Schema) -> Place:
+    path: Place = problem["loc"]
     return path if problem["type"] == "extra_forbidden" else path[: _descend(root, path)[1]]
 
 

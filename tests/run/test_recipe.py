@@ -245,3 +245,22 @@ def test_the_error_names_where_the_value_is_from(packaged, tmp_path, config):
     )
     stages = config("stages:\n  - {level: 0.5}\n  - {levle: 1}\n")
     assert message(stages, []).startswith(f"{stages}:3: stage 2: no key 'levle'. Did you mean 'level'? Keys here: task")
+
+
+def test_every_mistake_is_named_up_to_three(packaged, tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("n_envs: 0\npolicy_kwargs:\n  net_arch: [a, 2.5]\nalgo_kwargs:\n  gamma: 99\n")
+    with pytest.raises(RecipeError) as caught:
+        resolve(packaged, file, {"seed": -1})
+    assert [line.split(" expected")[0] for line in str(caught.value).splitlines()] == [
+        f"{file}:5: algo_kwargs.gamma:",
+        f"{file}:3: policy_kwargs.net_arch:",
+        "and 2 more mistakes",
+    ]
+    with pytest.raises(RecipeError) as caught:
+        resolve(packaged, file, {"seed": -1, "policy_kwargs": {"net_arch": [8]}})
+    assert [line.split(" expected")[0] for line in str(caught.value).splitlines()] == [
+        f"{file}:5: algo_kwargs.gamma:",
+        f"{file}:1: n_envs:",
+        "command line: seed:",
+    ]
