@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 from rlctl import errors
 from rlctl.errors import (
     EpisodeFailed,
@@ -54,4 +56,4 @@ def make_error(failure: Failure, task: str) -> RlctlError:
 
 def format_hint(task: str) -> str:
     """Return what to type to look at an environment without a training."""
-    return f"to see it alone: rlctl check-env {task}"
+    return f"to see it alone: rlctl check-env {shlex.quote(task)}"

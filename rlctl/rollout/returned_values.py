@@ -43,7 +43,7 @@ def to_float(value: Any, name: str) -> float:
 
 
 def to_bool(value: Any, name: str) -> bool:
-    """Return `terminated` or `truncated` as a bool; numpy's bools and numbers 0 and 1 are accepted."""
+    """Return `terminated`, or what else must be a bool, as one; numpy's bools and numbers 0 and 1 are accepted."""
     if np.size(value) == 1 and (single := np.ravel(value)[0]) in (0, 1):
         return bool(single)
     raise InvalidReturn(f"{name} is {reprlib.repr(value)}, not a bool")

@@ -75,7 +75,8 @@ class RunningEpisode:
         success = info.get("is_success")
         metrics = info.get("metrics")  # of a plain environment it may be anything
         distance = (metrics if isinstance(metrics, dict) else info).get("distance")
-        if not isinstance(distance, int | float | np.number):  # a plain environment may mean something else by it
+        # A plain environment may mean something else by it.
+        if not isinstance(distance, int | float | np.number) or not math.isfinite(distance):
             distance = None
         terms = {
             str(name): returned_values.to_float(value, f"reward term {name}") for name, value in self._sums.items()
@@ -85,7 +86,7 @@ class RunningEpisode:
             self.seed,
             self._return,
             self.step,
-            None if success is None else bool(returned_values.to_float(success, "info['is_success']")),
+            None if success is None else returned_values.to_bool(success, "info['is_success']"),
             terms,
             None if distance is None else float(distance),
             row,

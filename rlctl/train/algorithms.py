@@ -97,16 +97,19 @@ def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: 
         raise RecipeError(f"dqn cannot be used here: it needs Discrete actions, these are {actions}; try ppo or sac")
     if algo in _CONTINUOUS and not isinstance(action_space, spaces.Box):
         raise RecipeError(f"{algo} cannot be used here: it needs Box actions, these are {actions}; try ppo or dqn")
-    for name, space, advice in (
+    for what, space, advice in (
         ("observation", observation_space, "observe values less start"),
         ("action", action_space, "add start in step"),
     ):
         for key, part in split_space(space).items():
+            name = f"{what} {key!r}" if key else f"the {what}"
             if np.any(getattr(part, "start", 0)):
                 raise RecipeError(
-                    f"{f'{name} {key!r}' if key else f'the {name}'} is {part}, and Stable-Baselines3 counts categories "
-                    f"from 0: leave start out of the space, and {advice}"
+                    f"{name} is {part}, and Stable-Baselines3 counts categories from 0: "
+                    f"leave start out of the space, and {advice}"
                 )
+            if isinstance(part, spaces.Box) and part.shape == () and what == "observation":
+                raise RecipeError(f"{name} is {part}, a single number: make it an array of the shape (1,)")
 
 
 def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:

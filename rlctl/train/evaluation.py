@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -112,7 +113,7 @@ class Evaluator:
         episode = RecordedEpisode(info, actions, nothing, nothing, nothing.reshape(0, 0))
         written: list[Path] = []
         self._saver.attempt("failed episode", lambda: written.append(self._write(episode)))
-        return error.with_hint(f"to reproduce it: rlctl replay {written[0]}") if written else error
+        return error.with_hint(f"to reproduce it: rlctl replay {shlex.quote(str(written[0]))}") if written else error
 
     def _write(self, episode: RecordedEpisode) -> Path:
         run = self._saver.run

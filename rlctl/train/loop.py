@@ -7,6 +7,7 @@ when to write a checkpoint, which changes nothing: so a run that was resumed is 
 from __future__ import annotations
 
 import dataclasses
+import shlex
 import time
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,10 @@ class TrainingLoop:
     def steps(self) -> int:
         """Environment steps so far."""
         return int(self._model.num_timesteps)
+
+    @property
+    def _resume_command(self) -> str:
+        return shlex.join(["rlctl", "train", "--resume", str(self.saver.run.path)])
 
     def run(self) -> None:
         """Play and learn until the recipe's steps are done, or its success rate holds.
@@ -148,7 +153,7 @@ class TrainingLoop:
             return
         state = "checkpoint saved" if self.save_checkpoint() else "the last saved checkpoint stands"
         raise Interrupted(
-            f"interrupted at step {self.steps:,}; {state}. Go on with: rlctl train --resume {self.saver.run.path}",
+            f"interrupted at step {self.steps:,}; {state}. Go on with: {self._resume_command}",
             self.stop_signal,
         )
 
@@ -269,9 +274,7 @@ class TrainingLoop:
         """Keep the actions of the training episode that failed, and return the error with what to do next."""
         lines = [str(self._evaluator.keep_failed(error, self._env.workers.spec))]
         if step := self.saver.saved_step:  # at step 0 there is nothing to keep
-            lines.append(
-                f"the checkpoint of step {step:,} stands; go on with: rlctl train --resume {self.saver.run.path}"
-            )
+            lines.append(f"the checkpoint of step {step:,} stands; go on with: {self._resume_command}")
         return TaskError("\n".join(lines), details=error.details)
 
     def write_end(self, recordings: int) -> list[Path]:

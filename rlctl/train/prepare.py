@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import shlex
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -171,7 +172,7 @@ def _refuse_errors(report: Report, display: Display) -> None:
     """Raise `AnswerIsNo` if the check found an error, and show its warnings."""
     if report.records.built is None:
         return  # the workers build it too, and report what is wrong
-    task, found = report.task, report.verdict.findings
+    task, found = shlex.quote(report.task), report.verdict.findings
     for name in report.verdict.crashed:
         display.message(f"check before training: {name} crashed, a bug in rlctl; what it would find is not known")
     errors = [finding for finding in found if finding.severity is Severity.ERROR]

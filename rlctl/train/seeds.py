@@ -8,6 +8,7 @@ import functools
 import itertools
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -53,9 +54,10 @@ class SeedsResult:
         """Raise `SeedsFailed` if a seed failed."""
         if self.failed:
             which = ", ".join(f"seed {seed} with exit code {code}" for seed, code in self.failed.items())
+            group = self.score.group
             raise SeedsFailed(
-                f"{self.score.group.path}: {len(self.failed)} of {len(self.score.group.seeds)} seeds failed: {which}. "
-                f"What each said is above; to try again: rlctl train --resume {self.score.group.path}",
+                f"{group.path}: {len(self.failed)} of {len(group.seeds)} seeds failed: {which}. "
+                f"What each said is above; to try again: rlctl train --resume {shlex.quote(str(group.path))}",
                 max(self.failed.values()),
             )
 
@@ -151,7 +153,9 @@ class _Trainings:
         with HandledSignals(self._pass_on), ThreadPoolExecutor(self._jobs, initializer=self._take_cores) as pool:
             codes = list(pool.map(self._train, commands, commands.values()))
         if self._stopped_by is not None:
-            raise Interrupted(f"interrupted; go on with: rlctl train --resume {group}", self._stopped_by)
+            raise Interrupted(
+                f"interrupted; go on with: rlctl train --resume {shlex.quote(str(group))}", self._stopped_by
+            )
         return {seed: code for seed, code in zip(commands, codes, strict=True) if code}
 
     def _take_cores(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import re
+import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -148,9 +149,10 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         run.recover()
         found, damage = checkpoint.read_newest(run)
         if found is None and status.get("status") == "finished":
+            command = shlex.join(["rlctl", "train", task, "--from", str(run.path)])
             raise ArtifactError(
                 f"{run.path}: finished, and its checkpoints were removed; "
-                f"for a new training that begins with its policy: rlctl train {task} --from {run.path}"
+                f"for a new training that begins with its policy: {command}"
             )
         if found is not None and request.settings:
             found = _reopen(found, before, recipe)

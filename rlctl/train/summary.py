@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Any
 
 from rlctl import output
@@ -15,19 +16,19 @@ def show(result: TrainResult, json: str | None) -> None:
     findings = diagnose(result.run)
     if json is not None and output.write_result_json(json, _to_json(result, findings)):
         return
-    run = result.run.path
+    run = shlex.quote(str(result.run.path))
     lines = [result.note] if result.note else []
-    lines += [*_format_result(result), *format_end(findings, str(run))]
-    lines += [f"recording: rerun {path}" for path in result.recordings]
+    lines += [*_format_result(result), *format_end(findings, run)]
+    lines += [f"recording: rerun {shlex.quote(str(path))}" for path in result.recordings]
     if result.recordings:
         lines.append("  without a display, in a browser: rerun --serve-web FILE")
     lines += [
-        f"run: {run}",
+        f"run: {result.run.path}",
         "next:",
         f"  rlctl eval {run}",
         f"  rlctl export {run} --onnx",
         f"  rlctl replay {run}",
-        f"  tensorboard --logdir {result.run.tensorboard}",
+        f"  tensorboard --logdir {shlex.quote(str(result.run.tensorboard))}",
     ]
     for line in lines:
         output.out().print(line)

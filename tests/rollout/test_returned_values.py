@@ -13,7 +13,7 @@ from rlctl.rollout.child_process import (
     anonymous_file,
     replace_control_characters,
 )
-from rlctl.rollout.failures import FailedInEpisode, describe_failure
+from rlctl.rollout.failures import FailedInEpisode, describe_failure, format_hint
 from rlctl.rollout.messages import Attach, Build, Failure, Job, LoadPolicy, Play
 from rlctl.rollout.worker import Worker
 from tests.train import faulty_envs
@@ -56,7 +56,8 @@ def failure(env, **parameters):
         ("text flag", "terminated is 'False', not a bool"),
         ("text term", "info['reward_terms'] is {'speed': 'fast'}, not a dict of numbers"),
         ("term list", "info['reward_terms'] is [1.0], not a dict of numbers"),
-        ("text success", "info['is_success'] is 'yes', not a number"),
+        ("text success", "info['is_success'] is 'yes', not a bool"),
+        ("nan success", "info['is_success'] is nan, not a bool"),
     ],
 )
 def test_what_is_returned(fault, message):
@@ -85,6 +86,10 @@ def test_what_is_raised(fault, message, at_reset):
     assert found.where == (0, 7, 0 if at_reset else 7)
     assert found.details.splitlines()[1].startswith(f'  File "{ENVS}"')
     assert "/rlctl/rollout/" not in found.details
+
+
+def test_a_path_with_spaces_can_be_typed_as_it_is_shown():
+    assert format_hint("my envs/a.py:A") == "to see it alone: rlctl check-env 'my envs/a.py:A'"
 
 
 def test_a_category_that_the_space_has_not():

@@ -100,6 +100,7 @@ RETURNS = {
     "text term": lambda o, r, t, u, i: (o, r, t, u, {"reward_terms": {"speed": "fast"}}),
     "term list": lambda o, r, t, u, i: (o, r, t, u, {"reward_terms": [1.0]}),
     "text success": lambda o, r, t, u, i: (o, r, True, u, {"is_success": "yes"}),
+    "nan success": lambda o, r, t, u, i: (o, r, True, u, {"is_success": float("nan")}),
 }
 
 

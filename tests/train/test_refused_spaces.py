@@ -42,6 +42,12 @@ BOX = spaces.Box(-1, 1, (2,))
             "the observation is MultiDiscrete([4 4], start=[0 1])",
         ),
         (
+            "sac",
+            spaces.Dict({"x": spaces.Box(0, 1, ())}),
+            BOX,
+            "observation 'x' is Box(0.0, 1.0, (), float32), a single ",
+        ),
+        (
             "ppo",
             BOX,
             spaces.Discrete(3, start=-1),

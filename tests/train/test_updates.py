@@ -79,6 +79,7 @@ PPO_CASES = {
     "clipped values and gradients, entropy": {"clip_range_vf": 0.2, "ent_coef": 0.1, "max_grad_norm": 0.1},
     "advantages as they are": {"normalize_advantage": False},
     "stopped by target_kl": {"target_kl": 8.0},
+    "actions in float64": {"actions": spaces.Box(-1, 1, (3,), np.float64)},
     "dict": {"observations": spaces.Dict({"a": VECTOR, "b": VECTOR}), "policy": "MultiInputPolicy"},
 }
 

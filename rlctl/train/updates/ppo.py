@@ -85,6 +85,7 @@ class PpoUpdate:
         observations = join({key: to_tensor(rows) for key, rows in split(buffer.observations).items()})
         data = {name: to_tensor(getattr(buffer, name)) for name in _FIELDS}
         data |= {name: data[name].flatten() for name in _FIELDS[1:]}
+        data["actions"] = data["actions"].float()  # the buffer has the type of the space
         return {"features": self._policy.extract_features(observations), **data}
 
     def _update(
