@@ -123,15 +123,12 @@ class EnvChanges:
 
     def apply(self, spec: EnvSpec) -> EnvSpec:
         """Return `spec` with the changes put over it."""
-        events = {} if self.randomize is False else dict(spec.events)
-        for name, changes in self.events.items():
-            events[name] = {**events.get(name, {}), **changes}
         return dataclasses.replace(
             spec,
-            parameters={**spec.parameters, **self.parameters},
-            reward_weights={**spec.reward_weights, **self.reward_weights},
+            parameters=merge(spec.parameters, self.parameters),
+            reward_weights=merge(spec.reward_weights, self.reward_weights),
             randomize=spec.randomize if self.randomize is None else self.randomize,
-            events=events,
+            events=merge({} if self.randomize is False else spec.events, self.events),
         )
 
     def __bool__(self) -> bool:
@@ -139,6 +136,16 @@ class EnvChanges:
 
 
 UNCHANGED = EnvChanges()
+
+
+def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `below` with the values of `above` put over it, mapping by mapping."""
+    result = dict(below)
+    for key, value in above.items():
+        known = result.get(key)
+        both = isinstance(known, Mapping) and isinstance(value, Mapping)
+        result[key] = merge(known, value) if both else value  # type: ignore[arg-type]
+    return result
 
 
 def make(

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 from pydantic import Field
 
-from rlctl.env_spec import EnvSpec
+from rlctl.env_spec import EnvSpec, merge
 from rlctl.errors import RecipeError, short_repr
 from rlctl.run import schema_text, yaml_text
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS, decide_by
@@ -176,16 +176,6 @@ class Recipe(Section):
     def to_yaml(self) -> str:
         """Return the recipe as YAML that is itself valid for `--config`."""
         return yaml_text.dump(self.model_dump(mode="json", by_alias=True))
-
-
-def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `below` with the values of `above` put over it, mapping by mapping."""
-    result = dict(below)
-    for key, value in above.items():
-        known = result.get(key)
-        both = isinstance(known, Mapping) and isinstance(value, Mapping)
-        result[key] = merge(known, value) if both else value  # type: ignore[arg-type]
-    return result
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import registry
-from rlctl.env_spec import EnvChanges
+from rlctl.env_spec import EnvChanges, merge
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
 from rlctl.run import yaml_text
 from rlctl.run.hyperparameters import ON_POLICY
-from rlctl.run.recipe import Normalize, Recipe, Source, merge, validate
+from rlctl.run.recipe import Normalize, Recipe, Source, validate
 
 _PRESETS = Path(__file__).with_name("presets")
 """Recipes that `--config` finds by name."""

@@ -38,10 +38,13 @@ def import_model(
 ) -> ImportedPolicy:
     """Read a model, and a VecNormalize if it has one, and write it as a policy of a task, once it acts.
 
-    Raises `ArtifactError` for a file that is not a model, or one for other spaces than the task has.
+    Raises `UsageError` for another ending of `output` than .safetensors, `ArtifactError` for a file that is not a
+    model, or one for other spaces than the task has.
     """
     from rlctl.run.torch_policy import ALGORITHMS, build_network, describe_network, policy_name
 
+    if output is not None and output.suffix != ".safetensors":
+        raise UsageError(f"--output {output}: the name of a policy file ends in .safetensors")
     if algo is not None and algo not in ALGORITHMS:
         raise UsageError(f"--algo {algo}: no such algorithm.{did_you_mean(algo, ALGORITHMS)}")
     model = read_model(file, algo)

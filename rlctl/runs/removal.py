@@ -53,7 +53,7 @@ def _checked(path: Path, root: Path) -> Path:
         raise ArtifactError(f"{path}: not the folder of a run; `rlctl runs` lists them")
     if is_run and not is_below_root:
         RunDirectory(found).status()
-    return found
+    return found.resolve()
 
 
 def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:

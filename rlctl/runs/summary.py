@@ -46,7 +46,8 @@ class RunSummary:
     @property
     def name(self) -> str:
         """Return the path below the folder of all runs: `reach/2026-11-21_10-30-00_s0`."""
-        return "/".join(self.path.parts[-3 if is_group(self.path.parent) else -2 :])
+        path = self.path.resolve()  # it may have been called "." or "latest"
+        return "/".join(path.parts[-3 if is_group(path.parent) else -2 :])
 
     @property
     def state_text(self) -> str:

@@ -210,6 +210,11 @@ def test_what_is_changed_goes_over_what_was_trained_with():
     assert changed == EnvSpec(
         "reach", {"a": 1, "b": 2}, {"x": 1.0, "y": 3.0}, True, {"mass": {"factor": [1, 1], "body": "arm"}}
     )
+    # Mapping by mapping, as a recipe is put together.
+    trained = EnvSpec("reach", {"arm": {"length": 1, "mass": 2}}, events={"mass": {"factor": {"from": 1, "to": 2}}})
+    changed = EnvChanges({"arm": {"mass": 3}}, events={"mass": {"factor": {"to": 3}}}).apply(trained)
+    assert changed.parameters == {"arm": {"length": 1, "mass": 3}}
+    assert changed.events == {"mass": {"factor": {"from": 1, "to": 3}}}
     # Not randomised: also the events go that it was trained with, but for those that are asked for.
     calm = EnvChanges(randomize=False, events={"push": {}}).apply(trained)
     assert (calm.randomize, calm.events) == (False, {"push": {}})

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from rlctl.env_spec import merge
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval.evaluate import EvalRequest
-from rlctl.run.recipe import merge
 from rlctl.runs.comparison import compare, find_runs_of
 from rlctl.runs.comparison_report import as_json, format_needed
 from rlctl.runs.statistics import Verdict

@@ -174,6 +174,8 @@ def test_other_files_are_refused(save, tmp_path):
     (tmp_path / "half.pkl").write_bytes(request["normalization"].read_bytes()[:200])
     with pytest.raises(ArtifactError, match=r"half\.pkl"):
         read_normalization(tmp_path / "half.pkl")
+    with pytest.raises(UsageError, match=r"--output policy: the name of a policy file ends in \.safetensors"):
+        import_model(tmp_path / "nothing.zip", "reach", output=Path("policy"))
 
 
 def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path):

@@ -3,11 +3,13 @@ import os
 import pty
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.runs.removal import plan_prune, plan_removal, remove
+from rlctl.runs.summary import summarize
 
 
 def test_removes_what_is_named(write_run):
@@ -18,6 +20,16 @@ def test_removes_what_is_named(write_run):
     assert not gone.exists()
     assert stays.exists()
     assert list(gone.parent.iterdir()) == [stays]
+
+
+def test_names_of_one_folder(write_run, monkeypatch):
+    run = write_run("reach/2026-01-01_00-00-00_s0")
+    removal = plan_removal(["reach/2026-01-01_00-00-00_s0", f"runs/reach/../reach/{run.name}", str(run)])
+    assert removal.paths == [run]
+    monkeypatch.chdir(run)
+    assert summarize(Path()).name == f"reach/{run.name}"
+    remove(plan_removal(["."]))
+    assert not run.exists()
 
 
 def test_keeps_the_best_of_each_task(write_run):

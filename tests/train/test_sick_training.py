@@ -2,7 +2,7 @@
 
 import pytest
 
-from rlctl.run.recipe import merge
+from rlctl.env_spec import merge
 from rlctl.runs.diagnosis import Grade, diagnose
 
 SHORT = {"total_timesteps": 60_000, "eval": {"every_steps": 12_000, "episodes": 10}}

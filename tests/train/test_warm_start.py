@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from rlctl.env_spec import merge
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run.policy import read_policy
-from rlctl.run.recipe import merge
 from rlctl.run.shipped import find_shipped_policy
 from rlctl.train.request import TrainRequest, run_training
 from tests.train.comparing import rows
