@@ -102,6 +102,10 @@ class EnvSpec:
         _check_keywords(self.task, constructor, parameters)
         if render_mode is not None:
             parameters["render_mode"] = render_mode
+            try:
+                _check_keywords(self.task, constructor, parameters)
+            except RecipeError:
+                raise RecipeError(f"{self.task} takes no render_mode") from None
         env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
         if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
             raise TaskError(

@@ -59,7 +59,7 @@ def serve(
         from rlctl.eval.self_test import run_self_test
         from rlctl.eval.self_test import show as show_test
 
-        result = run_self_test(server, EvalRequest(run, checkpoint=chosen, episodes=episodes, limits=limits))
+        result = run_self_test(server, EvalRequest(str(found.file), episodes=episodes, limits=limits))
         show_test(result, json)
         return result.check()
 

@@ -43,7 +43,7 @@ def make_filmable(spec: EnvSpec) -> Env:
         return spec.make("rgb_array")
     except RlctlError as error:
         spec.make().close()  # raises again if the pictures were not the reason
-        raise UsageError(f"--video: {spec.task} makes no pictures: {str(error).splitlines()[0]}") from None
+        raise UsageError(f"--video: no pictures: {str(error).splitlines()[0]}") from None
 
 
 def film_episodes(

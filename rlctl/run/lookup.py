@@ -66,7 +66,8 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
     if entry := registry.find(text):
         shipped = "; for the policy that it ships: --pretrained" if entry.policy_file else ""
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
-    raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{did_you_mean(text, names)}")
+    hint = did_you_mean(text, names) or " All runs: rlctl runs"
+    raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{hint}")
 
 
 def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> FoundPolicy:

@@ -15,6 +15,7 @@ from rlctl.task.bullet import pybullet
 from rlctl.task.properties import Properties
 
 Array = NDArray[np.float64]
+_NUMBER = (int, float, np.number)
 
 
 class _Plan(NamedTuple):
@@ -29,8 +30,9 @@ class _Plan(NamedTuple):
 class Motors(Properties):
     """The part of `Body` that drives its joints.
 
-    `joints` are names; none means all, in `joint_names` order. Arrays have one element per joint that is named. Forces
-    are in [N m], of sliding joints in [N]; speeds in [rad/s], of sliding joints in [m/s].
+    `joints` are names; none means all, in `joint_names` order. Arrays have one element per joint that is named; a
+    limit may also be one number for all of them. Forces are in [N m], of sliding joints in [N]; speeds in [rad/s], of
+    sliding joints in [m/s].
     """
 
     joint_low: Array
@@ -52,8 +54,8 @@ class Motors(Properties):
         self,
         positions: Array,
         *,
-        max_speed: Sequence[float] | None = None,
-        max_force: Sequence[float] | None = None,
+        max_speed: float | Sequence[float] | None = None,
+        max_force: float | Sequence[float] | None = None,
         gain: float = 0.1,
         joints: Sequence[str] = (),
     ) -> None:
@@ -62,7 +64,9 @@ class Motors(Properties):
         `gain` is the part of the position error that a physics step takes away, in (0, 1].
         """
         # Tuples, because two arrays cannot be compared by `!=`.
-        speeds, forces = (None if each is None else tuple(each) for each in (max_speed, max_force))
+        speeds, forces = (
+            each if each is None or isinstance(each, _NUMBER) else tuple(each) for each in (max_speed, max_force)
+        )
         limits = (speeds, forces, gain)
         plan = self._plans.get(tuple(joints))
         if plan is None or plan.limits != limits:
@@ -80,12 +84,16 @@ class Motors(Properties):
         )
 
     def _plan_motors(
-        self, joints: Sequence[str], max_speed: Sequence[float] | None, max_force: Sequence[float] | None, gain: float
+        self,
+        joints: Sequence[str],
+        max_speed: float | Sequence[float] | None,
+        max_force: float | Sequence[float] | None,
+        gain: float,
     ) -> _Plan:
         chosen = self.find_joints(joints)
         links = [self.joint_indices[joint] for joint in chosen]
         given = self.joint_max_speed[chosen] if max_speed is None else max_speed
-        speeds = self._read_values("max_speed", given, len(links))
+        speeds = self._read_limits("max_speed", given, len(links))
         # Only the call for one joint takes a speed; the motor keeps it when the call for all sets the targets.
         for index, speed in zip(links, speeds, strict=True):
             pybullet.setJointMotorControl2(
@@ -95,7 +103,7 @@ class Motors(Properties):
         return _Plan((max_speed, max_force, gain), chosen, links, impulses, [gain] * len(links))
 
     def drive_at(
-        self, velocities: Array, *, max_force: Sequence[float] | None = None, joints: Sequence[str] = ()
+        self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()
     ) -> None:
         """Set velocity targets [rad/s or m/s]; the force is limited, by the model file's limit if not given.
 
@@ -113,10 +121,13 @@ class Motors(Properties):
             physicsClientId=self.client,
         )
 
-    def _motor_impulses(self, joints: list[int], max_force: Sequence[float] | None) -> list[float]:
+    def _motor_impulses(self, joints: list[int], max_force: float | Sequence[float] | None) -> list[float]:
         # PyBullet makes an impulse of a motor's force with the time of a whole step, and gives it in every substep.
         forces = self.joint_max_force[joints] if max_force is None else max_force
-        return [force / self._substeps for force in self._read_values("max_force", forces, len(joints))]
+        return [force / self._substeps for force in self._read_limits("max_force", forces, len(joints))]
+
+    def _read_limits(self, name: str, limits: float | Array | Sequence[float], count: int) -> list[float]:
+        return self._read_values(name, [limits] * count if isinstance(limits, _NUMBER) else limits, count)
 
     def _read_values(self, name: str, values: Array | Sequence[float], count: int) -> list[float]:
         # PyBullet's own message says neither of what body, nor how many there are. A list takes it half the time.

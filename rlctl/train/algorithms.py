@@ -94,9 +94,11 @@ def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: 
     """Raise `RecipeError` for spaces that SB3 refuses in its own words, or not before training."""
     actions = short_repr(action_space)
     if algo == "dqn" and not isinstance(action_space, spaces.Discrete):
-        raise RecipeError(f"dqn cannot be used here: it needs Discrete actions, these are {actions}; try ppo or sac")
+        others = "ppo or sac" if isinstance(action_space, spaces.Box) else "ppo"
+        raise RecipeError(f"dqn cannot be used here: it needs Discrete actions, these are {actions}; try {others}")
     if algo in _CONTINUOUS and not isinstance(action_space, spaces.Box):
-        raise RecipeError(f"{algo} cannot be used here: it needs Box actions, these are {actions}; try ppo or dqn")
+        others = "ppo or dqn" if isinstance(action_space, spaces.Discrete) else "ppo"
+        raise RecipeError(f"{algo} cannot be used here: it needs Box actions, these are {actions}; try {others}")
     for what, space, advice in (
         ("observation", observation_space, "observe values less start"),
         ("action", action_space, "add start in step"),

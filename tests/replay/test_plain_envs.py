@@ -50,14 +50,14 @@ def test_time_follows_from_the_frame_rate(tmp_path):
     ("name", "parameters", "reason"),
     [
         ("Pixels", {"fault": "render"}, "no camera pictures: OSError: no OpenGL"),
-        ("Blind", {}, "no camera pictures: "),
+        ("Blind", {}, "envs.py:Blind takes no render_mode"),
         ("Undrawn", {}, "no camera pictures: the environment does not implement render"),
     ],
 )
 def test_missing_pictures_cost_a_warning_and_nothing_else_is_missing(name, parameters, reason, tmp_path):
     rollout, warnings = play(name, **parameters)
     assert len(warnings) == 1
-    assert warnings[0].startswith(reason)
+    assert reason in warnings[0]
     found = entities(write(rollout, tmp_path))
     assert "/camera" not in found
     assert {"/action", "/reward/total", "/observation/point"} <= found

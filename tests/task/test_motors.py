@@ -46,6 +46,19 @@ def test_a_motor_gives_no_more_than_its_force(sim, tmp_path):
     assert arm.joint_positions[0] > 0.5  # it falls
 
 
+def test_a_limit_may_be_one_number_for_all_joints(sim, tmp_path):
+    one, two = (sim.load(name, models.two_wheels(tmp_path), fixed=True) for name in ("one", "two"))
+    for _ in range(3):
+        one.drive_to(np.ones(2), max_speed=2.0, max_force=np.float32(0.5), gain=0.3)
+        two.drive_to(np.ones(2), max_speed=[2.0, 2.0], max_force=[0.5, 0.5], gain=0.3)
+        sim.step()
+    assert one.joint_positions.tolist() == two.joint_positions.tolist()
+    one.drive_at(np.ones(2), max_force=0.5)
+    two.drive_at(np.ones(2), max_force=[0.5, 0.5])
+    sim.step()
+    assert one.joint_velocities.tolist() == two.joint_velocities.tolist()
+
+
 def test_set_torques_are_what_is_given(sim, tmp_path):
     wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
     wheels.disable_motors()

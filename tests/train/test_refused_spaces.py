@@ -62,6 +62,12 @@ def test_spaces_that_are_refused(algo, observation, action, message):
     assert str(caught.value).startswith(message)
 
 
+@pytest.mark.parametrize("algo", ["dqn", "sac"])
+def test_only_what_takes_the_actions_is_advised(algo):
+    with pytest.raises(RecipeError, match=r"these are MultiDiscrete\(\[3 2\]\); try ppo$"):
+        check_spaces(algo, BOX, spaces.MultiDiscrete([3, 2]))
+
+
 def test_spaces_that_are_not():
     for algo in ("ppo", "a2c"):
         check_spaces(algo, spaces.Dict({"gripper": spaces.Discrete(4), "arm": BOX}), spaces.Discrete(3))

@@ -135,7 +135,7 @@ class _Search:
         is_reported = reports_success([each.played for each in self.attempts])
         finished = [each for each in self.attempts if _finishes(each.played, is_reported)]
         if not finished:
-            yield Skipped("RL605", "nothing ended an episode at a goal", applies=False)
+            yield Skipped("RL605", "the search for high returns ended no episode at a goal", applies=False)
             return
         best = max(finished, key=lambda each: each.played.rewards[-1])
         one, nothing = best.played, zero_action(self._space)
