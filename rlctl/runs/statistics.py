@@ -19,6 +19,8 @@ ALPHA = 0.05
 """Below this p-value a difference is called one; intervals are of 1 - ALPHA."""
 POWER = 0.8
 _RESAMPLES = 9999
+_LEAST_PAIRS, _LEAST_SEEDS = 6, 4
+"""Pairs that differ, and seeds for each of two recipes, of which an exact test's p-value can be below `ALPHA`."""
 
 
 class Verdict(enum.StrEnum):
@@ -92,13 +94,13 @@ def return_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float
     )
     low, high = _interval((difference,), np.mean)
     std = float(difference.std(ddof=1)) if difference.size > 1 else math.nan
-    return Difference(mean, low, high, float(test.pvalue), _sample_size(mean, std))
+    return Difference(mean, low, high, float(test.pvalue), _sample_size(mean, std, _LEAST_PAIRS))
 
 
 def seed_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64]) -> SeedDifference:
     """Compare two recipes by the final scores of their training seeds: an exact permutation test where it is small.
 
-    Shapes (seeds,), which may differ. The interval of the difference of means is a bootstrap over seeds.
+    Shapes (seeds,), two seeds or more each. The interval of the difference of means is a bootstrap over seeds.
     """
     from scipy.stats import permutation_test
 
@@ -106,16 +108,13 @@ def seed_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64
     wins = np.sign(candidate[:, None] - baseline[None, :])
     improvement = float((wins + 1).mean() / 2)
     smallest = min(1.0, 2 / math.comb(baseline.size + candidate.size, baseline.size))
-    if min(baseline.size, candidate.size) < 2:
-        return SeedDifference(mean, mean, mean, 1.0, None, improvement, smallest)
     p = 1.0
     if wins.any():
         result = permutation_test((candidate, baseline), _difference_of_means, n_resamples=_RESAMPLES, rng=_rng())
         p = float(result.pvalue)
     low, high = _interval((candidate, baseline), _difference_of_means)
     std = math.sqrt(float(candidate.var(ddof=1) + baseline.var(ddof=1)))
-    needed = _sample_size(mean, std)
-    return SeedDifference(mean, low, high, p, None if needed is None else max(needed, 4), improvement, smallest)
+    return SeedDifference(mean, low, high, p, _sample_size(mean, std, _LEAST_SEEDS), improvement, smallest)
 
 
 def interquartile_mean_interval(scores: NDArray[np.float64]) -> tuple[float, float]:
@@ -149,11 +148,11 @@ def _rng() -> np.random.Generator:
     return np.random.default_rng(0)  # the same data give the same figures
 
 
-def _sample_size(difference: float, std: float) -> int | None:
+def _sample_size(difference: float, std: float, least: int) -> int | None:
     """Return for how many samples a t-test would find the difference: ((z_a + z_b) std / difference)^2."""
     if difference == 0 or not math.isfinite(std):
         return None
-    return max(2, math.ceil((sum(_quantiles()) * std / difference) ** 2))
+    return max(least, math.ceil((sum(_quantiles()) * std / difference) ** 2))
 
 
 def _episodes_for_success(gained: int, lost: int, episodes: int) -> int | None:
@@ -163,7 +162,7 @@ def _episodes_for_success(gained: int, lost: int, episodes: int) -> int | None:
     disagreeing, difference = (gained + lost) / episodes, (gained - lost) / episodes
     alpha, beta = _quantiles()
     root = alpha * math.sqrt(disagreeing) + beta * math.sqrt(max(disagreeing - difference**2, 0.0))
-    return math.ceil((root / difference) ** 2)
+    return math.ceil(max((root / difference) ** 2, _LEAST_PAIRS / disagreeing))
 
 
 def _quantiles() -> tuple[float, float]:

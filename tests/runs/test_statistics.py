@@ -54,6 +54,14 @@ def test_episodes_needed_by_connors_formula():
     assert difference.needed == pytest.approx(784, abs=1)
 
 
+def test_fewer_pairs_than_can_decide_are_not_called_enough():
+    # Five of five gained: p = 2 / 2^5 = 0.0625, and with six 2 / 2^6 = 0.031.
+    difference = success_difference(np.zeros(5), np.ones(5))
+    assert (difference.p, difference.needed, difference.verdict) == (0.0625, 6, Verdict.CANNOT_TELL)
+    difference = return_difference(np.zeros(3), np.array([1.0, 1.0, 1.1]))
+    assert (difference.p, difference.needed, difference.verdict) == (0.25, 6, Verdict.CANNOT_TELL)
+
+
 def test_returns_are_paired():
     rng = np.random.default_rng(0)
     baseline = rng.normal(0.0, 100.0, 50)
@@ -108,9 +116,3 @@ def test_intervals_cover_as_often_as_they_say():
         difference = return_difference(np.zeros(40), rng.normal(1.0, 2.0, 40))
         covered += difference.low <= 1.0 <= difference.high
     assert covered >= 86
-
-
-def test_one_run_per_recipe_decides_nothing():
-    difference = seed_difference(np.array([1.0]), np.array([5.0]))
-    assert difference.verdict is Verdict.CANNOT_TELL
-    assert difference.needed is None
