@@ -15,6 +15,8 @@ from rlctl.deploy.safety_filter import SafetyFilter
 from rlctl.deploy.served_policy import ServedPolicy
 from rlctl.errors import RlctlError, short_repr
 
+_LONGEST_AGE_S = 1e9
+
 
 class Session:
     """An episode after the other of one client.
@@ -85,10 +87,13 @@ class Session:
         if not isinstance(request, dict):
             raise ObservationError("a request is a map: observations by name, or observation: the flat vector")
         fields = dict(request)
-        if fields.pop("reset", False):
+        reset, age_s = fields.pop("reset", False), fields.pop("age_s", 0.0)
+        if not isinstance(reset, bool | int | np.bool_):
+            raise ObservationError(f"reset is {short_repr(reset)}, not true or false")
+        if reset:
             self.reset()
-        age_s = fields.pop("age_s", 0.0)
-        if isinstance(age_s, bool) or not isinstance(age_s, int | float | np.number):
+        is_number = isinstance(age_s, int | float | np.number) and not isinstance(age_s, bool)
+        if not is_number or abs(age_s) > _LONGEST_AGE_S:
             raise ObservationError(f"age_s is {short_repr(age_s)}, not a number of seconds")
         layout = self.safety.layout
         if WHOLE in fields and WHOLE not in layout.shapes:

@@ -64,6 +64,8 @@ def test_the_protocol(serve):
         ({**OBSERVATION, "goal": "near"}, "observation 'goal' is <U4, not numbers"),
         ({**OBSERVATION, "goal": [[1], [2, 3]]}, "observation 'goal' is not an array of numbers"),
         ({**OBSERVATION, "age_s": "old"}, "age_s is old, not a number of seconds"),
+        ({**OBSERVATION, "age_s": 1e300}, "age_s is 1e+300, not a number of seconds"),
+        ({**OBSERVATION, "reset": np.array([True, False])}, "reset is array([ True, False]), not true or false"),
         (["positions"], "a request is a map"),
     ],
 )

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from rlctl.deploy.identify.follow import describe_expected, find_joints, open_world
-from rlctl.deploy.identify.log import Array, Log, write_log
+from rlctl.deploy.identify.log import LEAST_ROWS, Array, Log, write_log
 from rlctl.env_spec import EnvSpec
-from rlctl.errors import AnswerIsNo
+from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
 
@@ -39,14 +39,19 @@ def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) ->
     """Write the largest trajectory that is safe in simulation, as a log: actions, and what the simulation did.
 
     Safe: every joint stays 10 % of its range away from its ends and below its top speed, no body that is fixed to the
-    world touches another one, and the task does not end. Raises `AnswerIsNo` if even 5 % of the actions' range is not.
+    world touches another one, and the task does not end. Raises `AnswerIsNo` if even 5 % of the actions' range is not,
+    `UsageError` for actions without bounds and too short a trajectory.
     """
     env = open_world(spec)
     try:
+        if not np.isfinite([env.action_space.low, env.action_space.high]).all():  # type: ignore[attr-defined]
+            raise UsageError(f"{spec.task}: its actions have no bounds, of which a safe trajectory would be a part")
+        if (steps := round(seconds / env.task.control_dt)) < LEAST_ROWS:
+            raise UsageError(f"--seconds {seconds:g}: {steps} actions of {spec.task}; a log has {LEAST_ROWS} or more")
         expected = describe_expected(env, spec.task)
         # A world as the task builds it; what acts by chance would only disturb.
         env.set_events(EventSettings())
-        shape = _draw_sines(env, round(seconds / env.task.control_dt), seed)
+        shape = _draw_sines(env, steps, seed)
         reason = ""
         for amplitude in _AMPLITUDES:
             reason, log, share = _try(env, amplitude * shape, expected.driven)

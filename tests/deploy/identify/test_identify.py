@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rlctl import registry
 from rlctl.deploy.identify.excite import write_excitation
 from rlctl.deploy.identify.follow import open_world
 from rlctl.deploy.identify.identify import identify
@@ -14,6 +15,7 @@ from rlctl.deploy.identify.report import show, write_fragment
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.run import yaml_text
+from rlctl.task import Box
 from rlctl.task.events import EventSettings
 
 ARM = f"{Path(__file__).with_name('arm.py')}:Arm"
@@ -68,6 +70,14 @@ def test_trajectory_stays_in_the_limits(excitation):
     assert np.abs(log.velocities).max() <= 20.0 * 1.05
     assert len(log.actions) == 200
     assert 0 < excitation.largest_share <= 1
+
+
+def test_trajectories_that_cannot_be(tmp_path, monkeypatch):
+    with pytest.raises(UsageError, match=r"--seconds 0\.3: 15 actions of .*; a log has 20 or more"):
+        write_excitation(SPEC, tmp_path / "log.csv", seconds=0.3, seed=0)
+    monkeypatch.setattr(registry.load(ARM), "action_space", Box(-np.inf, np.inf, (2,), np.float32))
+    with pytest.raises(UsageError, match="its actions have no bounds"):
+        write_excitation(SPEC, tmp_path / "log.csv", seconds=1.0, seed=0)
 
 
 def test_hidden_values_are_found(real, tmp_path):
