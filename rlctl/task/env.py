@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean
+from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean, short_repr
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
 from rlctl.task.observation import Observation, ObservationFormat
@@ -40,6 +40,9 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.name = type(task).__name__
         if not hasattr(task, "action_space"):
             raise TaskError(f"{self.name} does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example")
+        for key in ("control_dt", "episode_s"):
+            if not 0 < (seconds := getattr(task, key)) < math.inf:
+                raise TaskError(f"{self.name}: {key} is {seconds}: it is a time above 0 [s]")
         # Of the instance: gymnasium.Env shares one dict between all environments.
         self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / task.control_dt)}
         if render_mode not in (None, "human", "rgb_array"):
@@ -71,6 +74,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             task.reset(np.random.default_rng(0))
             self._acting.try_once(["start", "interval"], self.sim)
             self._first = first = task.observe()
+            if not isinstance(first, dict) or not first:
+                raise _not_by_name(self.name, "observe", first)
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
             self._signals.try_once()
             # A task knows its markers once an episode has begun; they join the world as it was built.
@@ -150,6 +155,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         terminated = bool(task.is_terminated())
         truncated = not terminated and self._step >= self.max_steps
         raw = task.rewards(action)
+        if not isinstance(raw, dict):
+            raise _not_by_name(self.name, "rewards", raw)
         weights = self.reward_weights
         if raw.keys() != weights.keys():
             raise _term_mismatch(self.name, raw, weights)
@@ -213,6 +220,10 @@ def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]
         check_name(name, weights, f"reward_weights: {type(task).__name__} has no term", RecipeError)
         weights[name] = float(weight)
     return weights
+
+
+def _not_by_name(task: str, method: str, value: Any) -> TaskError:
+    return TaskError(f"{task}: {method}() returned {short_repr(value)}, not a dict of values by name: {{'speed': ...}}")
 
 
 def _term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:

@@ -15,6 +15,9 @@ from rlctl.task.task import Task
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
+_ROUNDING = 1e-4
+"""Of floats, by which a value may be outside its bounds: it is clipped. Farther outside it is an error of the task."""
+
 
 class ObservationFormat:
     """The space of a task's observations, and how they are put into it; `first` is one of them, by name."""
@@ -82,9 +85,8 @@ class ObservationFormat:
     def _clip_rounding(
         self, values: NDArray[np.float32], low: Any, high: Any, parts: Mapping[str, Any], step: int
     ) -> Any:
-        # Float rounding only: a value well outside its declared range is an error of the task.
         clipped = np.minimum(np.maximum(values, low), high)
-        if np.abs(clipped - values).max() > 1e-4:
+        if np.abs(clipped - values).max(initial=0.0) > _ROUNDING:
             raise self._out_of_bounds(parts, step)
         return clipped
 
@@ -105,9 +107,8 @@ class ObservationFormat:
 
     def _out_of_bounds(self, parts: Mapping[str, Any], step: int) -> TaskError:
         for name, (low, high) in self._bounds.items():
-            values = np.ravel(parts[name])
-            worst = values[np.argmax(np.maximum(low - values, values - high))]
-            if worst < low or worst > high:
+            worst = max(np.ravel(parts[name]).tolist(), key=lambda value: max(low - value, value - high), default=low)
+            if max(low - worst, worst - high) > _ROUNDING:
                 return TaskError(
                     f"{self._name}: observation {name!r} is {worst:g} at step {step}, "
                     f"outside its bounds [{low:g}, {high:g}]"

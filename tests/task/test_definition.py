@@ -62,6 +62,22 @@ def missing(*names: str) -> type[Task]:
             "MyArm does not define act(), rewards(); a task needs build, act, observe, rewards",
         ),
         (
+            type("Standing", (Whole,), {"control_dt": 0.0}),
+            "Standing: control_dt is 0.0: it is a time above 0 [s]",
+        ),
+        (
+            type("Endless", (Whole,), {"episode_s": float("inf")}),
+            "Endless: episode_s is inf: it is a time above 0 [s]",
+        ),
+        (
+            type("Flat", (Whole,), {"observe": lambda self: np.zeros(2)}),
+            "Flat: observe() returned array([0., 0.]), not a dict of values by name: {'speed': ...}",
+        ),
+        (
+            type("Blind", (Whole,), {"observe": lambda self: {}}),
+            "Blind: observe() returned {}, not a dict of values by name: {'speed': ...}",
+        ),
+        (
             missing("action_space"),
             "MyArm does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example",
         ),

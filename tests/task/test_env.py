@@ -114,6 +114,7 @@ def test_no_step_before_a_reset_or_after_the_end(make):
     [
         ("nan term", "Slider: reward term 'effort' is nan at step 3"),
         ("missing term", "Slider: rewards() returned no term 'effort', which reward_weights names"),
+        ("one reward", "Slider: rewards() returned 1.0, not a dict of values by name: {'speed': ...}"),
         ("unknown term", "Slider: reward term 'efort' has no weight. Did you mean 'effort'?"),
         ("nan observation", "Slider: observation 'place' is not finite at step 3: [nan]"),
         ("shape", "Slider: observation 'place' has shape (3,) at step 3, (1,) at the first observation"),
@@ -265,6 +266,22 @@ def test_observation_bounds(make):
     with pytest.raises(TaskError) as caught:
         env.step(np.array([0.25, 0.0]))
     assert str(caught.value) == "Bounded: observation 'place' is 1.75002 at step 2, outside its bounds [-1, 1.5]"
+
+
+@pytest.mark.parametrize("layout", ["flat", "dict"])
+def test_the_observation_farthest_outside_its_bounds_is_named(make, layout):
+    class Several(Slider):
+        observation_layout = layout
+        observation_bounds = {"none": (0.0, 1.0), "rounded": (0.0, 1.0), "place": (-1.0, 1.5)}
+
+        def observe(self):
+            return {**super().observe(), "none": np.zeros(0), "rounded": np.array([1.0 + 1e-6])}
+
+    env = make(Several())
+    env.reset(seed=0)
+    env.step(np.array([0.5, 0.0]))
+    with pytest.raises(TaskError, match=r"^Several: observation 'place' is 1\.75"):
+        env.step(np.array([0.25, 0.0]))
 
 
 def test_bounds_of_what_is_not_observed():
