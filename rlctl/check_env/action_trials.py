@@ -45,13 +45,13 @@ class Dimension:
         return name_element(self.leaf, self.index, "action")
 
     @property
-    def bounds(self) -> tuple[float, float]:
-        """Lowest and highest value; infinite where there is none."""
+    def bounds(self) -> tuple[Any, Any]:
+        """Lowest and highest value, of the action's type; infinite where there is none."""
         low, high = np.ravel(np.asarray(self.leaf.low)), np.ravel(np.asarray(self.leaf.high))
-        return float(low[self.index]), float(high[self.index])
+        return low[self.index].item(), high[self.index].item()
 
     @property
-    def ends(self) -> tuple[float, float]:
+    def ends(self) -> tuple[Any, Any]:
         """Two values that are far apart and inside the bounds."""
         low, high = self.bounds
         return (low if np.isfinite(low) else min(-1.0, high)), (high if np.isfinite(high) else max(1.0, low))
@@ -100,9 +100,7 @@ class Trials:
         frames = self._plain[seed, steps] = self.play(seed, self.actions(seed, steps))
         return frames
 
-    def with_value(
-        self, seed: int, steps: int, dimension: Dimension, value: float, at: int | None = None
-    ) -> list[Frame]:
+    def with_value(self, seed: int, steps: int, dimension: Dimension, value: Any, at: int | None = None) -> list[Frame]:
         """Play an episode with one number of the action set to a value, in one step or in all."""
 
         def change(action: Any, leaf: Leaf) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -110,19 +111,14 @@ def flatten_numbers(observation: Any) -> NDArray[Any]:
 def find_numbers(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
     """Yield the numbers of an info by name; those in a dictionary of it as `reward_terms/distance`."""
     for key, value in info.items():
-        if isinstance(value, dict):
-            for name, inner in value.items():
-                if _is_number(inner):
-                    yield f"{key}/{name}", float(inner)
-        elif _is_number(value):
-            yield str(key), float(value)
-
-
-def _is_number(value: Any) -> bool:
-    """Whether it is a number, or an array without axes, which some libraries make of a comparison."""
-    return isinstance(value, NUMBERS) or (
-        isinstance(value, np.ndarray) and value.shape == () and value.dtype.kind in "biuf"
-    )
+        inner = value.items() if isinstance(value, dict) else [("", value)]
+        for name, each in inner:
+            # Some libraries make an array without axes of a comparison.
+            if isinstance(each, NUMBERS) or (
+                isinstance(each, np.ndarray) and each.shape == () and each.dtype.kind in "biuf"
+            ):
+                with contextlib.suppress(OverflowError):  # a whole number of hundreds of digits
+                    yield f"{key}/{name}" if isinstance(value, dict) else str(key), float(each)
 
 
 def name_type(value: Any) -> str:

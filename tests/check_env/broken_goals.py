@@ -75,6 +75,33 @@ class NumberlessReward(Goal):
         return Clean.info(self)
 
 
+class NanComputed(EndsInComputeReward):
+    """Computes NaN where the environment pays a number."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return np.full(len(achieved_goal), np.nan)
+
+
+class NoReward(Goal):
+    """Pays None."""
+
+    def reward(self):
+        return None
+
+    def info(self):
+        return {}
+
+
+class LosesItsGoal(Goal):
+    """Leaves the goal out after a few steps."""
+
+    def observe(self):
+        observation = super().observe()
+        if self.steps > 3:
+            del observation["desired_goal"]
+        return observation
+
+
 class NestedGoal(Goal):
     """Its goals are dictionaries, which hindsight experience replay cannot take."""
 

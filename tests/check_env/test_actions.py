@@ -1,7 +1,11 @@
 """Actions that do nothing."""
 
+import numpy as np
 import pytest
+from gymnasium import spaces
 
+from rlctl.check_env.action_trials import find_dimensions
+from rlctl.check_env.leaves import find_leaves
 from tests.check_env.judging import case, check_case, findings, found, rules_of, verdict_of
 
 FILE = "broken_actions.py"
@@ -58,3 +62,13 @@ def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
 def test_what_is_not_repeatable_is_not_judged():
     verdict = verdict_of("broken_repeats.py:NoisyStep", "RL701")
     assert verdict.not_judged["RL701"] == "equal seeds and actions give unequal episodes (RL3)"
+
+
+def test_ends_of_whole_numbers_are_whole_numbers():
+    """As floats, those of 64 bits would not fit into the action."""
+    for dtype in (np.int64, np.uint64):
+        bounds = np.iinfo(dtype)
+        (dimension,) = find_dimensions(find_leaves(spaces.Box(bounds.min, bounds.max, (1,), dtype)))
+        assert dimension.ends == (bounds.min, bounds.max)
+    (unbounded,) = find_dimensions(find_leaves(spaces.Box(-np.inf, 5.0, (), np.float32)))
+    assert unbounded.ends == (-1.0, 5.0)

@@ -11,11 +11,14 @@ import jsonschema
 import pydantic
 import pytest
 import sarif_pydantic
+from gymnasium import spaces
 
 from rlctl.check_env import families
 from rlctl.check_env.check import Report, Verdict, judge
 from rlctl.check_env.finding import FAMILIES, RULES, choose_rules, find_rule
 from rlctl.check_env.formats import FORMATS, choose, github, plain, rules, sarif, structured
+from rlctl.check_env.leaves import find_leaves
+from rlctl.check_env.messages import Built
 from rlctl.check_env.records import Records
 from rlctl.errors import UsageError
 from tests import fork_server
@@ -31,6 +34,13 @@ PROBE = [each.name for each in families.PROCESSES["probe"].experiments]
 def report_of(task, rules=tuple(RULES), experiments=None):
     records = records_of(task, *(experiments or {"build", *families.find_needs(rules)}))
     return Report(task, judge(records, rules), records, 1.0, 20.0)
+
+
+def test_arrays_without_elements_have_no_row():
+    leaves = find_leaves(spaces.Dict(nothing=spaces.Box(-1, 1, (0,)), some=spaces.Box(-1, 1, (2,))))
+    records = Records("any", Built(leaves, leaves, "", ""))
+    assert [row.name for row in structured.observation_rows(records)] == ["observation['some']"]
+    assert [row.name for row in structured.action_rows(records)] == ["action['some']"]
 
 
 def rlctl(*arguments, folder=ROOT, **environment):

@@ -110,6 +110,7 @@ def test_missing_mass_is_named():
         "cart_without_inertial.urdf, link 'tip': no <inertial>, so PyBullet gives it a mass of 1 kg. "
         "Write its mass and inertia"
     )
+    assert finding.evidence == {}
 
 
 def test_impossible_inertia_is_named():

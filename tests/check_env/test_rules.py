@@ -9,6 +9,7 @@ from importlib import import_module
 import pytest
 
 from rlctl.check_env.finding import RULES
+from rlctl.check_env.leaves import find_numbers
 from tests.check_env.judging import FOLDER, case, check_case, findings, found, records_of, verdict_of
 
 CASES = [
@@ -60,6 +61,7 @@ CASES = [
     case("broken_envs.py:NanReward", ("RL601", "error")),
     case("broken_goals.py:OtherReward", ("RL614", "error"), twin="broken_goals.py:Goal"),
     case("broken_goals.py:OneByOne", ("RL614", "error"), twin="broken_goals.py:RoundedReward"),
+    case("broken_goals.py:NanComputed", ("RL614", "error")),
     case("broken_goals.py:NumberlessReward", ("RL614", "error"), twin="broken_goals.py:NestedGoal"),
 ]
 
@@ -109,6 +111,18 @@ def test_hindsight_rewards_are_compared():
     (finding,) = findings("broken_goals.py:OtherReward", "RL614")
     # Each reward is 0.5 below what compute_reward says.
     assert finding.evidence["value"] - finding.evidence["expected"] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("name", ["NoReward", "LosesItsGoal"])
+def test_hindsight_rewards_that_cannot_be_compared_are_the_matter_of_other_rules(name):
+    verdict = verdict_of(f"broken_goals.py:{name}", "RL614")
+    assert verdict.not_judged == {
+        "RL614": "goals are missing or change their shape (RL101), or types are wrong (RL204)"
+    }
+
+
+def test_a_number_that_is_too_large_for_a_float_is_left_out():
+    assert dict(find_numbers({"hash": 10**400, "terms": {"hash": 10**400, "distance": 1}})) == {"terms/distance": 1.0}
 
 
 def test_out_of_range_is_placed():

@@ -33,7 +33,7 @@ MEANT_CONSTANT = re.compile(
 """Names of terms that are meant to be the same at every step."""
 STEPS = 50
 TOLERANCE = 1e-4
-"""Difference between two rewards, relative to the larger one or to 1, up to which it is rounding to float32."""
+"""Difference between two rewards, relative to the environment's or to 1, up to which it is rounding to float32."""
 GOALS = ("achieved_goal", "desired_goal")
 
 
@@ -206,12 +206,15 @@ def recompute_rewards(context: Context) -> Iterator[Message]:
     if not callable(compute) or not leaves >= {(name,) for name in GOALS}:
         raise NotApplicable("no compute_reward, or no goals in the observation that are arrays")
     episode = Episode(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
-    taken = [(each.observation, each.info, float(each.reward)) for each in episode if each.step]
+    taken = [each for each in episode if each.step and each.is_readable]
     if not taken:
         raise NotJudged("no step could be taken")
-    goals = [np.stack([np.asarray(observation[name]) for observation, *_ in taken]) for name in GOALS]
-    infos = np.array([info for _, info, _ in taken])
-    given = np.array([reward for *_, reward in taken])
+    try:
+        goals = [np.stack([np.asarray(each.observation[name]) for each in taken]) for name in GOALS]
+        given = np.array([float(each.reward) for each in taken])
+        infos = np.array([each.info for each in taken])
+    except (LookupError, TypeError, ValueError):
+        raise NotJudged("goals are missing or change their shape (RL101), or types are wrong (RL204)") from None
     try:
         computed = instance.call("compute_reward", lambda: np.asarray(compute(*goals, infos), np.float64))
     except EnvironmentRaised as error:
@@ -223,8 +226,10 @@ def recompute_rewards(context: Context) -> Iterator[Message]:
         yield Finding("RL614", f"compute_reward: {shapes}", {"steps": len(taken)})
         return
     off = np.abs(computed - given)
-    step = int(off.argmax())
-    if off[step] > TOLERANCE * max(1.0, abs(given[step]), abs(computed[step])):
+    # Written so that NaN is another reward; where the environment itself gives one, RL601 says so.
+    is_other = np.isfinite(given) & ~(off <= TOLERANCE * np.maximum(1.0, np.abs(given)))
+    if is_other.any():
+        step = int(np.where(is_other, off, 0.0).argmax())
         message = f"the reward of step {step + 1} is {given[step]:.6g}, and compute_reward says {computed[step]:.6g}"
         evidence = {"step": step + 1, "value": float(computed[step]), "expected": float(given[step])}
         yield Finding("RL614", message, evidence)

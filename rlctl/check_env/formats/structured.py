@@ -122,7 +122,7 @@ def observation_rows(records: Records) -> list[Row]:
     """Return the parts of the observation, in order."""
     built, rows = records.built, []
     for index, leaf in enumerate(built.leaves if built else ()):
-        if built is not None and leaf.supported:
+        if built is not None and leaf.supported and 0 not in leaf.shape:
             values = [each.observations[index].values for each in records.alone if index in each.observations]
             flat = [each.reshape(len(each), -1).astype(np.float64) for each in values if each.size]
             rows += [_row(name, leaf, part, flat) for name, part in _parts(built, leaf).items()]
@@ -132,7 +132,7 @@ def observation_rows(records: Records) -> list[Row]:
 def action_rows(records: Records) -> list[Row]:
     """Return the parts of the action, in order, without the values that were played: a learner plays others."""
     leaves = records.built.action_leaves if records.built else []
-    named = [(name_leaf(leaf, "action"), leaf) for leaf in leaves if leaf.supported]
+    named = [(name_leaf(leaf, "action"), leaf) for leaf in leaves if leaf.supported and 0 not in leaf.shape]
     return [_row(name, leaf, slice(None), []) for name, leaf in named]
 
 
