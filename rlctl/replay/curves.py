@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -107,7 +108,7 @@ def _rewards(rollout: Rollout, timelines: Timelines) -> list[Plot]:
 
 
 def _actions(rollout: Rollout, timelines: Timelines) -> list[Plot]:
-    actions = rollout.episode.actions.reshape(rollout.length, -1)
+    actions = rollout.episode.actions.reshape(rollout.length, math.prod(rollout.episode.actions.shape[1:]))
     _send(timelines, "action", 1, actions, _numbered("action", actions.shape[1]))
     meaning = rollout.env.action_meaning
     return [Plot(f"action: {meaning}" if meaning else "action", "action", "action")]

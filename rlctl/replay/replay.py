@@ -111,7 +111,9 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
         return _verify(request.verify)
     played = _Recorded(Path(str(request.source)), request.output) if _is_episode(request.source) else _Actor(request)
     spec, seeds, film = played.spec, played.seeds, None
-    if request.video is not None and seeds:
+    if not seeds:
+        episodes = []
+    elif request.video is not None:
         with closing(make_filmable(spec)) as env:
             begin = functools.partial(played.begin, env)
             rollouts, film = film_episodes(request.video, env, spec, seeds, begin, policy=played.name)
@@ -259,7 +261,7 @@ class _Actor:
             return owner.episode_file(owner.next_episode_number()).with_suffix(".rrd")
         if self._output.suffix == ".rrd":
             return self._output
-        numbers = [int(each.stem) for each in self._output.glob("*.rrd") if each.stem.isdecimal()]
+        numbers = [int(each.stem) for each in self._output.glob("*.*") if each.stem.isdecimal()]
         number = max(numbers, default=-1) + 1
         return self._output / RunDirectory(self._output).episode_file(number).with_suffix(".rrd").name
 

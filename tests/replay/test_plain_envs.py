@@ -35,6 +35,14 @@ def test_actions_rewards_observations_and_pictures(tmp_path):
     assert sorted(jpegs(path, "/observation/eye")) == list(range(11))
 
 
+def test_an_episode_without_steps_has_a_recording(tmp_path):
+    """Of an episode that failed at its reset there are no actions; mended, it is replayed up to there."""
+    spec = EnvSpec(f"{ENVS}:Pixels")
+    with closing(make_drawable(spec, print)) as env:
+        rollout = play_episode(env, spec, 3, lambda observation, step: None, draw=print)
+    assert column(write(rollout, tmp_path), "/observation/count")[0].tolist() == [0]
+
+
 def test_long_episodes_have_fewer_pictures():
     rollout, _ = play("Pixels", steps=450)
     # More than 100: every second, and again, and again: every eighth step of 450.

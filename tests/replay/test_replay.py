@@ -32,6 +32,13 @@ def test_rollouts_go_into_the_run_and_are_numbered_on(run):
     assert recorded.info.versions.keys() >= {"rlctl", "pybullet", "torch"}
 
 
+def test_episodes_that_are_there_are_kept(run, tmp_path):
+    (tmp_path / "000004.npz").write_bytes(b"of a training, which records few of its episodes")
+    (episode,) = run_replay(ReplayRequest(str(run.run.path), output=tmp_path)).episodes
+    assert episode.episode == tmp_path / "000005.npz"
+    assert (tmp_path / "000004.npz").read_bytes().startswith(b"of a training")
+
+
 def test_rollout_is_reproduced_bit_for_bit(run, tmp_path):
     (episode,) = run_replay(ReplayRequest(str(run.run.path), seed=3, output=tmp_path)).episodes
     result = run_replay(ReplayRequest(None, verify=episode.episode))
