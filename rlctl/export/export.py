@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -109,7 +110,7 @@ def _export_onnx(job: _Export, target: Path, model: onnx.ModelProto) -> ExportRe
                 size=size,
                 written=f"{target} ({size / 1000:,.1f} kB, opset {opset})",
                 interface=[(kind, ", ".join(map(_format_port, each))) for kind, each in ports.items()],
-                next=f"rlctl eval {target} --task {job.info.spec.task}",
+                next=shlex.join(["rlctl", "eval", str(target), "--task", job.info.spec.task]),
                 details={"opset": opset} | {kind: [_describe_port(one) for one in ports[kind]] for kind in ports},
             )
         )
@@ -148,7 +149,7 @@ def _export_c(job: _Export, target: Path, code: CSource) -> ExportReport:
         size=size,
         written=f"{target} and {header.name} ({size / 1000:,.1f} kB, C99)",
         interface=[("function", code.prototype)],
-        next=f"cc -std=c99 -O3 -c {target}",
+        next=shlex.join(["cc", "-std=c99", "-O3", "-c", str(target)]),
         details={"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0]},
     )
 
