@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,8 @@ class Gates:
             if rate is not None and not 0 <= rate <= 1:
                 hint = f"; {rate:g} % is {rate / 100:g}" if 1 < rate <= 100 else ""
                 raise UsageError(f"--{name.replace('_', '-')} {rate:g}: a rate is between 0 and 1{hint}")
+        if self.min_return is not None and math.isnan(self.min_return):
+            raise UsageError("--min-return nan: every return would pass; give a number")
 
     def check_possible(self, has_success: bool) -> None:
         """Raise `UsageError` for a gate on success where the environment does not report it."""

@@ -45,7 +45,10 @@ class GroupScore:
         return Spread.of(known) if known else None
 
     def check(self, gates: Gates) -> None:
-        """Raise `ArtifactError` for seeds without a score, and `AnswerIsNo` for those that miss a gate."""
+        """Raise `ArtifactError` for seeds without a score, and `AnswerIsNo` for those that miss a gate.
+
+        Raises `UsageError` for a gate on success where the task does not report it.
+        """
         if failed := [each for each in self.seeds if each.score is None]:
             raise ArtifactError(
                 f"{self.group.path}: {len(failed)} of {len(self.seeds)} seeds without a score, the first seed "
@@ -55,6 +58,7 @@ class GroupScore:
         for each in self.seeds:
             score = each.score
             assert score is not None
+            gates.check_possible(score.success is not None)
             found = gates.list_missed(score.success, score.success_interval, score.mean_return)
             missed += [f"seed {each.seed}: {gate}" for gate in found]
         if missed:

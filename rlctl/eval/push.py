@@ -36,6 +36,8 @@ class PushedBody:
     mass: float
     """Of the whole body [kg]."""
     duration_s: float
+    max_steps: int
+    """Of an episode."""
     every_s: float
     """More than half an episode [s], so that an interval event acts once, in its middle."""
 
@@ -72,6 +74,7 @@ def find_pushed(spec: EnvSpec) -> PushedBody:
             link=None if link == body.base_name else link,
             mass=body.total_mass(),
             duration_s=max(1, round(_DURATION_S / dt)) * dt,
+            max_steps=steps,
             every_s=(steps // 2 + 1) * dt,
         )
 
@@ -80,10 +83,11 @@ def measure_push(player: CellPlayer, spec: EnvSpec, unpushed: Sequence[EpisodeRe
     """Push with twice the impulse until half of the episodes fail, then bisect, always with the same episodes."""
     pushed = find_pushed(spec)
     has_success = any(result.success is not None for result in unpushed)
-    max_steps = player.workers.info.max_steps or 0
 
     def judge(results: Sequence[EpisodeResult]) -> NDArray[np.bool_]:
-        return np.array([result.success if has_success else result.length >= max_steps for result in results], bool)
+        return np.array(
+            [result.success if has_success else result.length >= pushed.max_steps for result in results], bool
+        )
 
     held = {0.0: judge(unpushed)}
     outcomes = {0.0: summarize(unpushed)}

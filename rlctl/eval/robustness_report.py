@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from typing import TYPE_CHECKING
 
 from rlctl import output
@@ -15,9 +17,9 @@ _MOST_ROWS = 60
 _NOMINAL, _WORST = "*", "<"
 
 
-def show(result: Robustness, json: str | None) -> None:
+def show(result: Robustness, target: str | None) -> None:
     """Print the maps and the push, or JSON alone for `-`."""
-    if json is not None and output.write_result_json(json, result.model_dump(mode="json")):
+    if target is not None and output.write_result_json(target, result.model_dump(mode="json")):
         return
     out = output.out()
     out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})")
@@ -33,14 +35,21 @@ def show(result: Robustness, json: str | None) -> None:
     if worst is not None:
         found, cell = worst
         out.print(f"\nworst: {found.name_cell(cell)}: {format_outcome(cell)}")
-        settings = " ".join(
-            f"--set {axis.setting}={value:g}" for axis, value in zip(found.axes, cell.values, strict=True)
-        )
-        alone = f"rlctl eval {result.policy_file} --set randomize=false {settings}"
-        out.print(f"the same episodes alone: {alone}")
+        out.print(f"the same episodes alone: {format_command(result, found, cell)}")
     if result.push is not None:
         out.print()
         _show_push(result.push)
+
+
+def format_command(result: Robustness, found: RobustnessMap, cell: Cell) -> str:
+    """Return the command that plays the episodes of one cell."""
+    settings = {f"task.{name}": json.dumps(value) for name, value in result.parameters.items()}
+    settings["randomize"] = "false"
+    for axis, value in zip(found.axes, cell.values, strict=True):
+        settings[axis.setting] = str(int(value) if value.is_integer() else value)
+    words = ["rlctl", "eval", result.policy_file, "--episodes", str(result.episodes), "--seed", str(result.seed)]
+    words += [] if result.deterministic else ["--stochastic"]
+    return shlex.join([*words, *(word for key, value in settings.items() for word in ("--set", f"{key}={value}"))])
 
 
 def format_outcome(outcome: Outcome) -> str:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
-from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
+from rlctl.eval.evaluate import EvalRequest, run_evaluation
 from rlctl.eval.statistics import mean_interval
 from rlctl.run.shipped import MeasuredScore
 
 
 def measure_score(request: EvalRequest) -> MeasuredScore:
     """Play the episodes of a request and summarise them, with how much actions change."""
-    return summarize_score(run_evaluation(dataclasses.replace(request, measure_actions=True), Gates()))
-
-
-def summarize_score(evaluation: Evaluation) -> MeasuredScore:
-    """Summarise an evaluation that has measured its actions."""
+    evaluation = run_evaluation(dataclasses.replace(request, measure_actions=True))
     results = [episode.result for episode in evaluation.episodes]
     limit = evaluation.max_steps
     return MeasuredScore(

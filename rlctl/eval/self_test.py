@@ -16,7 +16,7 @@ from rlctl.deploy.serve import make_loop, serve_until
 from rlctl.deploy.server import PolicyServer
 from rlctl.errors import AnswerIsNo
 from rlctl.eval import report
-from rlctl.eval.evaluate import EvalRequest, Evaluation, Gates, run_evaluation
+from rlctl.eval.evaluate import EvalRequest, Evaluation, run_evaluation
 from rlctl.rollout.workers import available_cores
 
 
@@ -67,7 +67,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
 
     Both act within the request's limits, on the same episodes.
     """
-    direct = run_evaluation(request, Gates())
+    direct = run_evaluation(request)
     address: Future[str] = Future()
     end = asyncio.Event()
     loop = make_loop()
@@ -90,8 +90,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
                 seed=request.seed,
                 n_envs=1,  # as one robot: simulations beside it would take the server's time
                 env_timeout_s=request.env_timeout_s,
-            ),
-            Gates(),
+            )
         )
     finally:
         loop.call_soon_threadsafe(end.set)

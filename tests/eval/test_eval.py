@@ -1,4 +1,5 @@
 import json
+import math
 import sys
 
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 from rlctl.env_spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.eval.group import GroupScore, SeedScore
 from rlctl.eval.report import as_json
+from rlctl.eval.score import measure_score
 from rlctl.eval.statistics import Spread, mean_terms, success_interval, success_rate
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.runs.summary import read_table
@@ -143,11 +146,19 @@ def test_a_rate_is_between_0_and_1(name):
         Gates(**{name: -0.5})
 
 
+def test_a_return_to_reach_is_a_number():
+    with pytest.raises(UsageError, match="--min-return nan: every return would pass"):
+        Gates(min_return=math.nan)
+
+
 def test_a_gate_on_success_needs_success(tmp_path):
     run = run_training(TrainRequest(f"{ENVS}:NoSuccess", settings=SMALL_PPO, root=tmp_path)).run
     with pytest.raises(UsageError, match="--min-success: this task reports no success"):
         run_evaluation(EvalRequest(str(run.path), episodes=2), Gates(min_success=0.5))
     assert run_evaluation(EvalRequest(str(run.path), episodes=2), Gates(min_return=-1e9)).success_rate is None
+    seed = SeedScore(0, score=measure_score(EvalRequest(str(run.path), episodes=2)))
+    with pytest.raises(UsageError, match="--min-success: this task reports no success"):
+        GroupScore(None, [seed]).check(Gates(min_success_lower=0.5))
 
 
 def test_command_line_gate_and_pure_json(rlctl, reach_run, tmp_path):

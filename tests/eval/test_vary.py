@@ -9,6 +9,7 @@ from rlctl.env_spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.eval.axes import read_axes
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.eval.robustness_report import format_command
 from rlctl.eval.statistics import mean_interval
 from rlctl.eval.vary import check_gates, measure_robustness
 from rlctl.output import format_duration
@@ -92,8 +93,25 @@ def test_command_line_draws_the_map_and_gates_the_worst_cell(rlctl, block_run):
         ["success", "[%];", "*", "nominal,", "<", "worst"],
     ]
     assert lines[9].startswith("worst: push 6, mass 1: success 0.0% (0.0% to 56.1%), return -")
-    assert lines[10].startswith("the same episodes alone: rlctl eval ")
-    assert lines[10].endswith("--set randomize=false --set events.push.force=6 --set events.mass.factor=1")
+    assert lines[10] == (
+        f"the same episodes alone: rlctl eval {block_run.best_policy} --episodes 3 --seed 0 "
+        "--set randomize=false --set events.push.force=6 --set events.mass.factor=1"
+    )
+
+
+def test_the_command_for_one_cell_is_the_whole_of_it(measured):
+    (found,) = measured.maps
+    axis = found.axes[0].model_copy(update={"setting": "task.limit"})
+    cell = found.cells[0].model_copy(update={"values": [0.1234567891]})
+    found = found.model_copy(update={"axes": [axis]})
+    parameters = {"goal": [1, 2], "limit": 3.0}
+    result = measured.model_copy(
+        update={"policy_file": "my runs/best.safetensors", "deterministic": False, "parameters": parameters}
+    )
+    assert format_command(result, found, cell) == (
+        f"rlctl eval 'my runs/best.safetensors' --episodes {measured.episodes} --seed {measured.seed} --stochastic "
+        "--set 'task.goal=[1, 2]' --set task.limit=0.1234567891 --set randomize=false"
+    )
 
 
 def test_command_line_as_json(rlctl, block_run):
