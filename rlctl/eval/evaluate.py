@@ -13,7 +13,7 @@ from rlctl import output
 from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.eval.baseline import Baseline, choose_task, load_baseline
-from rlctl.eval.statistics import Spread, mean_action_change, mean_terms, success_interval, success_rate
+from rlctl.eval.statistics import Spread, mean_action_change, mean_metrics, mean_terms, success_interval, success_rate
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
@@ -69,6 +69,8 @@ class Evaluation:
     lengths: Spread
     terms: dict[str, float]
     """Mean over episodes of each weighted term's sum."""
+    metrics: dict[str, float]
+    """Mean per step of each reward term of weight 0, as the task returned it."""
     final_distance: Spread | None
     max_steps: int | None
     limited_by: Path | None = None
@@ -244,6 +246,7 @@ def _summarize(
         returns=Spread.of([result.total_reward for result in results]),
         lengths=Spread.of([result.length for result in results]),
         terms=mean_terms(results),
+        metrics=mean_metrics(results),
         final_distance=Spread.of(distances) if distances else None,
         max_steps=info.max_steps,
         action_change=mean_action_change(episodes) if request.measure_actions else None,

@@ -28,7 +28,8 @@ def show(result: Evaluation, json: str | None) -> None:
     rows = [("return", *_format_spread(result.returns)), ("length", *_format_spread(result.lengths))]
     if result.final_distance is not None:
         rows.append(("final distance", *_format_spread(result.final_distance)))
-    rows += [(f"term {name}", f"{mean:.4g}") for name, mean in result.terms.items()]
+    rows += [(f"term {name}", f"{mean:.4g}") for name, mean in result.terms.items() if name not in result.metrics]
+    rows += [(f"metric {name}, per step", f"{mean:.4g}") for name, mean in result.metrics.items()]
     output.print_table(("", "mean", "IQM", "std", "min", "max"), rows, left=("",))
     reports = [episode.result.report for episode in result.episodes]
     if held := sum(report.get("not_running", 0) for report in reports):
@@ -100,6 +101,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         "return": result.returns,
         "length": result.lengths,
         "terms": result.terms,
+        "metrics": result.metrics,
         "final_distance": result.final_distance,
         "episodes": [
             {
@@ -109,6 +111,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
                 "return": each.total_reward,
                 "length": each.length,
                 "terms": each.terms,
+                "metrics": each.metrics,
                 "final_distance": each.final_distance,
             }
             for index, each in enumerate(episode.result for episode in result.episodes)

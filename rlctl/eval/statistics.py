@@ -105,3 +105,9 @@ def mean_terms(results: Sequence[EpisodeResult]) -> dict[str, float]:
     """Return the mean over episodes of each weighted reward term's sum; the values add up to the mean return."""
     names = dict.fromkeys(name for result in results for name in result.terms)
     return {name: float(np.mean([result.terms.get(name, 0.0) for result in results])) for name in names}
+
+
+def mean_metrics(results: Sequence[EpisodeResult]) -> dict[str, float]:
+    """Return the mean over episodes of each metric's mean per step."""
+    names = dict.fromkeys(name for result in results for name in result.metrics)
+    return {name: float(np.mean([each.metrics[name] for each in results if name in each.metrics])) for name in names}

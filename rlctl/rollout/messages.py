@@ -130,6 +130,8 @@ class EpisodeResult:
     """How far two bodies overlapped at most [m]; None where it was not measured."""
     acting: float = dataclasses.field(default=0.0, compare=False)
     """The part of its time that the policy took, the environment the rest."""
+    metrics: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Mean per step of each reward term of weight 0, as the task returned it."""
 
 
 @dataclasses.dataclass(frozen=True)

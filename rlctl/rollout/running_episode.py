@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,11 @@ from rlctl.rollout.returned_values import InvalidReturn
 class RunningEpisode:
     """One environment and the episode it is in; what it returns is checked, but for observations."""
 
-    def __init__(self, env: Any, index: int) -> None:
+    def __init__(self, env: Any, index: int, metrics: Sequence[str] = ()) -> None:
         self.env = env
         self.index = index
         """Number of the environment."""
+        self._metrics = metrics  # reward terms of weight 0
         self.seed = -1
         self.step = 0
         """Steps that were begun in the episode."""
@@ -28,12 +30,14 @@ class RunningEpisode:
         self._discrete = isinstance(env.action_space, spaces.Discrete)
         self._return = 0.0
         self._sums: dict[str, float] = {}
+        self._raw_sums = dict.fromkeys(metrics, 0.0)
         self._deepest_contact: float | None = None
 
     def start(self, seed: int) -> Any:
         """Begin the episode of a seed; return its first observation."""
         self.seed, self.step = seed, 0
         self._return, self._sums, self._deepest_contact = 0.0, {}, None
+        self._raw_sums = dict.fromkeys(self._metrics, 0.0)
         self.acting_s, self.stepping_s = 0.0, 0.0
         observation, info = returned_values.check_tuple(self.env.reset(seed=seed), returned_values.RESET, "reset")
         returned_values.check_info(info)
@@ -65,6 +69,8 @@ class RunningEpisode:
                 sums[name] = sums.get(name, 0.0) + value
         except (TypeError, AttributeError):
             raise InvalidReturn(f"info['reward_terms'] is {info['reward_terms']!r}, not a dict of numbers") from None
+        for name in self._metrics:
+            self._raw_sums[name] += info["metrics"][name]
 
     def measure_contact(self) -> None:
         """Remember how far bodies overlap now, if it is the most so far."""
@@ -93,4 +99,5 @@ class RunningEpisode:
             report,
             self._deepest_contact,
             self.acting_s / max(self.acting_s + self.stepping_s, 1e-9),
+            {name: float(total) / self.step for name, total in self._raw_sums.items()},
         )

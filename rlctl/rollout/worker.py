@@ -80,7 +80,8 @@ class Worker:
             gc.collect()  # environments may hold themselves in cycles
         envs = make_several(spec, self._job.count)
         self._info = describe(envs[0])
-        self._episodes = [RunningEpisode(env, self._job.first + index) for index, env in enumerate(envs)]
+        metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
+        self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
         space = envs[0].observation_space
         # A task's environment has checked its observation itself.
         checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)

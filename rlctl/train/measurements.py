@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from rlctl.dict_spaces import split
-from rlctl.eval.statistics import mean_return, mean_terms, success_rate
+from rlctl.eval.statistics import mean_metrics, mean_return, mean_terms, success_rate
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.env_info import EnvInfo
 from rlctl.train.vec_env import WorkerVecEnv
@@ -210,19 +210,22 @@ def _sample(values: NDArray[Any]) -> torch.Tensor:
     return torch.from_numpy(flat[:: max(1, len(flat) // _SAMPLES)].copy())
 
 
-def training_row(recent: Sequence[EpisodeResult], terms: Iterable[str], log: Mapping[str, Any]) -> dict[str, Any]:
+def training_row(
+    recent: Sequence[EpisodeResult], weights: Mapping[str, float], log: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return what the episodes that ended lately have come to, and what SB3 logged of the last update.
 
-    `terms` are the names of the reward terms; missing values are None.
+    `weights` are those of the reward terms; missing values are None.
     """
-    means = mean_terms(recent) if recent else {}
+    means, metrics = mean_terms(recent), mean_metrics(recent)
     return {
         "acting": _mean(each.acting for each in recent),
         "return": mean_return(recent) if recent else None,
         "length": _mean(each.length for each in recent),
         "success": success_rate(recent) if recent else None,
         "distance": _mean(each.final_distance for each in recent),
-        **{f"term/{name}": means.get(name) for name in terms},
+        **{f"term/{name}": means.get(name) for name in weights},
+        **{f"metric/{name}": metrics.get(name) for name, weight in weights.items() if weight == 0},
         **{name: log.get(f"train/{name}") for name in _LOSSES},
     }
 
@@ -232,6 +235,7 @@ def tensorboard_values(row: Mapping[str, Any]) -> dict[str, float]:
     tags = {"return": "rollout/ep_rew_mean", "length": "rollout/ep_len_mean", "success": "rollout/success_rate"}
     tags |= {"distance": "rollout/final_distance", "stage": "curriculum/stage"}
     tags |= {name: f"reward_terms/{name.removeprefix('term/')}" for name in row if name.startswith("term/")}
+    tags |= {name: f"metrics/{name.removeprefix('metric/')}" for name in row if name.startswith("metric/")}
     return {tag: row[name] for name, tag in tags.items() if row.get(name) is not None}
 
 
@@ -246,6 +250,7 @@ def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
         "distance": _mean(each.final_distance for each in results),
         "overlap": float(np.median(depths)) if depths else None,
         **{f"term/{name}": value for name, value in mean_terms(results).items()},
+        **{f"metric/{name}": value for name, value in mean_metrics(results).items()},
     }
 
 

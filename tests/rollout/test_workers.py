@@ -1,5 +1,6 @@
 """Environments in worker processes: the same bits on any number of them, every kind of space, all output forwarded."""
 
+import dataclasses
 import os
 import sys
 import threading
@@ -14,6 +15,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import RecipeError
 from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers
+from rlctl.train.measurements import evaluation_row, training_row
 from tests.rollout.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
@@ -55,6 +57,19 @@ def test_terms_of_a_task(spec, start):
     assert result.terms == pytest.approx({"count": 4 * begin + 2.5, "fixed": 4.0}, abs=1e-5)
     assert result.total_reward == pytest.approx(sum(result.terms.values()))
     assert (bool(segment.truncated[0, 3]), bool(segment.terminated[0, 3])) == (True, False)
+
+
+def test_a_term_of_weight_0_is_a_metric(spec, start):
+    workers = start(dataclasses.replace(spec("Counting"), reward_weights={"fixed": 0.0}), 1)
+    workers.set_policy(*linear(workers.info, [[0.0]], bias=0.25))
+    workers.start_playing(Play(4, {0: 1}, {0: 1}))
+    (result,) = workers.finish_playing()
+    assert result.metrics == {"fixed": 2.0}  # as the task returns it, at every step
+    assert result.total_reward == pytest.approx(result.terms["count"])
+    row = evaluation_row([result])
+    assert (row["metric/fixed"], row["term/fixed"]) == (2.0, 0.0)
+    row = training_row([], workers.info.reward_weights, {})
+    assert [name for name in row if "/" in name] == ["term/count", "term/fixed", "metric/fixed"]
 
 
 @pytest.mark.parametrize("kind", ["dict", "image", "discrete", "binary"])
