@@ -22,8 +22,8 @@ def find_inertia_faults(body: Body) -> list[str]:
     if body.file.suffix != ".urdf":
         return []
     try:
-        root = ElementTree.fromstring(body.file.read_text().strip())
-    except ElementTree.ParseError:
+        root = ElementTree.fromstring(body.file.read_bytes().strip())
+    except (ElementTree.ParseError, LookupError, ValueError):  # the latter for encodings that Python does not have
         return []  # PyBullet reads more than XML allows
     return [f"{body.file.name}, link {name!r}: {fault}" for name, fault in _find_faults(body, root)]
 

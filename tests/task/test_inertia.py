@@ -67,6 +67,14 @@ def test_faults(sim, tmp_path, inertial, fault):
     assert found == ([f"model.urdf, link 'rod': {fault}"] if fault else [])
 
 
+@pytest.mark.parametrize(("encoding", "faults"), [("ISO-8859-1", 1), ("UTF-8", 0), ("none", 0)])
+def test_a_file_that_is_not_utf_8(sim, tmp_path, encoding, faults):
+    rod = f'<!-- Stoß --><link name="rod">{BOX}</link>'
+    file = models.urdf(tmp_path, models.link("base", 1.0), rod, models.joint("joint", "base", "rod"))
+    file.write_bytes(f'<?xml version="1.0" encoding="{encoding}"?>\n{file.read_text()}'.encode("latin-1"))
+    assert len(find_inertia_faults(sim.load("body", file, fixed=True))) == faults
+
+
 def test_what_is_not_used_is_no_fault(sim, tmp_path):
     assert find_inertia_faults(load(sim, tmp_path, inertial(1, 1, 1), inertia="shape")) == []
     assert find_inertia_faults(sim.load("plane", "plane.urdf", fixed=True)) == []
