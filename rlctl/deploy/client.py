@@ -95,6 +95,7 @@ class RemotePlayer(Player):
         env = self._client.metadata.get("env")
         own = {"observation_space": observation_space, "action_space": action_space}
         if isinstance(env, dict) and any(key in env and space_from_json(env[key]) != own[key] for key in own):
+            self._client.close()
             raise UsageError(f"{url}: the policy that is served there is for other spaces than this task has")
         dt = self._client.metadata.get("control_dt")
         self._control_dt = dt if isinstance(dt, int | float) else math.inf

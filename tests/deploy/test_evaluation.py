@@ -83,11 +83,12 @@ def test_a_server_that_does_not_run_its_policy_is_said_to(reach_server, rlctl):
     assert "the server was holding or stopped in 120 of 120 answers: not the policy's own" in done.stdout
 
 
-def test_a_server_that_is_not_there_or_of_another_task(reach_server):
+def test_a_server_that_is_not_there_or_of_another_task(reach_server, capfd):
     with pytest.raises(UsageError, match="no policy server answers"):
         run_evaluation(EvalRequest("reach", baseline="ws://127.0.0.1:1"), Gates())
     with pytest.raises(UsageError, match="is for other spaces than this task has"):
         run_evaluation(EvalRequest("Pendulum-v1", baseline=f"ws://{reach_server.address}", episodes=1), Gates())
+    assert "Unclosed" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("actions", [None, 0.5, [], [["left", "right"]], [[0.1], [0.1, 0.2]], [[0.1, 0.2, 0.3]]])
