@@ -180,22 +180,29 @@ def make_several(spec: EnvSpec, count: int) -> list[gymnasium.Env[Any, Any]]:
 
 
 def _check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
+    known = read_parameters(constructor) if parameters else None
+    if known is None or any(each.kind is each.VAR_KEYWORD for each in known.values()):
+        return
+    for key in parameters:
+        is_of_gymnasium = key == "max_episode_steps" and hasattr(constructor, "gymnasium_id")
+        if key not in known and not is_of_gymnasium:
+            raise _unknown_parameter(task, key, list(known))
+
+
+def read_parameters(constructor: Any) -> Mapping[str, inspect.Parameter] | None:
+    """Return the parameters of a plain environment by name, of a Gymnasium id those of what it stands for.
+
+    None where they are not known.
+    """
     if hasattr(constructor, "gymnasium_id"):
         import gymnasium
         from gymnasium.envs.registration import load_env_creator
 
         spec = gymnasium.registry.get(constructor.gymnasium_id)
-        if not parameters or spec is None or spec.entry_point is None:
-            return
-        parameters = {key: value for key, value in parameters.items() if key != "max_episode_steps"}  # of Gymnasium
-        entry_point = spec.entry_point
-        constructor = entry_point if callable(entry_point) else load_env_creator(entry_point)
-    signature = inspect.signature(constructor)
-    if any(p.kind is p.VAR_KEYWORD for p in signature.parameters.values()):
-        return
-    for key in parameters:
-        if key not in signature.parameters:
-            raise _unknown_parameter(task, key, list(signature.parameters))
+        if spec is None or spec.entry_point is None:
+            return None
+        constructor = spec.entry_point if callable(spec.entry_point) else load_env_creator(spec.entry_point)
+    return inspect.signature(constructor).parameters
 
 
 def _unknown_parameter(task: str, key: str, known: list[str]) -> RecipeError:

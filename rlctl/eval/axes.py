@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.env_spec import EnvChanges, EnvSpec
+from rlctl.env_spec import EnvChanges, EnvSpec, read_parameters
 from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.registry import is_task
 from rlctl.run.robustness import Axis
@@ -106,7 +107,7 @@ def _spread(span: tuple[float, float, int], whole: bool) -> list[float]:
 
 
 def _vary_parameter(name: str, task: Any, span: tuple[float, float, int], spec: EnvSpec) -> Axis:
-    parameter, nominal, whole = name.removeprefix("task."), None, False
+    parameter = name.removeprefix("task.")
     if is_task(task):
         numbers = _find_numbers(task)
         if parameter not in numbers:
@@ -118,6 +119,10 @@ def _vary_parameter(name: str, task: Any, span: tuple[float, float, int], spec: 
             )
         whole = numbers[parameter] is int
         nominal = task.parameters()[parameter].default
+    else:
+        declared = (read_parameters(task) or {}).get(parameter)
+        nominal = None if declared is None else declared.default
+        whole = declared is not None and _is_whole(declared, _spread(span, whole=False))
     nominal = spec.parameters.get(parameter, nominal)
     return Axis(
         name=name,
@@ -126,6 +131,13 @@ def _vary_parameter(name: str, task: Any, span: tuple[float, float, int], spec: 
         nominal=float(nominal) if isinstance(nominal, int | float) else None,
         whole=whole,
     )
+
+
+def _is_whole(declared: inspect.Parameter, values: Sequence[float]) -> bool:
+    """Say whether it takes whole numbers: by its type, or where it has none if its default and `values` are whole."""
+    if declared.annotation is not declared.empty:
+        return declared.annotation in (int, "int")
+    return type(declared.default) is int and all(value.is_integer() for value in values)
 
 
 def _find_numbers(task: type[Task]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import gymnasium
 import numpy as np
 
 from rlctl.task import Box, Event, Sim, Task, events
@@ -57,3 +58,10 @@ class Lost(Block):
     def is_terminated(self) -> bool:
         """It is too far away."""
         return self.distance() >= self.limit
+
+
+class Chain(gymnasium.Env):
+    """A plain environment with parameters of several kinds."""
+
+    def __init__(self, typed: int = 3, untyped=2, real: float = 1) -> None:
+        self.links = list(range(typed))

@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.env_spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.eval.axes import read_axes
+from rlctl.eval.axes import change, read_axes
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.eval.robustness_report import format_command
 from rlctl.eval.statistics import mean_interval
@@ -184,9 +184,26 @@ def test_bad_maps(vary, message):
 
 def test_plain_environments_have_parameters_only():
     (axis,) = read_axes(["g=9:11:3"], EnvSpec("Pendulum-v1"))[0]
-    assert (axis.setting, axis.nominal) == ("task.g", None)
+    assert (axis.setting, axis.nominal, axis.whole) == ("task.g", 10.0, False)
     with pytest.raises(UsageError, match="Pendulum-v1 offers no events; name one of its parameters"):
         read_axes(["all"], EnvSpec("Pendulum-v1"))
+
+
+@pytest.mark.parametrize(
+    ("vary", "values", "kind"),
+    [
+        ("typed=1:4:4", [1, 2, 3, 4], int),
+        ("typed=1:2:3", [1, 2], int),
+        ("untyped=1:4:4", [1, 2, 3, 4], int),
+        ("untyped=1:2:3", [1, 1.5, 2], float),  # its default, 2, may mean 2.0
+        ("real=1:4:4", [1, 2, 3, 4], float),
+    ],
+)
+def test_whole_numbers_of_plain_environments(vary, values, kind):
+    (axis,) = read_axes([vary], EnvSpec(f"{ENVS}:Chain"))[0]
+    assert axis.values == values
+    (value,) = change(axis, axis.values[0]).parameters.values()
+    assert type(value) is kind
 
 
 @pytest.mark.slow
