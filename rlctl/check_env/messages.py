@@ -178,9 +178,9 @@ class Failure:
 
 @dataclasses.dataclass(frozen=True)
 class Fact:
-    """Something that a check of the parent, or a later experiment of the same process, needs to know."""
+    """What an experiment has found out for checks of the parent."""
 
-    name: str
+    experiment: str
     value: Any
     """What JSON can hold, or a dataclass of this package."""
 

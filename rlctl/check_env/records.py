@@ -34,6 +34,7 @@ class Records:
     findings: list[Finding] = dataclasses.field(default_factory=list)
     """Those of the experiments."""
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """By the name of the experiment that found it out."""
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
     """Experiments, roles and rules that were left out, and why."""
     not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
@@ -58,7 +59,7 @@ class Records:
             case Finding():
                 self.findings.append(message)
             case Fact():
-                self.facts[message.name] = message.value
+                self.facts[message.experiment] = message.value
             case Skipped():
                 (self.skipped if message.applies else self.not_applicable)[message.name] = message.reason
             case Finished():
@@ -106,11 +107,11 @@ class Records:
             raise NotJudged(self.skipped.get(role, f"the comparison {role!r} could not be made"))
         return found[0]
 
-    def require_fact(self, name: str, experiment: str) -> Any:
+    def require_fact(self, experiment: str) -> Any:
         """Return what an experiment found out; raises `NotJudged` with the reason where it did not."""
-        if name not in self.facts:
+        if experiment not in self.facts:
             raise NotJudged(self.why_missing(experiment))
-        return self.facts[name]
+        return self.facts[experiment]
 
     def why_missing(self, experiment: str) -> str:
         """Return why an experiment has not come to its end."""

@@ -65,18 +65,13 @@ def count_interventions(result: Evaluation) -> collections.Counter[str]:
 
 
 def _show_head(result: Evaluation) -> None:
-    out = output.out()
+    out, info = output.out(), result.policy
     mode = "" if result.deterministic else ", sampled actions"
-    out.print(f"{result.spec.task}: {describe_policy(result)}")
+    trained = "" if info is None else f" ({info.algo}, step {info.training_steps:,})"
+    out.print(f"{result.spec.task}: {'policy ' if info is None else ''}{result.name}{trained}")
     randomization = describe_randomization(result.events)
     episodes = output.format_count(len(result.episodes), "episode")
     out.print(f"{episodes}, seed {result.seed}{mode}{randomization and f', {randomization}'}")
-
-
-def describe_policy(result: Evaluation) -> str:
-    """Return `best.safetensors (ppo, step 100,000)`, or `policy zero`."""
-    info = result.policy
-    return f"policy {result.name}" if info is None else f"{result.name} ({info.algo}, step {info.training_steps:,})"
 
 
 def _format_spread(spread: Spread) -> tuple[str, ...]:

@@ -44,7 +44,9 @@ def require_readable(records: Records) -> list[Trajectory]:
         raise NotJudged("step does not return five values (RL201)")
     if any(form.type != "dict" for _, form in records.forms("info")):
         raise NotJudged("info is not a dict (RL204)")
-    return _require_enough([each for each in records.require_alone() if each.steps])
+    episodes = [each for each in records.require_alone() if each.steps]
+    _require_enough(episodes)
+    return episodes
 
 
 def require_rewarded(records: Records) -> list[Trajectory]:
@@ -57,18 +59,9 @@ def require_rewarded(records: Records) -> list[Trajectory]:
     return episodes
 
 
-def require_terms(records: Records) -> list[Trajectory]:
-    """Return those of them that have reward terms in info; raises `NotApplicable` if none has."""
-    episodes = [each for each in require_rewarded(records) if has_terms(each)]
-    if not episodes:
-        raise NotApplicable("no reward_terms in info")
-    return _require_enough(episodes)
-
-
-def _require_enough(episodes: list[Trajectory]) -> list[Trajectory]:
+def _require_enough(episodes: list[Trajectory]) -> None:
     if sum(each.steps for each in episodes) < ENOUGH_STEPS:
         raise NotJudged(f"fewer than {ENOUGH_STEPS} steps were recorded")
-    return episodes
 
 
 def has_terms(episode: Trajectory) -> bool:
@@ -190,7 +183,10 @@ def _find_badly_scaled(records: Records) -> Iterator[Finding]:
 
 @check("RL612", *WITH_SEARCH)
 def _find_constant_penalty(records: Records) -> Iterator[Finding]:
-    episodes = require_terms(records)
+    episodes = [each for each in require_rewarded(records) if has_terms(each)]
+    if not episodes:
+        raise NotApplicable("no reward_terms in info")
+    _require_enough(episodes)
     for name, value in find_constant_terms(episodes).items():
         if value < 0 and not MEANT_CONSTANT.search(name):
             message = f"reward term {name!r} is {value:.6g} at every step of {summarize(episodes)}"

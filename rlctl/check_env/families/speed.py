@@ -205,7 +205,7 @@ def episode_steps(records: Records) -> float | None:
 
 
 def _require_speed(records: Records) -> Speed:
-    speed: Speed = records.require_fact("speed", "speed")
+    speed: Speed = records.require_fact("speed")
     return speed
 
 
