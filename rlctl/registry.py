@@ -155,7 +155,7 @@ def load(task: str) -> Callable[..., Any]:
         classes = _list_classes(file)
         forms = " or ".join(f"{task}:{name}" for name in classes) or f"{task}:CLASS; it defines no class"
         raise UsageError(f"{task}: name the class in it: {forms}")
-    if Path(task).is_dir():
+    if task and Path(task).is_dir():
         raise UsageError(
             f"{task} is a folder, not a task: pip install -e {task} installs a plugin; or name a class: "
             f"{task}/FILE.py:CLASS"

@@ -48,7 +48,7 @@ def show_run(run: Run = None, json: Json = None) -> None:
 @app.command("report")
 def report_runs(
     runs: Annotated[
-        list[str], typer.Argument(metavar="RUN|GROUP...", help="Runs, globs or folders of runs, all of one task.")
+        list[str], typer.Argument(metavar="RUN", help="Runs, groups, globs or folders of runs, all of one task.")
     ],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="Default: report.html; md goes to stdout.")
@@ -70,7 +70,8 @@ def report_runs(
 @app.command("compare")
 def compare_runs(
     runs: Annotated[
-        list[str], typer.Argument(metavar="A B...", help="Runs, globs or folders of runs; the first is the baseline.")
+        list[str],
+        typer.Argument(metavar="RUN", help="Runs, groups, globs or folders of runs; the first is the baseline."),
     ],
     episodes: Annotated[int, typer.Option(help="Episodes that each run plays.", min=2)] = 100,
     seed: EpisodeSeed = 0,
@@ -118,7 +119,7 @@ def import_run(
 
 @app.command("rm")
 def remove_runs(
-    runs: Annotated[list[str] | None, typer.Argument(metavar="RUN...", help="Folders of runs.")] = None,
+    runs: Annotated[list[str] | None, typer.Argument(metavar="RUN", help="Folders of runs.")] = None,
     keep_best: Annotated[
         int | None,
         typer.Option(

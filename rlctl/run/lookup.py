@@ -55,7 +55,7 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
         raise UsageError(f"{text}: a group of runs; name one of them: {text.rstrip('/')}/..._s0")
     if found := _list_newest_first(root / registry.make_slug(text), *_IN_TASK):
         return found[0]
-    if Path(text).is_dir():
+    if text and Path(text).is_dir():
         raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
     if Path(text).suffix == ".zip":
         raise ArtifactError(

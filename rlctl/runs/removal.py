@@ -32,7 +32,7 @@ def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Pat
     Raises `UsageError` where nothing or both is asked for, or a run is being trained; `ArtifactError` for a folder that
     is not a run.
     """
-    if bool(runs) == (keep_best is not None):
+    if bool(runs) == (keep_best is not None) or "" in runs:  # a variable of the shell that is not set
         raise UsageError("say what to remove: RUN..., or --keep-best N for all but the N best of each task")
     if keep_best is not None:
         return _measured([run.path for run in _all_but_best(list_runs(root=root), keep_best)])

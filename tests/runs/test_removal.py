@@ -75,8 +75,9 @@ def test_refuses_what_is_not_a_run(write_run, tmp_path):
     for path in ("thesis", "thesis/chapters/one", "nothing", "runs", "runs/reach"):
         with pytest.raises(ArtifactError, match="not the folder of a run"):
             plan_removal([path])
-    with pytest.raises(UsageError, match="say what to remove"):
-        plan_removal([])
+    for nothing in ([], [""]):
+        with pytest.raises(UsageError, match="say what to remove"):
+            plan_removal(nothing)
 
 
 def test_asks_only_on_a_terminal(write_run, rlctl):
