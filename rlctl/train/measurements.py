@@ -42,7 +42,7 @@ _LOSSES = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Play:
+class LastSteps:
     """The last steps of all environments; arrays of shape (n_envs, steps, ...) but for `values`."""
 
     observation: Mapping[str, NDArray[Any]]
@@ -57,22 +57,22 @@ class Play:
 def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timesteps: int) -> dict[str, float | None]:
     """Return columns for the environment steps since the last row; log them, and now and then distributions."""
     steps = model.num_timesteps
-    play = _read_last_steps(model, env, steps - last_row)
+    last = _read_last_steps(model, env, steps - last_row)
     row = {
-        **summarize_play(play, model.action_space, model.logger.name_to_value),
+        **summarize_steps(last, model.action_space, model.logger.name_to_value),
         "gradient_norm": _gradient_norm(model),
     }
     for name, value in row.items():
         if value is not None:
             model.logger.record(f"rollout/{name}", value)
     part = max(1, total_timesteps // HISTOGRAMS)
-    if play is not None and steps // part > last_row // part:
-        for name, values in collect_histograms(play, env.workers.info).items():
+    if last is not None and steps // part > last_row // part:
+        for name, values in collect_histograms(last, env.workers.info).items():
             model.logger.record(name, values)
     return row
 
 
-def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> Play | None:
+def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> LastSteps | None:
     """Return the environments' last steps, at most `steps` of all together; None before there are any.
 
     On-policy they are the last segment, else the newest of the replay buffer.
@@ -88,10 +88,10 @@ def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> Pla
     space, action, half = env.action_space, segment.action, _half_range(env.action_space)
     if isinstance(space, spaces.Box) and half is not None:
         action = (action - (space.high + space.low) / 2) / half  # as a replay buffer has it
-    return Play(observation, action, segment.terminated, segment.truncated, rollout.values.ravel())
+    return LastSteps(observation, action, segment.terminated, segment.truncated, rollout.values.ravel())
 
 
-def _read_replay_buffer(model: BaseAlgorithm, buffer: Any, steps: int) -> Play | None:
+def _read_replay_buffer(model: BaseAlgorithm, buffer: Any, steps: int) -> LastSteps | None:
     stored = buffer.buffer_size if buffer.full else buffer.pos
     rows = np.arange(buffer.pos - min(stored, steps, _ROWS), buffer.pos)
     if not len(rows):
@@ -99,7 +99,7 @@ def _read_replay_buffer(model: BaseAlgorithm, buffer: Any, steps: int) -> Play |
     done, timeout = (np.asarray(values[rows], np.bool_).T for values in (buffer.dones, buffer.timeouts))
     observation = {key: values[rows].swapaxes(0, 1) for key, values in split(buffer.observations).items()}
     # SB3 stores continuous actions scaled to [-1, 1].
-    return Play(observation, buffer.actions[rows].swapaxes(0, 1), done & ~timeout, done & timeout, None)
+    return LastSteps(observation, buffer.actions[rows].swapaxes(0, 1), done & ~timeout, done & timeout, None)
 
 
 def _half_range(space: spaces.Space[Any]) -> NDArray[Any] | None:
@@ -110,27 +110,29 @@ def _half_range(space: spaces.Space[Any]) -> NDArray[Any] | None:
     return half
 
 
-def summarize_play(play: Play | None, space: spaces.Space[Any], log: Mapping[str, Any]) -> dict[str, float | None]:
+def summarize_steps(
+    last: LastSteps | None, space: spaces.Space[Any], log: Mapping[str, Any]
+) -> dict[str, float | None]:
     """Return what can be said of steps with actions of a space; `log` is what SB3 logged of the update."""
     limited = _half_range(space) is not None
-    actions = None if play is None or not isinstance(space, spaces.Box) else play.action.astype(np.float32)
+    actions = None if last is None or not isinstance(space, spaces.Box) else last.action.astype(np.float32)
     return {
-        "terminated": None if play is None else _terminated_share(play),
+        "terminated": None if last is None else _terminated_share(last),
         "action_saturation": None if actions is None or not limited else float((np.abs(actions) > _AT_LIMIT).mean()),
-        "action_change": None if actions is None or play is None else _mean_change(actions, play),
+        "action_change": None if actions is None or last is None else _mean_change(actions, last),
         "exploration": _exploration(space, log.get("train/entropy_loss")),
-        "value": _expected_value(play, log),
+        "value": _expected_value(last, log),
     }
 
 
-def _terminated_share(play: Play) -> float | None:
-    ended = int((play.terminated | play.truncated).sum())
-    return float(play.terminated.sum()) / ended if ended else None
+def _terminated_share(last: LastSteps) -> float | None:
+    ended = int((last.terminated | last.truncated).sum())
+    return float(last.terminated.sum()) / ended if ended else None
 
 
-def _mean_change(actions: NDArray[np.float32], play: Play) -> float | None:
+def _mean_change(actions: NDArray[np.float32], last: LastSteps) -> float | None:
     """Return the mean size of the change from one action to the next of the same episode, in half ranges."""
-    same = ~(play.terminated | play.truncated)[:, :-1]
+    same = ~(last.terminated | last.truncated)[:, :-1]
     return float(np.abs(np.diff(actions, axis=1))[same].mean()) if same.any() else None
 
 
@@ -150,13 +152,13 @@ def _exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
     return math.exp(min(per_element - 0.5 * math.log(2 * math.pi * math.e), 50.0)) / float(np.exp(np.log(half).mean()))
 
 
-def _expected_value(play: Play | None, log: Mapping[str, Any]) -> float | None:
+def _expected_value(last: LastSteps | None, log: Mapping[str, Any]) -> float | None:
     """Return what the critic expects: the mean over a rollout, or over the replay buffer's samples of an update.
 
     The loss of an off-policy actor is minus that value, SAC's with the entropy that it is paid for.
     """
-    if play is not None and play.values is not None:
-        return float(play.values.mean())
+    if last is not None and last.values is not None:
+        return float(last.values.mean())
     loss = log.get("train/actor_loss")
     return None if loss is None else -float(loss)
 
@@ -186,11 +188,11 @@ def recent_gradient_norm(optimizer: torch.optim.Optimizer) -> float | None:
     return math.sqrt(sum(squares)) if squares else None
 
 
-def collect_histograms(play: Play, info: EnvInfo) -> dict[str, torch.Tensor]:
+def collect_histograms(last: LastSteps, info: EnvInfo) -> dict[str, torch.Tensor]:
     """Return what TensorBoard draws distributions of: actions, values, and observed angles."""
-    found = {"actions": play.action, **_angles(play.observation, info)}
-    if play.values is not None:
-        found["values"] = play.values
+    found = {"actions": last.action, **_angles(last.observation, info)}
+    if last.values is not None:
+        found["values"] = last.values
     return {f"histograms/{name}": _sample(values) for name, values in found.items()}
 
 

@@ -6,21 +6,21 @@ import torch
 from gymnasium import spaces
 
 from rlctl.run.env_info import EnvInfo, space_to_json
-from rlctl.train.measurements import Play, collect_histograms, recent_gradient_norm, summarize_play
+from rlctl.train.measurements import LastSteps, collect_histograms, recent_gradient_norm, summarize_steps
 
 
 def play(actions, done=(), terminated=()):
     """Make steps of one environment; `done` and `terminated` are numbers of steps."""
     actions = np.array(actions, np.float64).reshape(1, -1, 1)
     ended, by_task = (np.isin(np.arange(actions.shape[1]), each).reshape(1, -1) for each in (done, terminated))
-    return Play({"": np.zeros((*actions.shape[:2], 3))}, actions, by_task, ended & ~by_task, None)
+    return LastSteps({"": np.zeros((*actions.shape[:2], 3))}, actions, by_task, ended & ~by_task, None)
 
 
 LINE = spaces.Box(-2.0, 2.0, (1,))
 
 
 def test_actions():
-    row = summarize_play(play([1.0, -1.0, 0.5, 0.5], done=[1]), LINE, {})
+    row = summarize_steps(play([1.0, -1.0, 0.5, 0.5], done=[1]), LINE, {})
     assert row["action_saturation"] == 0.5  # in half ranges; two of four are at a limit
     # Changes of 2 and 0; that from -1 to 0.5 is from one episode to the next.
     assert row["action_change"] == 1.0
@@ -29,23 +29,23 @@ def test_actions():
 
 
 def test_share_of_terminated_episodes():
-    row = summarize_play(play([0.0] * 4, done=[0, 1, 3], terminated=[1]), LINE, {})
+    row = summarize_steps(play([0.0] * 4, done=[0, 1, 3], terminated=[1]), LINE, {})
     assert row["terminated"] == pytest.approx(1 / 3)
-    assert summarize_play(play([0.0] * 4), LINE, {})["terminated"] is None
+    assert summarize_steps(play([0.0] * 4), LINE, {})["terminated"] is None
 
 
 def test_exploration_is_the_deviation_that_has_the_entropy():
     # The entropy of a normal distribution with deviation 0.3 is ln(0.3 sqrt(2 pi e)); the half range is 2.
     entropy = np.log(0.3 * np.sqrt(2 * np.pi * np.e))
-    assert summarize_play(None, LINE, {"train/entropy_loss": -entropy})["exploration"] == pytest.approx(0.15)
+    assert summarize_steps(None, LINE, {"train/entropy_loss": -entropy})["exploration"] == pytest.approx(0.15)
     # Of four actions, two are as likely as each other: ln 2.
-    row = summarize_play(None, spaces.Discrete(4), {"train/entropy_loss": -np.log(2)})
+    row = summarize_steps(None, spaces.Discrete(4), {"train/entropy_loss": -np.log(2)})
     assert row["exploration"] == pytest.approx(0.5)
-    assert summarize_play(None, LINE, {})["exploration"] is None
+    assert summarize_steps(None, LINE, {})["exploration"] is None
 
 
 def test_an_off_policy_actors_loss_is_minus_the_value():
-    assert summarize_play(None, LINE, {"train/actor_loss": 3.0})["value"] == -3.0
+    assert summarize_steps(None, LINE, {"train/actor_loss": 3.0})["value"] == -3.0
 
 
 def test_adam_remembers_how_large_gradients_were():
