@@ -109,14 +109,15 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
         }
     if isinstance(space, spaces.Discrete):
         return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
-    if isinstance(space, spaces.MultiDiscrete):
+    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1:
         return {"type": "MultiDiscrete", "nvec": space.nvec.tolist()}
     if isinstance(space, spaces.MultiBinary):
         return {"type": "MultiBinary", "n": space.n if isinstance(space.n, int) else list(space.n)}
     if isinstance(space, spaces.Dict):
         return {"type": "Dict", "spaces": {key: space_to_json(value) for key, value in space.spaces.items()}}
     raise UsageError(
-        f"spaces of type {type(space).__name__} are not supported; Box, Discrete, MultiDiscrete, MultiBinary, Dict are"
+        f"the space {short_repr(space)} is not supported; "
+        "Box, Discrete, MultiDiscrete of one axis, MultiBinary, Dict are"
     )
 
 

@@ -54,7 +54,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         _use_fused_adam(model)
         return model
     except (AssertionError, ValueError, TypeError, RuntimeError) as error:
-        raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error), 300)}") from error
+        raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error) or error, 300)}") from error
 
 
 def keep_compiler_out() -> None:
@@ -103,6 +103,8 @@ def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: 
         ("observation", observation_space, "observe values less start"),
         ("action", action_space, "add start in step"),
     ):
+        if isinstance(space, spaces.Box) and 0 in space.shape:
+            raise RecipeError(f"the {what} is {space}, which has no element")
         for key, part in split_space(space).items():
             name = f"{what} {key!r}" if key else f"the {what}"
             if np.any(getattr(part, "start", 0)):

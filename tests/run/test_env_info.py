@@ -49,11 +49,15 @@ def test_images_take_no_room():
     assert len(json.dumps(space_to_json(spaces.Box(0, 255, (84, 84, 4), np.uint8)))) < 200
 
 
-def test_a_kind_no_policy_can_handle():
+@pytest.mark.parametrize(
+    ("space", "text"), [(spaces.Text(4), "Text(1, 4, "), (spaces.MultiDiscrete([[2, 3]]), "MultiDiscrete([[2 3]])")]
+)
+def test_a_kind_no_policy_can_handle(space, text):
     with pytest.raises(UsageError) as caught:
-        space_to_json(spaces.Text(4))
-    assert str(caught.value) == (
-        "spaces of type Text are not supported; Box, Discrete, MultiDiscrete, MultiBinary, Dict are"
+        space_to_json(space)
+    assert str(caught.value).startswith(f"the space {text}")
+    assert str(caught.value).endswith(
+        " is not supported; Box, Discrete, MultiDiscrete of one axis, MultiBinary, Dict are"
     )
 
 

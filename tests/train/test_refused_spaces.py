@@ -47,6 +47,7 @@ BOX = spaces.Box(-1, 1, (2,))
             BOX,
             "observation 'x' is Box(0.0, 1.0, (), float32), a single ",
         ),
+        ("ppo", BOX, spaces.Box(-1, 1, (0,)), "the action is Box([], [], (0,), float32), which has no element"),
         (
             "ppo",
             BOX,
