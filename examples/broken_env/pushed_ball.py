@@ -1,4 +1,4 @@
-"""A ball that is pushed to a goal: an environment as it is often written, with eight mistakes in sixty lines.
+"""A ball that is pushed to a goal: an environment as it is often written, with eight mistakes in fifty lines.
 
 rlctl check-env examples/broken_env/pushed_ball.py:PushedBall
 """

@@ -76,7 +76,7 @@ def show(plugin: NewPlugin, json: str | None) -> None:
     out.print("next:")
     for command in (
         f"rlctl check-env {plugin.target}",
-        f"pip install -e {plugin.folder}",
+        f'pip install -e "{plugin.folder}[test]"',
         f"rlctl train {plugin.name}",
         f"pytest {plugin.folder}",
     ):
