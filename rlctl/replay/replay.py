@@ -139,13 +139,13 @@ def _check_request(request: ReplayRequest) -> None:
         raise UsageError("--verify replays one recorded episode and writes nothing: give only --verify EPISODE")
     if request.gui and target is not None:
         raise UsageError("--gui shows a window and writes nothing: leave out --output")
-    recorded = request.verify is not None or _is_episode(source)
+    recorded = request.verify or (source if _is_episode(source) else None)
     if recorded and request.checkpoint != "best":
         raise UsageError("a recorded episode is replayed as it was: leave out --checkpoint and --pretrained")
     if recorded and (request.task is not None or request.changes or request.episodes not in (None, 1)):
         raise UsageError("a recorded episode is replayed as it was: leave out --task, --set and --episodes")
-    if recorded and request.choice is not None:
-        raise UsageError(f"--{request.choice.kind} chooses among the episodes of a policy; {source} is a recorded one")
+    if recorded and (choice := request.choice) is not None:
+        raise UsageError(f"--{choice.kind} chooses among the episodes of a policy; {recorded} is a recorded one")
     if request.video is not None:
         if request.gui or target is not None or request.verify is not None:
             raise UsageError("--video writes a film and nothing else: leave out --gui, --output and --verify")

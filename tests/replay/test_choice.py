@@ -81,6 +81,10 @@ def test_a_number_below_1_or_not_whole_is_refused(rlctl, value, problem):
     [
         (["--worst", "1", "--best", "1"], "--worst and --best: give one of --worst, --best and --failures"),
         (["x.npz", "--worst", "1"], "--worst chooses among the episodes of a policy; x.npz is a recorded one"),
+        (
+            ["--verify", "x.npz", "--worst", "1"],
+            "--worst chooses among the episodes of a policy; x.npz is a recorded one",
+        ),
         (["--worst", "2", "-o", "y.rrd"], "--output y.rrd: a recording has one episode; give a folder for 2"),
         (["--video", "y.avi"], "--video y.avi: give a file that ends in .mp4 or .gif"),
         (
