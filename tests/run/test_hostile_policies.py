@@ -100,7 +100,7 @@ def test_a_network_of_another_size(kwargs, message, changed, described):
         ({**BOX_DATA, "shape": [10**12]}, "1,000,000,000,000 elements, at most 10,000,000 are supported"),
         ({**BOX_DATA, "shape": [10**6, 10**6]}, "1,000,000,000,000 elements, at most "),
         ({**BOX_DATA, "shape": [-1]}, "not a space: shape [-1]"),
-        ({**BOX_DATA, "shape": [1] * 65}, "not a space: shape [1, 1"),
+        ({**BOX_DATA, "shape": [1] * 65}, "not a space: maximum supported dimension for an ndarray is "),
         ({**BOX_DATA, "shape": [True]}, "not a space: expected a whole number, got True"),
         ({**BOX_DATA, "shape": [5], "dtype": "O"}, "not a space: a Box of object"),
         ({**BOX_DATA, "shape": [5], "low": ["1.0"]}, "not a space: "),
