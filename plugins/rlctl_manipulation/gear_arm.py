@@ -42,6 +42,7 @@ NEAR = 0.05  # [m]
 HELD = 0.025  # [m], from the tool to an object that is between the fingers, and not below closed ones
 CLEARANCE = 0.06  # [m], above an object, at which the tool goes there from beside it
 LIFTED = 0.05  # [m], above the table
+LOST = 0.5  # [m]
 HOLD_S = 0.5  # [s]
 
 
@@ -118,6 +119,7 @@ class GearArm(Task):
         self.arm.disable_motors()
         self.table = sim.load("table", MODEL.with_name("table.urdf"), fixed=True)
         if self.stage != "reach":
+            sim.load("floor", "plane.urdf", fixed=True)  # a cube that slides off the table does not fall for ever
             self.cube = sim.load("object", MODEL.with_name("cube.urdf"), position=(0.3, 0.0, GOAL_HEIGHT))
 
     def pose(self, joints: np.ndarray, opening: float) -> np.ndarray:
@@ -181,12 +183,12 @@ class GearArm(Task):
         height = float(self.object[2]) - GOAL_HEIGHT
         done = held and (self.stage != "lift" or height > LIFTED)
         self.held_steps = self.held_steps + 1 if done else 0
-        distance = rewards.distance(self.tool, self.object)
+        way = rewards.distance(self.tool, self.object) if self.stage == "reach" else self.measure_way()
         torques = self.arm.joint_torques[self.motors]
         return {
-            "distance": distance if self.stage == "reach" else self.measure_way(),
-            "arrival": rewards.closeness(distance, NEAR),
-            "grasp": rewards.grasp(distance, NEAR, held),
+            "distance": way,
+            "arrival": rewards.closeness(way, NEAR),
+            "grasp": rewards.grasp(way, NEAR, held),
             "lift": min(max(height, 0.0), LIFTED) / LIFTED if held else 0.0,
             "energy": rewards.power(torques, self.arm.joint_velocities[self.motors]),
             "amplitude": rewards.squared(action),
@@ -196,11 +198,11 @@ class GearArm(Task):
     def measure_way(self) -> float:
         """Return how far the tool is from above the object, and the nearer to its axis the lower above it [m].
 
-        Straight for the object, the fingers would push it away.
+        Straight for the object, the fingers would push it away. It counts as LOST at most, wherever an object lies.
         """
         x, y, z = self.object - self.tool
         aside = math.hypot(x, y)
-        return math.hypot(aside, z + min(max(2 * (aside - 0.01), 0.0), CLEARANCE))
+        return min(math.hypot(aside, z + min(max(2 * (aside - 0.01), 0.0), CLEARANCE)), LOST)
 
     def is_held(self) -> bool:
         """Both fingers touch the object, which is between them."""

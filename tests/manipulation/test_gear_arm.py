@@ -156,6 +156,18 @@ def test_the_way_to_an_object_goes_over_it(env):
     task.object = task.tool + np.array([0.0, 0.02, -0.03])
     # 0.02 m beside it: 2 * 0.01 m above it, so 0.01 m further down
     assert task.measure_way() == pytest.approx(math.hypot(0.02, 0.01))
+    task.object = task.tool + np.array([2.0, 0.0, -0.6])
+    assert task.measure_way() == 0.5
+
+
+def test_a_cube_off_the_table_lies_on_the_floor():
+    env = TaskEnv(GearArm(stage="lift"))
+    env.reset(seed=0)
+    env.task.cube.set_base((0.8, 0.0, 0.1))
+    for _ in range(50):
+        env.step(np.zeros(4, np.float32))
+    assert env.task.cube.base_position[2] == pytest.approx(0.02, abs=0.002)
+    env.close()
 
 
 def test_the_terms_by_hand(env):
