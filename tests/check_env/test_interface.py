@@ -43,7 +43,7 @@ def test_pictures_are_told():
     )
     (message,) = messages("TakesNoMode", "RL215")
     assert "the constructor raises" in message
-    assert "unexpected keyword argument 'render_mode'" in message
+    assert "takes no render_mode" in message
     (message,) = messages("RenderNothing", "RL215")
     assert message.startswith("with render_mode='rgb_array' render returns a NoneType")
 
