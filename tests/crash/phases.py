@@ -35,6 +35,11 @@ Each checkpoint is renamed into its place; after all but the first, the one befo
 """
 
 
+def first_of_two(number):
+    """Return another signal than `number`: equal ones within a second are one."""
+    return signal.SIGTERM if number == signal.SIGINT else signal.SIGINT
+
+
 def send(number, phase, everybody=False, again=False):
     """Send a signal at the start of a phase, to this process or to all below it too; with `again` after another one.
 
@@ -48,8 +53,7 @@ def send(number, phase, everybody=False, again=False):
 
     def called(*arguments, **options):
         if next(counter) == call:
-            first = signal.SIGTERM if number == signal.SIGINT else signal.SIGINT  # equal ones within a second are one
-            for sent in [first, number] if again else [number]:
+            for sent in [first_of_two(number), number] if again else [number]:
                 for each in psutil.Process().children(recursive=True) if everybody else ():
                     each.send_signal(sent)
                 os.kill(os.getpid(), sent)
