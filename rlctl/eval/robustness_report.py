@@ -44,6 +44,11 @@ def show(result: Robustness, target: str | None) -> None:
 def format_command(result: Robustness, found: RobustnessMap, cell: Cell) -> str:
     """Return the command that plays the episodes of one cell."""
     settings = {f"task.{name}": json.dumps(value) for name, value in result.parameters.items()}
+    settings |= {f"reward_weights.{name}": json.dumps(value) for name, value in result.reward_weights.items()}
+    for name, event in result.events.items():
+        settings |= {f"events.{name}.{key}": json.dumps(value) for key, value in event.items()} or {
+            f"events.{name}": "{}"
+        }
     settings["randomize"] = "false"
     for axis, value in zip(found.axes, cell.values, strict=True):
         settings[axis.setting] = str(int(value) if value.is_integer() else value)

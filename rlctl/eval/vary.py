@@ -81,6 +81,8 @@ def measure_robustness(
     result = Robustness(
         task=spec.task,
         parameters=dict(spec.parameters),
+        reward_weights=dict(spec.reward_weights),
+        events={name: dict(each) for name, each in spec.events.items()},
         policy_file=str(found.file),
         algo=policy.info.algo,
         training_steps=policy.info.training_steps,
@@ -139,8 +141,8 @@ def _keep(file: Path, result: Robustness) -> None:
     """Write the result into its run, with what was measured before of the same policy in the same way."""
     with contextlib.suppress(ArtifactError):
         before = robustness.read(file)
-        same = ("task", "parameters", "policy_file", "training_steps", "episodes", "seed", "deterministic")
-        if all(getattr(before, name) == getattr(result, name) for name in same):
+        measured = {"nominal", "maps", "push", "command", "versions"}
+        if before.model_dump(mode="json", exclude=measured) == result.model_dump(mode="json", exclude=measured):
             kept = {"maps": result.maps or before.maps, "push": result.push or before.push}
             result = result.model_copy(update=kept)
     try:

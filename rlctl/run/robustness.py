@@ -110,6 +110,9 @@ class Robustness(_Content):
     format: int = FORMAT
     task: str
     parameters: dict[str, Any]
+    reward_weights: dict[str, float] = {}
+    events: dict[str, dict[str, Any]] = {}
+    """Those that act in every cell; see `EnvSpec.events`."""
     policy_file: str
     algo: str
     training_steps: int

@@ -43,6 +43,9 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         for key in ("control_dt", "episode_s"):
             if not 0 < (seconds := getattr(task, key)) < math.inf:
                 raise TaskError(f"{self.name}: {key} is {seconds}: it is a time above 0 [s]")
+        for key in ("substeps", "solver_iterations"):
+            if (count := getattr(task, key)) < 1:
+                raise TaskError(f"{self.name}: {key} is {count}: it is at least 1")
         # Of the instance: gymnasium.Env shares one dict between all environments.
         self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / task.control_dt)}
         if render_mode not in (None, "human", "rgb_array"):

@@ -60,6 +60,8 @@ def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> Tra
         status.write_end(run, start.step, progress)
     _raise_if_evaluations_failed(run, progress)
     note = "this run is finished already: nothing to do; -n makes it longer"
+    if start.request.record:
+        note += f"; to record episodes of it: rlctl replay {run.path}"
     return TrainResult(run, start.task, start.recipe, start.step, progress, time.monotonic() - start.began, note=note)
 
 

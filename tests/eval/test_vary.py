@@ -104,13 +104,19 @@ def test_the_command_for_one_cell_is_the_whole_of_it(measured):
     axis = found.axes[0].model_copy(update={"setting": "task.limit"})
     cell = found.cells[0].model_copy(update={"values": [0.1234567891]})
     found = found.model_copy(update={"axes": [axis]})
-    parameters = {"goal": [1, 2], "limit": 3.0}
     result = measured.model_copy(
-        update={"policy_file": "my runs/best.safetensors", "deterministic": False, "parameters": parameters}
+        update={
+            "policy_file": "my runs/best.safetensors",
+            "deterministic": False,
+            "parameters": {"goal": [1, 2], "limit": 3.0},
+            "reward_weights": {"distance": 0.5},
+            "events": {"mass": {"factor": [0.9, 1.1]}, "push": {}},
+        }
     )
     assert format_command(result, found, cell) == (
         f"rlctl eval 'my runs/best.safetensors' --episodes {measured.episodes} --seed {measured.seed} --stochastic "
-        "--set 'task.goal=[1, 2]' --set task.limit=0.1234567891 --set randomize=false"
+        "--set 'task.goal=[1, 2]' --set task.limit=0.1234567891 --set reward_weights.distance=0.5 "
+        "--set 'events.mass.factor=[0.9, 1.1]' --set 'events.push={}' --set randomize=false"
     )
 
 

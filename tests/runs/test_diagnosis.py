@@ -203,6 +203,21 @@ def test_what_is_worth_knowing_is_information(write_training, id, metrics, more)
     assert ids(run, Grade.WARNING) == []
 
 
+def test_training_that_ends_before_the_last_stage_is_found(write_training):
+    stages = [{"promote": {"success": 0.8}}, {}]
+    run = write_training({"stage": 1}, recipe={"stages": stages})
+    (finding,) = diagnose(run)
+    assert (finding.id, finding.grade) == ("Q1", Grade.WARNING)
+    assert finding.evidence == ["ended in stage 1 of 2"]
+    assert f"rlctl train --resume {run.path} -n STEPS" in finding.advice[0]
+
+
+@pytest.mark.parametrize(("stage", "status"), [(2, "finished"), (1, "running"), (1, "interrupted")])
+def test_stage_of_a_training_that_goes_on_is_no_finding(write_training, stage, status):
+    stages = [{"promote": {"success": 0.8}}, {}]
+    assert diagnose(write_training({"stage": stage}, recipe={"stages": stages}, status=status)) == []
+
+
 def test_motion_that_no_robot_makes_is_found(write_training):
     flight = np.zeros((101, 3), np.float32)
     flight[:, 0] = 10.0 * np.arange(101)  # 10 m in 0.05 s are 200 m/s

@@ -70,6 +70,10 @@ def missing(*names: str) -> type[Task]:
             "Endless: episode_s is inf: it is a time above 0 [s]",
         ),
         (
+            type("Timeless", (Whole,), {"substeps": 0}),
+            "Timeless: substeps is 0: it is at least 1",
+        ),
+        (
             type("Flat", (Whole,), {"observe": lambda self: np.zeros(2)}),
             "Flat: observe() returned array([0., 0.]), not a dict of values by name: {'speed': ...}",
         ),

@@ -77,3 +77,11 @@ def model_file_missing(run: History) -> str | None:
     if run.status.get("status") != "failed" or not any(name in error.lower() for name in names):
         return None
     return error.partition("\n")[0]
+
+
+def last_stage_never_begun(run: History) -> str | None:
+    """The training is over, and ended before the last stage of its curriculum."""
+    stages, reached = run.recipe.get("stages"), run.curve("stage").values
+    if run.status.get("status") != "finished" or not isinstance(stages, list) or not len(reached):
+        return None
+    return f"ended in stage {reached[-1]:.0f} of {len(stages)}" if reached[-1] < len(stages) else None
