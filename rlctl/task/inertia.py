@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 
@@ -34,13 +35,32 @@ def _find_faults(body: Body, root: ElementTree.Element) -> Iterator[tuple[str, s
         index = -1 if name == body.base_name else body._links.get(name)
         if index is None or (index == -1 and body.fixed):
             continue  # merged with its parent, or held by the world: its mass is not used
+        inertial = link.find("inertial")
+        if inertial is not None and (fault := _find_bad_number(inertial, body.inertia_from_file)):
+            yield name, fault
+            continue
         if not _is_heavy(body, index):
             continue
-        inertial = link.find("inertial")
         if inertial is None or inertial.find("mass") is None:
             yield name, "no <inertial>, so PyBullet gives it a mass of 1 kg. Write its mass and inertia."
         elif body.inertia_from_file and (fault := _judge_inertia(body, index, inertial)):
             yield name, fault
+
+
+def _find_bad_number(inertial: ElementTree.Element, inertia_used: bool) -> str:
+    """Return what is wrong with the first value that is not a number: PyBullet reads part of it, or 0."""
+    for element in inertial.findall("mass") + inertial.findall("inertia") * inertia_used:
+        for name, value in element.items():
+            try:
+                number = float(value)
+                if element.tag == "mass" and number < 0:
+                    return f"a mass of {number:g} kg."
+                if math.isfinite(number):
+                    continue
+            except ValueError:
+                pass
+            return f"{element.tag} {name}={value!r} is not a number; PyBullet reads its first digits, or 0."
+    return ""
 
 
 def _is_heavy(body: Body, index: int) -> bool:

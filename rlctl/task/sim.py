@@ -6,7 +6,10 @@ read at most once per control step.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +19,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body
-from rlctl.task.bullet import pybullet, pybullet_data
+from rlctl.task.bullet import pybullet, pybullet_data, read_complaint
 from rlctl.task.constraints import Constraints
 
 
@@ -26,6 +29,15 @@ class _Push:
     link: int
     force: Sequence[float]  # [N], world frame
     steps: int  # control steps that it still acts
+
+
+def _check_joint_names(path: Path) -> None:
+    """Raise `TaskError` for two joints of one name, which crash PyBullet."""
+    with contextlib.suppress(ElementTree.ParseError, LookupError, ValueError):  # PyBullet says what it cannot read
+        names = [joint.get("name") for joint in ElementTree.fromstring(path.read_bytes().strip()).findall("joint")]
+        for name in names:
+            if names.count(name) > 1:
+                raise TaskError(f"{path}: {names.count(name)} joints are called {name!r}; give each its own name")
 
 
 class Sim(Constraints):
@@ -94,6 +106,8 @@ class Sim(Constraints):
                 f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data; "
                 f"for a file beside your module: Path(__file__).with_name({path.name!r})"
             )
+        if path.suffix == ".urdf":
+            _check_joint_names(path)
         if path.suffix == ".urdf" and inertia == "file":
             flags |= pybullet.URDF_USE_INERTIA_FROM_FILE
         if self_collision:
@@ -123,10 +137,11 @@ class Sim(Constraints):
         return int(ids[0])
 
     def _call_loader(self, path: Path, load: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        call = functools.partial(load, str(path), *args, **kwargs, physicsClientId=self.client)
         try:
-            return load(str(path), *args, **kwargs, physicsClientId=self.client)
+            return call()
         except pybullet.error as error:
-            raise TaskError(f"PyBullet cannot load {path}: {error}") from None
+            raise TaskError(f"PyBullet cannot load {path}: {read_complaint(call) or error}") from None
 
     def body(self, name: str) -> Body:
         """Return a loaded body by its name."""

@@ -10,6 +10,7 @@ from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl_manipulation import reach
 from rlctl_manipulation.reach import Reach
+from tests.task import models
 from tests.task.tasks import Slider
 
 
@@ -34,6 +35,19 @@ def test_a_model_file_that_is_none(sim, tmp_path):
     file.write_text("not xml")
     with pytest.raises(TaskError, match=r"^PyBullet cannot load .*broken.urdf: "):
         sim.load("robot", file)
+
+
+def test_what_pybullet_prints_of_a_model_is_in_the_error(sim, tmp_path):
+    hand = '<link name="hand"><visual><geometry><mesh filename="meshes/hand.stl"/></geometry></visual></link>'
+    with pytest.raises(TaskError, match=r"model\.urdf:1: cannot find 'meshes/hand\.stl' in any .* Link: hand failed"):
+        sim.load("robot", models.urdf(tmp_path, hand))
+
+
+def test_two_joints_of_one_name(sim, tmp_path):
+    joints = models.joint("elbow", "a", "b"), models.joint("elbow", "b", "c")
+    file = models.urdf(tmp_path, *(models.link(name, 1.0) for name in "abc"), *joints)
+    with pytest.raises(TaskError, match=r"model\.urdf: 2 joints are called 'elbow'; give each its own name"):
+        sim.load("robot", file)  # PyBullet crashes
 
 
 def test_names_of_links_and_bodies(sim):
