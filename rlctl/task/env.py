@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import numbers
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
 from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.sim import Sim
-from rlctl.task.task import Task, check_methods, check_parameters
+from rlctl.task.task import Task, check_definition, check_methods, check_parameters
 
 
 class TaskEnv(gymnasium.Env[Observation, Any]):
@@ -36,16 +37,9 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     ) -> None:
         check_parameters(type(task))
         check_methods(type(task))
+        check_definition(task)
         self.task = task
         self.name = type(task).__name__
-        if not hasattr(task, "action_space"):
-            raise TaskError(f"{self.name} does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example")
-        for key in ("control_dt", "episode_s"):
-            if not 0 < (seconds := getattr(task, key)) < math.inf:
-                raise TaskError(f"{self.name}: {key} is {seconds}: it is a time above 0 [s]")
-        for key in ("substeps", "solver_iterations"):
-            if (count := getattr(task, key)) < 1:
-                raise TaskError(f"{self.name}: {key} is {count}: it is at least 1")
         # Of the instance: gymnasium.Env shares one dict between all environments.
         self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / task.control_dt)}
         if render_mode not in (None, "human", "rgb_array"):
@@ -155,7 +149,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         task.act(self._signals.act(action))
         self.sim.step()
         self._step += 1
-        terminated = bool(task.is_terminated())
+        terminated = self._read_flag("is_terminated")
         truncated = not terminated and self._step >= self.max_steps
         raw = task.rewards(action)
         if not isinstance(raw, dict):
@@ -163,8 +157,11 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         weights = self.reward_weights
         if raw.keys() != weights.keys():
             raise _term_mismatch(self.name, raw, weights)
-        terms = {name: weight * raw[name] for name, weight in weights.items()}
-        reward = float(sum(terms.values()))
+        try:
+            terms = {name: weight * raw[name] for name, weight in weights.items()}
+            reward = float(sum(terms.values()))
+        except (TypeError, ValueError):
+            raise _not_a_number(self.name, raw, self._step) from None
         if not math.isfinite(reward):
             bad = next((name for name, value in raw.items() if not math.isfinite(value)), None)
             if bad is None:
@@ -175,12 +172,19 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             drawn = self._acting.run_due(self._step, self.sim, self.np_random, self._episode_level)
             info.update({"events": drawn} if drawn else {})
         if self.has_success:
-            info["is_success"] = bool(task.is_success())
+            info["is_success"] = self._read_flag("is_success")
         self._running = not (terminated or truncated)
         observation = self._observe()
         if self.render_mode == "human":
             self.move_markers()
         return observation, reward, terminated, truncated, info
+
+    def _read_flag(self, method: str) -> bool:
+        flag = getattr(self.task, method)()
+        try:
+            return bool(flag)
+        except ValueError:  # of an array
+            raise TaskError(f"{self.name}: {method}() returned {short_repr(flag)}, not True or False") from None
 
     def _check_action(self, action: Any) -> Any:
         space = self.action_space
@@ -227,6 +231,11 @@ def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]
 
 def _not_by_name(task: str, method: str, value: Any) -> TaskError:
     return TaskError(f"{task}: {method}() returned {short_repr(value)}, not a dict of values by name: {{'speed': ...}}")
+
+
+def _not_a_number(task: str, raw: Mapping[str, Any], step: int) -> TaskError:
+    name = next((name for name, value in raw.items() if not isinstance(value, numbers.Real)), "sum")
+    return TaskError(f"{task}: reward term {name!r} is {short_repr(raw.get(name))} at step {step}, not a number")
 
 
 def _term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:

@@ -98,6 +98,7 @@ class Sim(Constraints):
         other's ancestors. `inertia` of a URDF's links is what the file says, or that of their collision shapes with
         the file's masses, for a file whose values are wrong: see `rlctl.task.inertia`.
         """
+        self._check_new(name)
         path = Path(file)
         if not path.is_absolute() and not path.exists():
             path = Path(pybullet_data.getDataPath()) / file
@@ -142,6 +143,10 @@ class Sim(Constraints):
             return call()
         except pybullet.error as error:
             raise TaskError(f"PyBullet cannot load {path}: {read_complaint(call) or error}") from None
+
+    def _check_new(self, name: str) -> None:
+        if name in self.bodies:  # what the first reads would be kept forever
+            raise TaskError(f"a body {name!r} is loaded already; give each its own name")
 
     def body(self, name: str) -> Body:
         """Return a loaded body by its name."""
@@ -222,6 +227,7 @@ class Sim(Constraints):
 
         `rlctl.task.terrain` makes heights from a seed.
         """
+        self._check_new(name)
         rows, columns = heights.shape
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_HEIGHTFIELD,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
@@ -138,6 +139,29 @@ def check_methods(task: type[Task]) -> None:
     missing = [f"{method}()" for method in _REQUIRED if getattr(task, method) is getattr(Task, method)]
     if missing:
         raise TaskError(f"{task.__name__} does not define {', '.join(missing)}; a task needs {', '.join(_REQUIRED)}")
+
+
+def check_definition(task: Task) -> None:
+    """Raise `TaskError` for an attribute of the definition that cannot be what it is."""
+    name = type(task).__name__
+    if not isinstance(getattr(task, "action_space", None), spaces.Space):
+        raise TaskError(f"{name} does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example")
+    for key in ("control_dt", "episode_s"):
+        if not 0 < (seconds := getattr(task, key)) < math.inf:
+            raise TaskError(f"{name}: {key} is {seconds}: it is a time above 0 [s]")
+    if task.control_dt > task.episode_s:
+        raise TaskError(f"{name}: control_dt is {task.control_dt} s, longer than an episode of {task.episode_s} s")
+    for key in ("substeps", "solver_iterations"):
+        if not isinstance(count := getattr(task, key), int) or count < 1:
+            raise TaskError(f"{name}: {key} is {count}: it is a whole number, at least 1")
+    if (layout := task.observation_layout) not in ("flat", "dict"):
+        raise TaskError(f"{name}: observation_layout is {layout!r}: it is 'flat' or 'dict'")
+    for key, bounds in task.observation_bounds.items():
+        if np.shape(bounds) != (2,) or not bounds[0] <= bounds[1]:
+            raise TaskError(f"{name}: observation_bounds of {key!r} are {bounds}: they are two numbers, (low, high)")
+    for key, event in task.events.items():
+        if not isinstance(event, Event):
+            raise TaskError(f"{name}: events.{key} is not an Event: Event('reset', scale_mass, body=...), for example")
 
 
 _REQUIRED = ("build", "act", "observe", "rewards")

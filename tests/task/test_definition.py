@@ -9,6 +9,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.task import Box, Task
 from rlctl.task.env import TaskEnv
+from rlctl.task.events import scale_mass
 
 
 class Whole(Task):
@@ -71,7 +72,35 @@ def missing(*names: str) -> type[Task]:
         ),
         (
             type("Timeless", (Whole,), {"substeps": 0}),
-            "Timeless: substeps is 0: it is at least 1",
+            "Timeless: substeps is 0: it is a whole number, at least 1",
+        ),
+        (
+            type("Rate", (Whole,), {"control_dt": 50}),
+            "Rate: control_dt is 50 s, longer than an episode of 5.0 s",
+        ),
+        (
+            type("Half", (Whole,), {"substeps": 4.5}),
+            "Half: substeps is 4.5: it is a whole number, at least 1",
+        ),
+        (
+            type("Layout", (Whole,), {"observation_layout": "Dict"}),
+            "Layout: observation_layout is 'Dict': it is 'flat' or 'dict'",
+        ),
+        (
+            type("Bounds", (Whole,), {"observation_bounds": {"zero": 3.0}}),
+            "Bounds: observation_bounds of 'zero' are 3.0: they are two numbers, (low, high)",
+        ),
+        (
+            type("Swapped", (Whole,), {"observation_bounds": {"zero": (1, -1)}}),
+            "Swapped: observation_bounds of 'zero' are (1, -1): they are two numbers, (low, high)",
+        ),
+        (
+            type("Bare", (Whole,), {"events": {"mass": scale_mass}}),
+            "Bare: events.mass is not an Event: Event('reset', scale_mass, body=...), for example",
+        ),
+        (
+            type("Tuple", (Whole,), {"action_space": (-1, 1, 3)}),
+            "Tuple does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example",
         ),
         (
             type("Flat", (Whole,), {"observe": lambda self: np.zeros(2)}),
@@ -113,3 +142,20 @@ def test_a_parameter_of_a_class_that_forgot_it(write_module, tmp_path, monkeypat
     write_module("arm.py", "from rlctl.task import Task\n\n\nclass Arm(Task):\n    tolerance: float = 0.1\n")
     with pytest.raises(TaskError, match=r"^Arm has parameters \(tolerance\) and is not a dataclass"):
         EnvSpec("arm.py:Arm", {"tolerance": 0.2}).make()
+
+
+@pytest.mark.parametrize(
+    ("method", "value", "message"),
+    [
+        ("rewards", {"one": np.zeros(2)}, "Odd: reward term 'one' is array([0., 0.]) at step 1, not a number"),
+        ("rewards", {"one": None}, "Odd: reward term 'one' is None at step 1, not a number"),
+        ("is_success", np.array([True, False]), "Odd: is_success() returned array([ True, False]), not True or False"),
+    ],
+)
+def test_a_value_of_a_wrong_type_is_named(method, value, message):
+    env = TaskEnv(type("Odd", (Whole,), {method: lambda self, *action: value})())
+    env.reset(seed=0)
+    with pytest.raises(TaskError) as raised:
+        env.step(np.zeros(1))
+    env.close()
+    assert str(raised.value) == message

@@ -26,6 +26,14 @@ def test_a_typo_names_the_closest(changes, message):
     assert str(caught.value) == message
 
 
+def test_a_typo_in_the_event_of_a_task():
+    event = Event("interval", events.push, body="cart", force=1.0, every=0.5)
+    with pytest.raises(
+        TaskError, match=r"^events\.push: no parameter 'every'\. Did you mean 'every_s'\? It has: body, "
+    ):
+        event.bind("push")
+
+
 def test_a_task_without_events():
     with pytest.raises(RecipeError, match=r"^events: this task has no event 'mass'. It has: none.$"):
         TaskEnv(Slider(), events=EventSettings(changes={"mass": {}}))

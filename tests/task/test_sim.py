@@ -50,6 +50,12 @@ def test_two_joints_of_one_name(sim, tmp_path):
         sim.load("robot", file)  # PyBullet crashes
 
 
+def test_two_bodies_of_one_name(sim):
+    sim.load("cube", "cube.urdf")
+    with pytest.raises(TaskError, match=r"^a body 'cube' is loaded already; give each its own name$"):
+        sim.load("cube", "cube.urdf")
+
+
 def test_names_of_links_and_bodies(sim):
     arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
     with pytest.raises(TaskError) as caught:

@@ -113,6 +113,9 @@ class Event:
         if self.when not in possible:
             function = getattr(self.function, "__name__", str(self.function))
             raise error(f"{where}: {function} does not act at {self.when!r}, but at: {', '.join(possible)}.")
+        if not any(p.kind is p.VAR_KEYWORD for p in inspect.signature(self.function).parameters.values()):
+            for key in self.parameters:
+                check_name(key, self.parameter_names, f"{where}: no parameter", error)
         for key, parameter in self._signature.items():
             if parameter.annotation is parameter.empty:
                 function = getattr(self.function, "__name__", str(self.function))
