@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean, short_repr
+from rlctl.joints import Joints
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
 from rlctl.task.observation import Observation, ObservationFormat
@@ -75,6 +76,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
                 raise _not_by_name(self.name, "observe", first)
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
             self._signals.try_once()
+            _check_joints(task)
             # A task knows its markers once an episode has begun; they join the world as it was built.
             markers = list(task.markers()) if render_mode is not None else []
             if self.events or render_mode is not None:
@@ -227,6 +229,16 @@ def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]
         check_name(name, weights, f"reward_weights: {type(task).__name__} has no term", RecipeError)
         weights[name] = float(weight)
     return weights
+
+
+def _check_joints(task: Task) -> None:
+    joints, count = task.describe_joints(), math.prod(task.action_space.shape or ())
+    if joints is not None and (not isinstance(joints, Joints) or len(joints.names) != count):
+        given = list(joints.names) if isinstance(joints, Joints) else joints
+        raise TaskError(
+            f"{type(task).__name__}: describe_joints() returned {short_repr(given)}, not what body.describe_joints "
+            f"makes of {count} names, one per element of the action"
+        )
 
 
 def _not_by_name(task: str, method: str, value: Any) -> TaskError:

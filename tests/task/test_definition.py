@@ -7,6 +7,7 @@ import pytest
 
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import TaskError
+from rlctl.joints import Joints
 from rlctl.task import Box, Task
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import scale_mass
@@ -109,6 +110,16 @@ def missing(*names: str) -> type[Task]:
         (
             type("Blind", (Whole,), {"observe": lambda self: {}}),
             "Blind: observe() returned {}, not a dict of values by name: {'speed': ...}",
+        ),
+        (
+            type("Names", (Whole,), {"describe_joints": lambda self: ["hip"]}),
+            "Names: describe_joints() returned ['hip'], not what body.describe_joints makes of 1 names, "
+            "one per element of the action",
+        ),
+        (
+            type("Few", (Whole,), {"describe_joints": lambda self: Joints(["hip", "knee"])}),
+            "Few: describe_joints() returned ['hip', 'knee'], not what body.describe_joints makes of 1 names, "
+            "one per element of the action",
         ),
         (
             missing("action_space"),
