@@ -28,6 +28,7 @@ from rlctl.env_spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.named_task import POLICY
 from rlctl.run import files, untrusted
+from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo
 from rlctl.run.named_spec import PolicySpec
 from rlctl.run.shipped import Provenance, find_shipped_policy
@@ -213,12 +214,14 @@ class Policy(abc.ABC):
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a policy from a `.safetensors` file, or an exported `.onnx` file; torch is not imported.
+    """Load a `.safetensors` file, an exported `.onnx` file, or the best policy of a run's folder; without torch.
 
     `load_policy(path).predict(observation)` returns the action. The name of an installed task, `load_policy("ant")`,
     is the policy that ships with it, never that of a run. Raises `ArtifactError` for a file that is not one.
     """
     path = Path(path) if Path(path).suffix or registry.find(str(path)) is None else find_shipped_policy(str(path))
+    if RunDirectory(path).status_file.is_file():
+        path = RunDirectory(path).policy_file()
     if path.suffix == ".onnx":
         from rlctl.run.onnx_policy import OnnxPolicy
 

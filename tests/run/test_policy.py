@@ -13,7 +13,7 @@ from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.network import Network, select_actor_tensors
-from rlctl.run.policy import PolicyInfo, compute_digest, read_policy, save_policy
+from rlctl.run.policy import PolicyInfo, compute_digest, load_policy, read_policy, save_policy
 from rlctl.run.torch_policy import TorchPolicy, build_network, pin_threads
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
@@ -220,3 +220,11 @@ def test_an_actor_alone_acts_as_the_whole_policy(tmp_path, algo):
     save_policy(tmp_path / "part.safetensors", info, actor)
     with pytest.raises(ArtifactError, match="its tensors do not fit its description: tensors missing: "):
         TorchPolicy.load(tmp_path / "part.safetensors")
+
+
+def test_the_folder_of_a_run_is_its_best_policy(path, tmp_path):
+    run = tmp_path / "a_run"
+    (run / "policies").mkdir(parents=True)
+    (run / "run.json").write_text("{}")
+    (run / "policies/best.safetensors").write_bytes(path.read_bytes())
+    assert load_policy(run).info == load_policy(path).info

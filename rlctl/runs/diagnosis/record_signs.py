@@ -84,4 +84,4 @@ def last_stage_never_begun(run: History) -> str | None:
     stages, reached = run.recipe.get("stages"), run.curve("stage").values
     if run.status.get("status") != "finished" or not isinstance(stages, list) or not len(reached):
         return None
-    return f"ended in stage {reached[-1]:.0f} of {len(stages)}" if reached[-1] < len(stages) else None
+    return f"trained in stage {reached[-1]:.0f} of {len(stages)} to the end" if reached[-1] < len(stages) else None
