@@ -74,9 +74,10 @@ class Body(Motors):
         movable = [info for info in infos if info[2] in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)]
         self.joint_names = [info[1].decode() for info in movable]
         self.joint_indices = [int(info[0]) for info in movable]
-        self.joint_low: Array = np.array([info[8] for info in movable])
-        """Lower joint limits [rad or m], shape (joints,)."""
-        self.joint_high: Array = np.array([info[9] for info in movable])
+        limits = np.array([info[8:10] for info in movable]).reshape(-1, 2)
+        # Of a joint without limits PyBullet's lower one is above the upper.
+        self.joint_low, self.joint_high = np.where(limits[:, :1] > limits[:, 1:], (-np.inf, np.inf), limits).T
+        """Joint limits [rad or m], infinite where the model file has none; each of shape (joints,)."""
         self.joint_max_force: Array = np.array([info[10] for info in movable])
         """Torque or force limit in the model file [N m or N], shape (joints,)."""
         self.joint_max_speed: Array = np.array([info[11] for info in movable])

@@ -165,3 +165,11 @@ def test_contact_forces(sim):
     cube.set_base((0, 0, 0.02))
     sim.step()
     assert cube.contacts_with(floor).distances.min() == pytest.approx(-0.005, rel=0.3)  # [m], 5 mm deep
+
+
+def test_a_joint_without_limits_has_infinite_ones(sim, tmp_path):
+    wheel = models.joint("wheel", "base", "left", kind="continuous").replace('lower="-3" upper="3" ', "")
+    file = models.urdf(tmp_path, models.link("base", 1.0), models.link("left", 0.2), wheel)
+    body = sim.load("cart", file, fixed=True)
+    assert (body.joint_low[0], body.joint_high[0]) == (-np.inf, np.inf)
+    assert body.describe_joints(["wheel"]).low == ()

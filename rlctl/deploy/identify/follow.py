@@ -16,6 +16,7 @@ from rlctl.task.events import EventSettings
 WINDOW_S = 1.0
 """After so long [s] the simulation begins again from what was measured: small errors do not add up without end."""
 _SMOOTHED = 9  # rows, around the one that a window begins from
+_TRIED = 200  # rows at least, on which it is found out whether that is better than what was measured
 
 
 def open_world(spec: EnvSpec) -> TaskEnv:
@@ -72,14 +73,14 @@ class Follower:
         """Rows that the simulation begins from."""
         self.steps = steps
         self.control_dt = env.task.control_dt
-        rows = min(_SMOOTHED, len(log.actions) // 2 * 2 - 1)
-        self._begin = [savgol_filter(values, rows, 2, axis=0) for values in (log.positions, log.velocities)]
         self._measured = np.concatenate([log.positions, log.velocities], axis=1)
         shape = env.action_space.shape or ()
         self._actions = log.actions.reshape(-1, *shape)
         low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
         self._resting = np.clip(np.zeros(shape), low, high)
         self._dtype = env.action_space.dtype
+        rows = min(_SMOOTHED, len(log.actions) // 2 * 2 - 1)
+        self._begin = self._choose_begin(savgol_filter(self._measured, rows, 2, axis=0))
 
     @property
     def spread(self) -> Array:
@@ -94,21 +95,35 @@ class Follower:
         """
         changes = {} if positions is None else self.unknowns.settings(positions.tolist())
         self._env.set_events(EventSettings(False, changes))
-        errors: Array = np.concatenate([self._play(start, delay) for start in self.starts]) - np.concatenate(
-            [self._measured[start + 1 : start + 1 + self.steps] for start in self.starts]
-        )
+        errors: Array = np.concatenate(
+            [self._play(start, delay, self.steps) for start in self.starts]
+        ) - np.concatenate([self._measured[start + 1 : start + 1 + self.steps] for start in self.starts])
         return errors
 
-    def _play(self, start: int, delay: int) -> Array:
+    def _choose_begin(self, smoothed: Array) -> Array:
+        """Return the states to begin from: each column smoothed, or as measured if the next row is better predicted.
+
+        Smoothing takes noise away, and the peaks of a joint that a quickly changing torque moves.
+        """
+        self._env.set_events(EventSettings(False, {}))
+        starts = np.arange(0, len(self._actions) - 1, max(1, len(self._actions) // _TRIED))
+        errors = []
+        for begin in (self._measured, smoothed):
+            self._begin = begin
+            played = np.concatenate([self._play(start, 0, 1) for start in starts])
+            errors.append(np.square(played - self._measured[starts + 1]).sum(axis=0))
+        return np.where(errors[0] < errors[1], self._measured, smoothed)
+
+    def _play(self, start: int, delay: int, steps: int) -> Array:
         env = self._env
         env.reset(seed=0)
         for body in self._bodies.values():
             angles, speeds = body.joint_positions.copy(), body.joint_velocities.copy()
             for column, (owner, index) in enumerate(self._joints):
                 if owner is body:
-                    angles[index], speeds[index] = self._begin[0][start, column], self._begin[1][start, column]
+                    angles[index], speeds[index] = self._begin[start, column :: len(self._joints)]
             body.set_joints(angles, speeds)
-        rows = min(self.steps, len(self._actions) - 1 - start)
+        rows = min(steps, len(self._actions) - 1 - start)
         played = np.empty((rows, self._measured.shape[1]))
         for row in range(rows):
             step = start + row - delay
