@@ -90,7 +90,7 @@ def _make_bounds(
     if timed and control_dt is None:
         raise RecipeError(_NO_CONTROL_DT)
     dt, is_value = control_dt or 1.0, limits.command in ("position", "torque", "action")
-    scale, offset = _choose_units(limits, known, names)
+    scale, offset = _choose_units(limits, space, known, names)
     if not is_value and offset.any():
         raise RecipeError(f"limits: offset: with command: {limits.command} action 0 is to keep still; leave it out")
     factor = scale * (dt if limits.command == "speed" else 1.0)
@@ -164,12 +164,17 @@ def _check_can_be_limited(limits: Limits, joint: JointLimits, name: str) -> None
             )
 
 
-def _choose_units(limits: Limits, known: Joints | None, names: list[str]) -> tuple[Array, Array]:
+def _choose_units(limits: Limits, space: spaces.Box, known: Joints | None, names: list[str]) -> tuple[Array, Array]:
     """Return scale and offset of the command, per joint."""
     scale: Any = 1.0
     offset: Any = 0.0
     if known is not None and known.action_scale and limits.command == "position":
         scale, offset = known.action_scale, known.default_positions or 0.0
+    elif limits.scale is None and limits.command != "action" and (space.low == -1).all() and (space.high == 1).all():
+        raise RecipeError(
+            f"limits: scale: how much {limits.command} is 1 of the action? The policy's go from -1 to 1; write scale: "
+            "NUMBER, in rad, rad/s or N m, and 1 if they are in that unit"
+        )
     return _spread("scale", limits.scale, scale, names), _spread("offset", limits.offset, offset, names)
 
 

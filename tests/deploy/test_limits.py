@@ -127,6 +127,15 @@ def test_a_joint_without_limits_of_its_own(write, arm):
     assert SafetyFilter(arm, write("command: torque")).limit([5.0, 5.0]) == pytest.approx([5.0, 3.0])
 
 
+def test_actions_from_minus_1_to_1_need_a_scale(write, arm):
+    normalised = arm.model_copy(update={"action_space": space_to_json(spaces.Box(-1, 1, (2,)))})
+    with pytest.raises(RecipeError, match=r"^limits: scale: how much torque is 1 of the action\? "):
+        SafetyFilter(normalised, write("command: torque\nlimits: {all: {torque: 8}}"))  # 1 of it may be 10 N m
+    safety = SafetyFilter(normalised, write("command: torque\nscale: 10\nlimits: {all: {torque: 8}}"))
+    safety.observe(observe_at(0, 0))
+    assert safety.limit([0.9, 0.1]) == pytest.approx([0.8, 0.1])
+
+
 def test_without_a_control_dt(write):
     info = EnvInfo(observation_space=make_arm().observation_space, action_space=space_to_json(spaces.Box(-1, 1, (2,))))
     with pytest.raises(RecipeError, match="does not say its control_dt"):

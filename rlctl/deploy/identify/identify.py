@@ -176,6 +176,8 @@ def _judge(unknowns: Unknowns, fit: Fit) -> list[Found]:
     variance = fit.cost * fit.rows_per_window
     deviations = np.sqrt(variance * np.diag(np.linalg.inv(regular)))
     alone = np.sqrt(variance / np.diag(regular))  # if all others were known
+    without_trace = np.diag(information) <= 1e-9 * np.trace(information)
+    deviations[without_trace] = alone[without_trace] = 1e6  # whatever the errors are that are left
     return [
         _judge_one(unknowns, index, fit, float(deviations[index]), float(alone[index]), regular)
         for index in range(len(spans))

@@ -23,6 +23,8 @@ class Parameter:
     key: str
     low: float
     high: float
+    nominal: float | None = None
+    """Of the built world, where that is known."""
 
     @property
     def name(self) -> str:
@@ -37,6 +39,15 @@ class Parameter:
         if self.is_logarithmic:
             return self.low * math.exp(position * math.log(self.high / self.low))
         return self.low + position * (self.high - self.low)
+
+    @property
+    def first(self) -> float:
+        """The position to try first: that of the built world, or the middle."""
+        if self.nominal is None or not self.low <= self.nominal <= self.high:
+            return 0.5
+        if self.is_logarithmic:
+            return math.log(self.nominal / self.low) / math.log(self.high / self.low)
+        return (self.nominal - self.low) / (self.high - self.low)
 
     @property
     def relative_span(self) -> float:
@@ -85,7 +96,7 @@ def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: st
         if is_delay:
             delayed, longest = name, max(5, 2 * int(ranges["steps"][1]))
         else:
-            found += [_make_parameter(name, key, *values) for key, values in ranges.items()]
+            found += [_make_parameter(name, key, *values, event.nominal(key)) for key, values in ranges.items()]
     if not found and not delayed:
         raise UsageError(f"{task} has no event with a physical value to find: see rlctl tasks show {task}")
     return Unknowns(tuple(found), delayed, longest)
@@ -96,9 +107,11 @@ def _list_ranges(name: str, event: Event) -> dict[str, tuple[float, float]]:
     return {key: value.end for key, value in values.items() if isinstance(value, Widening)}
 
 
-def _make_parameter(event: str, key: str, low: float, high: float) -> Parameter:
+def _make_parameter(event: str, key: str, low: float, high: float, nominal: float | None) -> Parameter:
     if low < 0:
         middle, half = (low + high) / 2, _WIDER * max((high - low) / 2, 1e-6)
-        return Parameter(event, key, middle - half, middle + half)
+        return Parameter(event, key, middle - half, middle + half, nominal)
+    if low == 0 and nominal is None:  # as of damping: nothing, most likely
+        nominal = _SMALLEST * max(high, 1e-6)
     low = low / _WIDER if low > 0 else _SMALLEST * max(high, 1e-6)
-    return Parameter(event, key, low, _WIDER * max(high, low))
+    return Parameter(event, key, low, _WIDER * max(high, low), nominal)

@@ -124,7 +124,7 @@ def search(
         ),
         key=lambda pair: pair[0],
     )
-    starts = _choose_starts([trial for _, trial in ranked])
+    starts = _choose_starts(trials[0], [trial for _, trial in ranked])
     report(f"least squares from {len(starts)} starts")
     follow_up([_ask_fit(trial["at"], trial["delay"], weights, _EVALUATIONS) for trial in starts])
     best = _best(fits)
@@ -158,24 +158,26 @@ def _ask_fit(at: Array | list[float], delay: int, weights: Array, evaluations: i
 
 
 def _make_trials(unknowns: Unknowns, seed: int) -> list[dict[str, Any]]:
-    """Return points all over the ranges, with every delay in turn."""
+    """Return the built world with every delay, then points all over the ranges, with every delay in turn."""
     from scipy.stats import qmc
 
     size = len(unknowns.parameters)
     delays = range(unknowns.longest_delay + 1)
+    built = [{"at": [each.first for each in unknowns.parameters], "delay": delay} for delay in delays]
     if size == 0:
-        return [{"at": [], "delay": delay} for delay in delays]
+        return built
     count = max(len(delays), _TRIALS * (size + 1))
     points = qmc.Halton(size, seed=seed).random(count).tolist()
-    return [{"at": point, "delay": delays[index % len(delays)]} for index, point in enumerate(points)]
+    return built + [{"at": point, "delay": delays[index % len(delays)]} for index, point in enumerate(points)]
 
 
-def _choose_starts(ranked: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the best trial of each of the best delays, then the next best ones."""
+def _choose_starts(built: dict[str, Any], ranked: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the best trial of each of the best delays, then the next best ones, and the built world."""
     firsts = list({trial["delay"]: trial for trial in reversed(ranked)}.values())
     firsts = [trial for trial in ranked if trial in firsts][:_STARTS]
     others = [trial for trial in ranked if trial not in firsts]
-    return [*firsts, *others[: max(0, _STARTS - len(firsts))]]
+    starts = [*firsts, *others[: max(0, _STARTS - len(firsts))]]
+    return starts if built in starts else [*starts, built]
 
 
 def main(connection: Connection, spec: dict[str, Any]) -> None:

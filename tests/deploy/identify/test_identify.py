@@ -9,10 +9,11 @@ import pytest
 from rlctl import registry
 from rlctl.deploy.identify.excite import write_excitation
 from rlctl.deploy.identify.follow import Follower, open_world
-from rlctl.deploy.identify.identify import identify
+from rlctl.deploy.identify.identify import _judge, identify
 from rlctl.deploy.identify.log import Expected, Log, read_log, write_log
-from rlctl.deploy.identify.parameters import Unknowns
+from rlctl.deploy.identify.parameters import Parameter, Unknowns
 from rlctl.deploy.identify.report import show, write_fragment
+from rlctl.deploy.identify.search import Fit, _choose_starts, _make_trials
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.run import yaml_text
@@ -219,3 +220,20 @@ def test_the_peaks_of_quick_torques_are_not_smoothed():
     errors = Follower(env, play(actions, {}, 0, 0.0), Unknowns(())).compare(None, 0)
     env.close()
     assert np.abs(errors).max() < 1e-6  # the log is of this very world: smoothed states were 0.3 rad/s off
+
+
+def test_a_value_without_a_trace_is_not_known_in_a_log_without_noise():
+    parameters = tuple(Parameter(name, "factor", 0.5, 2.0) for name in ("mass", "friction"))
+    errors = np.full(4, 1e-9)
+    fit = Fit(np.full(2, 0.5), 0, 1e-12, np.diag([1e4, 0.0]), errors, 50.0)
+    mass, friction = _judge(Unknowns(parameters), fit)
+    assert mass.known
+    assert (friction.known, friction.note) == (False, "this log says nothing of friction.factor")
+
+
+def test_the_built_world_is_tried_first():
+    mass = Parameter("mass", "factor", 0.5, 2.0, 1.0)
+    unknown = Parameter("friction", "friction", 0.1, 2.0)
+    trials = _make_trials(Unknowns((mass, unknown), "late", 1), 0)
+    assert trials[:2] == [{"at": [pytest.approx(0.5), 0.5], "delay": delay} for delay in (0, 1)]
+    assert _choose_starts(trials[0], trials[1:])[-1] == trials[0]
