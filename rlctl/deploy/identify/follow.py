@@ -106,12 +106,12 @@ class Follower:
         Smoothing takes noise away, and the peaks of a joint that a quickly changing torque moves.
         """
         self._env.set_events(EventSettings(False, {}))
-        starts = np.arange(0, len(self._actions) - 1, max(1, len(self._actions) // _TRIED))
+        starts = range(0, len(self._actions) - 1, max(1, len(self._actions) // _TRIED))
         errors = []
         for begin in (self._measured, smoothed):
             self._begin = begin
             played = np.concatenate([self._play(start, 0, 1) for start in starts])
-            errors.append(np.square(played - self._measured[starts + 1]).sum(axis=0))
+            errors.append(np.square(played - self._measured[np.array(starts) + 1]).sum(axis=0))
         return np.where(errors[0] < errors[1], self._measured, smoothed)
 
     def _play(self, start: int, delay: int, steps: int) -> Array:
