@@ -22,7 +22,7 @@ def load(sim, folder, inertial, **kwargs):
     """A held base and one link of 0.3 m x 0.04 m x 0.04 m."""
     link = f'<link name="rod">{inertial}{BOX}</link>'
     file = models.urdf(folder, models.link("base", 1.0), link, models.joint("joint", "base", "rod"))
-    return sim.load("body", file, fixed=True, **kwargs)
+    return sim.load(f"body {len(sim.bodies)}", file, fixed=True, **kwargs)
 
 
 def inertial(ixx, iyy, izz, mass=1.0):
