@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +19,10 @@ def train(
     device: str = "cpu",
     root: str | Path = "runs",
     check: bool = True,
-    initial_policy: str | Path | None = None,
+    initial_policy: str | os.PathLike[str] | None = None,
     **recipe: Any,
 ) -> TrainResult:
-    """Train as `rlctl train` does, and return the run with what it reached.
+    """Train as `rlctl train` does, and return what was reached; `load_policy` and `evaluate` take its `run`.
 
     Keywords are the keys of a recipe, `docs/recipe.md`: `train("reach", seed=1, algo_kwargs={"gamma": 0.97})`. They go
     over `config`, a recipe file. `initial_policy` is a run, a policy file or a task's name, as `--from` takes it. Call
@@ -36,13 +37,13 @@ def train(
         device=device,
         root=Path(root),
         check=check,
-        initial_policy=None if initial_policy is None else str(initial_policy),
+        initial_policy=None if initial_policy is None else os.fspath(initial_policy),
     )
     return run_training(request)
 
 
 def evaluate(
-    run: str | Path | None = None,
+    run: str | os.PathLike[str] | None = None,
     /,
     *,
     other_task: str | None = None,
@@ -65,7 +66,7 @@ def evaluate(
     if episodes < 1 or seed < 0:
         raise UsageError(f"evaluate: episodes={episodes}, seed={seed}: one episode or more, and a seed from 0 on")
     request = EvalRequest(
-        run=None if run is None else str(run),
+        run=None if run is None else os.fspath(run),
         task=other_task,
         checkpoint=checkpoint,
         episodes=episodes,

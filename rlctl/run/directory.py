@@ -41,6 +41,9 @@ class RunDirectory:
     def __init__(self, path: Path) -> None:
         self.path = path
 
+    def __fspath__(self) -> str:
+        return str(self.path)
+
     recipe_file = _Place("recipe.yaml")
     """The resolved recipe."""
     status_file = _Place("run.json")

@@ -10,6 +10,7 @@ import abc
 import dataclasses
 import functools
 import hashlib
+import os
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -213,13 +214,15 @@ class Policy(abc.ABC):
             raise ValueError("its actions are not finite")
 
 
-def load_policy(path: str | Path) -> Policy:
+def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Load a `.safetensors` file, an exported `.onnx` file, or the best policy of a run's folder; without torch.
 
     `load_policy(path).predict(observation)` returns the action. The name of an installed task, `load_policy("ant")`,
     is the policy that ships with it, never that of a run. Raises `ArtifactError` for a file that is not one.
     """
-    path = Path(path) if Path(path).suffix or registry.find(str(path)) is None else find_shipped_policy(str(path))
+    name, path = os.fspath(path), Path(path)
+    if not path.suffix and registry.find(name) is not None:
+        path = find_shipped_policy(name)
     if RunDirectory(path).status_file.is_file():
         path = RunDirectory(path).policy_file()
     if path.suffix == ".onnx":

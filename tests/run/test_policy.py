@@ -11,6 +11,7 @@ from safetensors.numpy import load_file, save
 import rlctl
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError
+from rlctl.run.directory import RunDirectory
 from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.network import Network, select_actor_tensors
 from rlctl.run.policy import PolicyInfo, compute_digest, load_policy, read_policy, save_policy
@@ -227,4 +228,4 @@ def test_the_folder_of_a_run_is_its_best_policy(path, tmp_path):
     (run / "policies").mkdir(parents=True)
     (run / "run.json").write_text("{}")
     (run / "policies/best.safetensors").write_bytes(path.read_bytes())
-    assert load_policy(run).info == load_policy(path).info
+    assert load_policy(run).info == load_policy(RunDirectory(run)).info == load_policy(path).info
