@@ -101,6 +101,12 @@ class Comparison:
     threshold: float | None
 
     @property
+    def of_the_first(self) -> list[str]:
+        """The keys of the world that all play in, where that of a candidate was another."""
+        keys = dict.fromkeys(key for candidate in self.candidates for key in candidate.recipe_changes)
+        return [key for key in keys if key.partition(".")[0] in ("task", "reward_weights", "randomize", "events")]
+
+    @property
     def sides(self) -> list[Side]:
         """The baseline, then the candidates' sides."""
         return [self.baseline, *(candidate.side for candidate in self.candidates)]
@@ -127,10 +133,13 @@ def compare(texts: Sequence[str], request: EvalRequest, threshold: float | None 
     _refuse_unequal(texts, groups)
     task = _common_task([run for group in groups for run in group], request.task)
     recipes = [[run.recipe() for run in group] for group in groups]
+    first = _evaluate(groups[0][0], request, threshold)
+    # All in the same world: a tolerance that is easier to keep makes no policy better.
+    request = dataclasses.replace(request, spec=first.evaluation.spec)
     sides = [
         Side(
             name=text.rstrip("/") if len(group) > 1 else str(group[0].path),
-            runs=[_evaluate(run, request, threshold) for run in group],
+            runs=[first if run is groups[0][0] else _evaluate(run, request, threshold) for run in group],
             mixed=find_mixed(own),
         )
         for text, group, own in zip(texts, groups, recipes, strict=True)

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from rlctl.env_spec import merge
+from rlctl.env_spec import EnvSpec, merge
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.eval.evaluate import EvalRequest
-from rlctl.runs.comparison import compare, find_runs_of
+from rlctl.eval.evaluate import EvalRequest, choose_spec, load_player
+from rlctl.runs.comparison import Candidate, Comparison, Side, compare, find_runs_of
 from rlctl.runs.comparison_report import as_json, format_needed
 from rlctl.runs.statistics import Verdict
 from rlctl.train.request import TrainRequest, run_training
@@ -38,6 +38,20 @@ def test_policies_are_compared_episode_by_episode(root):
     first, second = ([episode.result.seed for episode in side.runs[0].evaluation.episodes] for side in sides)
     assert first == second
     assert candidate.recipe_changes == {}
+    assert result.of_the_first == []
+
+
+def test_all_play_in_the_world_of_the_first(root):
+    one, _ = sorted((root / "0.9/Line").iterdir())
+    policy = load_player(one / "policies/best.safetensors", deterministic=True)
+    easier = EnvSpec(f"{ENVS}:Line", {"goal": 0.5}, {"near": 2.0}, randomize=True, events={"mass": {"factor": 1.0}})
+    played = choose_spec(policy.info, EvalRequest(str(one), spec=easier))
+    assert (played.parameters, played.reward_weights) == ({"goal": 0.5}, {"near": 2.0})
+    assert (played.randomize, played.events) == (True, {"mass": {"factor": 1.0}})
+    changes = {"task.goal": (0.1, 0.5), "algo_kwargs.gamma": (0.9, 0.99), "randomize": (False, True)}
+    candidate = Candidate(Side("b", [], []), {}, changes)
+    result = Comparison(False, "Line", Side("a", [], []), [candidate], 5, None)
+    assert result.of_the_first == ["task.goal", "randomize"]
 
 
 def test_recipes_are_compared_seed_by_seed(root):
