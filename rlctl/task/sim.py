@@ -100,9 +100,9 @@ class Sim(Constraints):
         """
         self._check_new(name)
         path = Path(file)
-        if not path.is_absolute() and not path.exists():
+        if not path.is_absolute() and not path.is_file():
             path = Path(pybullet_data.getDataPath()) / file
-        if not path.exists():
+        if not path.is_file():  # PyBullet crashes on a folder
             raise TaskError(
                 f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data; "
                 f"for a file beside your module: Path(__file__).with_name({path.name!r})"

@@ -30,6 +30,11 @@ def test_a_model_file_that_is_not_there(sim):
     )
 
 
+def test_a_folder_is_no_model_file(sim, tmp_path):
+    with pytest.raises(TaskError, match=r"^model file '.*' not found"):
+        sim.load("robot", tmp_path)  # PyBullet crashes
+
+
 def test_a_model_file_that_is_none(sim, tmp_path):
     file = tmp_path / "broken.urdf"
     file.write_text("not xml")
