@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 TIME = "time"
 _POSITION, _VELOCITY = "position_", "velocity_"
+_USED = (TIME, "action_", _POSITION, _VELOCITY)
 _GAP = 1.5
 """Control periods between two rows from which on something is missing between them."""
 _OTHER_RATE = 0.1
@@ -102,7 +103,9 @@ def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise ArtifactError(f"{path}: not a CSV file: {error}") from None
     if not rows or TIME not in [name.strip() for name in rows[0]]:
-        raise ArtifactError(f"{path}: its first line must name the columns: {TIME}, action_..., position_JOINT, ...")
+        raise ArtifactError(
+            f"{path}: its first line must name the columns, with commas: {TIME}, action_..., position_JOINT"
+        )
     names = [name.strip() for name in rows[0]]
     if doubled := [name for name in names if names.count(name) > 1]:
         raise ArtifactError(f"{path}: there are two columns {doubled[0]!r}")
@@ -124,7 +127,7 @@ def _read_row(path: Path, line: int, row: list[str], names: list[str]) -> list[f
             number = float(text)
         except ValueError:
             number = math.nan
-        if not math.isfinite(number):
+        if not math.isfinite(number) and name.startswith(_USED):  # other columns may hold anything
             raise ArtifactError(f"{path}, line {line}: {name} is {text.strip()!r}, not a finite number")
         numbers.append(number)
     return numbers

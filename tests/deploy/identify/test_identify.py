@@ -202,6 +202,13 @@ def test_logs_that_cannot_be_used(change, message, real, tmp_path):
         read_log(path, EXPECTED)
 
 
+def test_columns_that_are_not_used_may_hold_anything(real, tmp_path):
+    header, *rows = real.read_text().splitlines()
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([f"{header},state", *(f"{row},running" for row in rows)]))
+    np.testing.assert_array_equal(read_log(path, EXPECTED).actions, read_log(real, EXPECTED).actions)
+
+
 def test_command_line(rlctl, real, tmp_path):
     (tmp_path / "bad.csv").write_text("time\n0\n")
     done = rlctl("identify", ARM, "--log", "bad.csv")
