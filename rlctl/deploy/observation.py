@@ -89,12 +89,16 @@ def _convert(value: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]
     if array.dtype.kind not in "biuf":
         raise ObservationError(f"observation {name!r} is {array.dtype}, not numbers")
     if array.shape != shape:
-        if array.size != math.prod(shape):
+        # Only what has one axis, but for those of length 1, can be put in order: a picture on its side cannot.
+        axes, wanted = ([each for each in given if each != 1] for given in (array.shape, shape))
+        if array.size != math.prod(shape) or (axes != wanted and min(len(axes), len(wanted)) > 1):
             raise ObservationError(f"observation {name!r} has shape {array.shape}, the policy takes {shape}")
         array = array.reshape(shape)
     if array.dtype != dtype:
         with np.errstate(all="ignore"):  # what is not finite then is found by the checks of sensors
-            array = array.astype(dtype)
+            given, array = array, array.astype(dtype)
+        if dtype.kind in "iu" and (odd := given[given != array]).size:
+            raise ObservationError(f"observation {name!r} has {odd.flat[0]:g}, the policy takes {dtype}")
     return array
 
 

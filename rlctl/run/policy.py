@@ -189,6 +189,8 @@ class Policy(abc.ABC):
         parts = {}
         for key, (shape, dtype) in self._parts.items():
             value = np.asarray(given[key], dtype) if key in given else None
+            if value is not None and value.dtype.kind == "u" and (odd := value != given[key]).any():
+                raise ValueError(f"observation has {np.asarray(given[key])[odd][0]:g}, the policy expects {dtype}")
             if value is None or value.shape != shape:
                 expected = join({key: shape for key, (shape, _) in self._parts.items()})
                 raise ValueError(

@@ -43,3 +43,19 @@ def test_stacked_observations_have_no_names():
     stacked = layout(spaces.Box(-1, 1, (2, 3), np.float32), observation_sizes={"a": 1, "b": 2})
     assert stacked.shapes == {"observation": (2, 3)}
     assert stacked.read(np.arange(6) / 6).shape == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (np.full((4, 6, 3), 0.5), "observation 'camera' has 0.5, the policy takes uint8"),  # it was all black
+        (np.full((4, 6, 3), 300), "observation 'camera' has 300, the policy takes uint8"),  # it was 44
+        (np.ones((6, 4, 3), np.uint8), r"observation 'camera' has shape \(6, 4, 3\), the policy takes \(4, 6, 3\)"),
+    ],
+)
+def test_pictures_of_another_scale_or_on_their_side(picture, message):
+    camera = layout(spaces.Dict({"camera": spaces.Box(0, 255, (4, 6, 3), np.uint8)}))
+    with pytest.raises(ObservationError, match=message):
+        camera.read({"camera": picture})
+    for same in (np.full((1, 4, 6, 3), 7.0), np.full(72, 7)):
+        assert camera.read({"camera": same})["camera"].tolist() == np.full((4, 6, 3), 7).tolist()

@@ -206,6 +206,12 @@ def test_predict_with_a_wrong_shape(path, saved):
         by_name.predict({"a": np.zeros(3)})
 
 
+def test_predict_with_a_picture_from_0_to_1(saved):
+    policy = rlctl.load_policy(saved(policy="CnnPolicy", observation=spaces.Box(0, 255, (36, 40, 3), np.uint8)))
+    with pytest.raises(ValueError, match=r"^observation has 0\.5, the policy expects uint8$"):
+        policy.predict(np.full((36, 40, 3), 0.5))  # it was all black
+
+
 @pytest.mark.parametrize("algo", ["ppo", "sac", "td3", "crossq", "recurrent_ppo"])
 def test_an_actor_alone_acts_as_the_whole_policy(tmp_path, algo):
     info = describe(algo, "MlpLstmPolicy" if algo == "recurrent_ppo" else "MlpPolicy", policy_kwargs={"net_arch": [8]})
