@@ -49,10 +49,10 @@ def resolve(
     return fill_defaults(validate(merged, *sources))
 
 
-def resolve_packaged(task: str) -> Recipe:
+def resolve_packaged(task: str, settings: Mapping[str, Any] | None = None) -> Recipe:
     """Return the recipe that a task comes with, with the stages that its class declares; the task is imported."""
     constructor: Any = registry.load(task)
-    return resolve(task, None, {}, constructor.stages if registry.is_task(constructor) else ())
+    return resolve(task, None, settings or {}, constructor.stages if registry.is_task(constructor) else ())
 
 
 def fill_defaults(recipe: Recipe) -> Recipe:

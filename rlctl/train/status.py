@@ -33,7 +33,7 @@ def write_start(run: RunDirectory, start: Start) -> None:
         **identify_task(start.task),
         "algo": recipe.algo,
         "seed": recipe.seed,
-        "recipe_changes": _find_recipe_changes(start.task, recipe),
+        "recipe_changes": find_recipe_changes(start.task, recipe),
         "device": start.request.device,
         "versions": collect_versions(),
         "git_commit": find_git_commit(),
@@ -50,13 +50,15 @@ def write_start(run: RunDirectory, start: Start) -> None:
     run.write_status(changes)
 
 
-def _find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
-    """Return the keys in which a recipe differs from the task's own, and their values."""
+def find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
+    """Return the keys in which a recipe differs from the task's own, and their values; not what follows from them."""
+    chosen = {key: getattr(recipe, key) for key in ("algo", "n_envs", "total_timesteps")}
     try:
-        packaged = resolve_packaged(task)
+        packaged, adapted = resolve_packaged(task), resolve_packaged(task, chosen)
     except RlctlError:  # a packaged recipe that is wrong in itself; this one was made right by --config or --set
         return {}
-    return {key: value for key, (value, _) in find_difference(recipe, packaged).items()}
+    own = {key: value for key, value in chosen.items() if value != getattr(packaged, key)}
+    return own | {key: value for key, (value, _) in find_difference(recipe, adapted).items()}
 
 
 def write_failure(run: RunDirectory, error: BaseException) -> None:

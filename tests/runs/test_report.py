@@ -11,11 +11,11 @@ import pytest
 
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import robustness
-from rlctl.run.recipe import find_difference
-from rlctl.run.recipe_sources import parse_settings, resolve, resolve_packaged
+from rlctl.run.recipe_sources import parse_settings, resolve
 from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.runs.report import content
 from rlctl.runs.report.write import write_report
+from rlctl.train.status import find_recipe_changes
 
 LARGEST = 2_000_000  # [bytes]
 HEADER = "steps,seconds,return,success,term/alive\n"
@@ -64,7 +64,9 @@ def test_page_has_everything_and_needs_nothing_else(group):
 
 def test_command_for_another_algorithm_trains_the_same_recipe(write_run):
     other = resolve("reach", None, {"algo": "sac", "task": {"tolerance": 0.1}, "seed": 3})
-    changes = {key: value for key, (value, _) in find_difference(other, resolve_packaged("reach")).items()}
+    changes = find_recipe_changes("reach", other)
+    # What follows from another algorithm, its own defaults, is no choice of the user's.
+    assert changes == {"algo": "sac", "n_envs": 8, "total_timesteps": 300_000, "task.tolerance": 0.1}
     run = write_run("reach/2026-11-21_10-00-00_s3", seed=3, recipe_changes=changes)
     (command,) = content.list_commands(content.collect([str(run)]))
     words = shlex.split(command)
