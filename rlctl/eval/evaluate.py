@@ -42,8 +42,7 @@ class EvalRequest:
     baseline: str | None = None
     """What to play instead of a trained policy: `zero`, `random`, `module:function` or `file.py:function`."""
     spec: EnvSpec | None = None
-    """What the baseline plays in, where it is not what the task's recipe would train; of a policy, whose parameters,
-    weights and events it plays with instead of its own."""
+    """What to play in, where it is not what the policy, or for a baseline the task's recipe, was trained in."""
     limits: Path | None = None
     """Limits that the policy acts within; it is evaluated without them too."""
     measure_actions: bool = False
@@ -176,14 +175,9 @@ def load_player(path: Path, deterministic: bool) -> LoadedPolicy:
 
 def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:
     """Return what to evaluate on: the policy's task or another, with changes, or the stage that was asked for."""
-    if (other := request.spec) is not None:
-        return dataclasses.replace(
-            info.derive_spec(request.task),
-            parameters=other.parameters,
-            reward_weights=other.reward_weights,
-            randomize=other.randomize,
-            events=other.events,
-        )
+    if request.spec is not None:  # the policy brings only how it observes
+        own = info.spec
+        return dataclasses.replace(request.spec, frame_stack=own.frame_stack, time_feature=own.time_feature)
     if (stage := request.stage) is None:
         return info.derive_spec(request.task, request.changes)
     if request.task is not None and request.task != info.spec.task:

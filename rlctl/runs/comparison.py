@@ -101,8 +101,8 @@ class Comparison:
     threshold: float | None
 
     @property
-    def of_the_first(self) -> list[str]:
-        """The keys of the world that all play in, where that of a candidate was another."""
+    def world_differences(self) -> list[str]:
+        """The recipe keys of the world in which a candidate differs from the first; all play in the first's."""
         keys = dict.fromkeys(key for candidate in self.candidates for key in candidate.recipe_changes)
         return [key for key in keys if key.partition(".")[0] in ("task", "reward_weights", "randomize", "events")]
 

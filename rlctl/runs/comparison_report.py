@@ -25,8 +25,8 @@ def show(result: Comparison, json: str | None) -> None:
         out.print(f"policies on {result.task}: the unit is the episode, the same {result.episodes} for each")
         rows = [(side.name, *_format_scores(side.runs[0])) for side in result.sides]
         output.print_table(("policy", "success", "return"), rows, left=("policy",))
-    if result.of_the_first:
-        out.print(f"all played with the first's {', '.join(result.of_the_first)}")
+    if result.world_differences:
+        out.print(f"all played with the first's {', '.join(result.world_differences)}")
     for candidate in result.candidates:
         _show_candidate(result, candidate)
 

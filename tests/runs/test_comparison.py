@@ -38,7 +38,7 @@ def test_policies_are_compared_episode_by_episode(root):
     first, second = ([episode.result.seed for episode in side.runs[0].evaluation.episodes] for side in sides)
     assert first == second
     assert candidate.recipe_changes == {}
-    assert result.of_the_first == []
+    assert result.world_differences == []
 
 
 def test_all_play_in_the_world_of_the_first(root):
@@ -51,7 +51,7 @@ def test_all_play_in_the_world_of_the_first(root):
     changes = {"task.goal": (0.1, 0.5), "algo_kwargs.gamma": (0.9, 0.99), "randomize": (False, True)}
     candidate = Candidate(Side("b", [], []), {}, changes)
     result = Comparison(False, "Line", Side("a", [], []), [candidate], 5, None)
-    assert result.of_the_first == ["task.goal", "randomize"]
+    assert result.world_differences == ["task.goal", "randomize"]
 
 
 def test_recipes_are_compared_seed_by_seed(root):
