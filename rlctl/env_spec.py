@@ -98,6 +98,8 @@ class EnvSpec:
         return env
 
     def _make_plain_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
+        import gymnasium
+
         parameters = dict(self.parameters)
         _check_keywords(self.task, constructor, parameters)
         if render_mode is not None:
@@ -107,6 +109,11 @@ class EnvSpec:
             except RecipeError:
                 raise RecipeError(f"{self.task} takes no render_mode") from None
         env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
+        if hasattr(env, "num_envs") and not isinstance(env, gymnasium.Env):
+            raise TaskError(
+                f"{self.task}: {type(env).__name__} is a vectorised environment\n"
+                "Give a single one: rlctl steps n_envs of them side by side"
+            )
         if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
             raise TaskError(
                 f"{self.task}: {type(env).__name__} is neither a Gymnasium environment (reset, step, spaces) "

@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from rlctl.errors import RecipeError
 from rlctl.task.env import TaskEnv
+from rlctl.time_limit import find_time_limit
 
 NAME = "time_left"
 """Its name among the observations of a task."""
@@ -25,7 +26,7 @@ class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
         inner = env.unwrapped
-        limit = inner.max_steps if isinstance(inner, TaskEnv) else env.spec and env.spec.max_episode_steps
+        limit = inner.max_steps if isinstance(inner, TaskEnv) else find_time_limit(env)
         if not limit:
             raise RecipeError(f"time_feature: {type(inner).__name__} has no time limit, so no time is left")
         self._limit = limit

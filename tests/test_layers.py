@@ -23,6 +23,7 @@ LAYERS = [
     {"gym"},
     {"env_spec"},
     {"dict_spaces", "time_feature"},
+    {"time_limit"},
     {"named_task"},
     {"registry"},
     {"plugin_code"},

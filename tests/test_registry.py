@@ -140,6 +140,12 @@ def test_places_that_are_not_there(my_env, tmp_path):
     )
 
 
+def test_a_vectorised_environment_is_named_as_one(my_env, write_module):
+    write_module("many.py", "import gymnasium\n\ndef make():\n    return gymnasium.make_vec('CartPole-v1', 2)\n")
+    with pytest.raises(TaskError, match=r"many.py:make: CartPoleVectorEnv is a vectorised environment\nGive a single"):
+        EnvSpec("many.py:make").make()
+
+
 def test_gymnasium_ids(write_module, monkeypatch):
     assert error(UsageError, "Pendulun-v1") == (
         "Gymnasium has no environment 'Pendulun-v1'. Did you mean 'Pendulum-v1'?"

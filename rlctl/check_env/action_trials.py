@@ -121,6 +121,8 @@ class Trials:
         frames = [to_frame(moment) for moment in episode]
         if episode.ended == "time":
             raise OutOfTime
+        if episode.ended == "raised":
+            raise NotJudged("step returns no observation, reward and flags (RL201)")
         return frames
 
     def copies(self, dimension: Dimension, seed: int, steps: int, longest_delay: int) -> list[int]:

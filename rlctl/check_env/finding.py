@@ -179,6 +179,6 @@ def _codes(texts: Sequence[str], option: str) -> list[str]:
     codes = [code.strip().upper() for text in texts for code in text.split(",") if code.strip()]
     for code in codes:
         if not any(rule.startswith(code) for rule in RULES):
-            closest = did_you_mean(code, [*FAMILIES, *RULES])
+            closest = did_you_mean(code, RULES) or did_you_mean(code, FAMILIES)
             raise UsageError(f"{option} {code}: no such rule.{closest} rlctl check-env --list shows all.")
     return codes

@@ -180,11 +180,11 @@ def is_task(env: Any) -> bool:
     return task_env is not None and isinstance(getattr(env, "unwrapped", env), task_env.TaskEnv)
 
 
-def find_time_limit(env: Any) -> int | None:
+def find_longest_episode(env: Any) -> int | None:
     """Return after how many steps an environment says that its episodes end; None where it does not."""
-    if is_task(env):
-        return int(env.unwrapped.max_steps)
-    return getattr(getattr(env, "spec", None), "max_episode_steps", None)
+    from rlctl.time_limit import find_time_limit
+
+    return int(env.unwrapped.max_steps) if is_task(env) else find_time_limit(env)
 
 
 def rebuilds_world(env: Any) -> bool:

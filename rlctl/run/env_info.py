@@ -60,6 +60,7 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
     """Describe an environment; for a task with its names, units and timing."""
     from rlctl.task.env import TaskEnv
     from rlctl.time_feature import find_time_feature
+    from rlctl.time_limit import find_time_limit
 
     inner = env.unwrapped
     common: dict[str, Any] = {
@@ -83,7 +84,7 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
             robot=task.robot,
             joints=task.describe_joints(),
         )
-    return EnvInfo(**common, max_steps=env.spec.max_episode_steps if env.spec else None)
+    return EnvInfo(**common, max_steps=find_time_limit(env))
 
 
 def describe_randomization(events: Mapping[str, bool]) -> str:

@@ -107,7 +107,10 @@ def _find_difference(
 
     seen = network_space(observation)
     if _describe_shape(seen) != _describe_shape(model.observation_space):
-        return f"it observes {_describe_shape(model.observation_space)}, {task} gives {_describe_shape(seen)}"
+        ours, theirs = _flat_part(seen), _flat_part(model.observation_space)
+        is_stack = ours is not None and theirs is not None and theirs.shape[0] % ours.shape[0] == 0
+        hint = ". Stacks of VecFrameStack, which begin with zeros, are not imported" if is_stack else ""
+        return f"it observes {_describe_shape(model.observation_space)}, {task} gives {_describe_shape(seen)}{hint}"
     same = _describe_shape(action) == _describe_shape(model.action_space)
     if same and isinstance(action, spaces.Box) and isinstance(model.action_space, spaces.Box):
         same = np.allclose(action.low, model.action_space.low) and np.allclose(action.high, model.action_space.high)

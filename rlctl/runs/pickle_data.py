@@ -122,11 +122,11 @@ def read(content: bytes) -> Any:
             if opcode.name == "STOP":
                 return machine.stack.pop()
             machine.run(opcode.name, argument)
-    except (IndexError, KeyError, TypeError, AttributeError, ValueError) as error:
-        if isinstance(error, NotPlainData):
-            raise
-        raise NotPlainData(f"damaged: {error}") from None
-    raise NotPlainData("damaged: it has no end")
+    except NotPlainData:
+        raise
+    except (IndexError, KeyError, TypeError, AttributeError, ValueError):
+        raise NotPlainData("it is no pickle, or damaged") from None
+    raise NotPlainData("its pickle has no end")
 
 
 class _Machine:

@@ -181,7 +181,8 @@ def read_space(value: Any) -> spaces.Space[Any]:
 def _split_object(value: Any, *modules: str) -> tuple[str, dict[str, Any]]:
     """Return the class name and the attributes of an object of certain modules."""
     if not isinstance(value, Call) or not str(value.function).startswith(modules) or not isinstance(value.state, dict):
-        raise NotPlainData(f"{getattr(value, 'function', value)} where an object of {modules[-1]} is expected")
+        given, module = getattr(value, "function", value), modules[-1].rstrip(".")
+        raise NotPlainData(f"{given} where an object of {module} is expected")
     return value.function.qualname, value.state
 
 

@@ -78,6 +78,7 @@ def _convert(value: Any) -> Any:
 
 def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     from rlctl.task.env import TaskEnv
+    from rlctl.time_limit import find_time_limit
 
     built = env.unwrapped
     task_env = built if isinstance(built, TaskEnv) else None
@@ -86,7 +87,6 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
     distribution, version = _find_origin(task, target)
     # Gymnasium's constructor of an id takes anything; the class behind it does not.
     called = cls if task_env or hasattr(constructor, "gymnasium_id") else constructor
-    steps = env.spec.max_episode_steps if env.spec else None
     return {
         "task": task,
         "target": target,
@@ -99,7 +99,7 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
         "action_space": _format_space(env.action_space),
         "actions": _list_quantities(env.action_space),
         "parameters": [] if task_env and not dataclasses.is_dataclass(cls) else _list_parameters(called),
-        "max_steps": task_env.max_steps if task_env else steps,
+        "max_steps": task_env.max_steps if task_env else find_time_limit(env),
         "definition": _describe_definition(task_env) if task_env else None,
     }
 

@@ -24,6 +24,12 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
+def test_actions_are_not_judged_where_step_returns_nothing_to_read():
+    verdict = verdict_of("broken_actions.py:ReturnsNothing", "RL701")
+    assert verdict.findings == []
+    assert "(RL201)" in verdict.not_judged["RL701"]
+
+
 @pytest.mark.parametrize("task", CLEAN)
 def test_clean_is_clean(task):
     assert found(task, *rules_of("RL7")) == set()

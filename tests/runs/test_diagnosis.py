@@ -212,6 +212,13 @@ def test_training_that_ends_before_the_last_stage_is_found(write_training):
     assert f"rlctl train --resume {run.path} -n STEPS" in finding.advice[0]
 
 
+def test_a_policy_that_succeeds_only_while_it_explores_is_found(write_training):
+    run = write_training({"success": np.tile([0.0, 0.4], 15)}, {"success": 0.0, "return": -0.5}, {"algo": "dqn"})
+    (finding,) = diagnose(run)
+    assert (finding.name, finding.grade) == ("succeeds only while it explores", Grade.WARNING)
+    assert finding.evidence == ["success at most 0.0% in 5 evaluations, 40% while training"]
+
+
 @pytest.mark.parametrize(("stage", "status"), [(2, "finished"), (1, "running"), (1, "interrupted")])
 def test_stage_of_a_training_that_goes_on_is_no_finding(write_training, stage, status):
     stages = [{"promote": {"success": 0.8}}, {}]

@@ -9,11 +9,13 @@ import sys
 import zipfile
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from rlctl.env_spec import EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError
@@ -184,6 +186,13 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path):
         archive.filelist[0].file_size = 600_000_000  # written into the archive's table when it is closed
     with pytest.raises(ArtifactError, match="600,000,000 bytes"):
         read_model(tmp_path / "bomb.zip")
+
+
+def test_a_stack_of_frames_is_named_as_such(tmp_path):
+    env = VecFrameStack(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]), 3)
+    PPO("MlpPolicy", env, device="cpu").save(tmp_path / "model.zip")
+    with pytest.raises(ArtifactError, match=r"Box\(9,\), Pendulum-v1 gives Box\(3,\). Stacks of VecFrameStack"):
+        import_model(tmp_path / "model.zip", "Pendulum-v1")
 
 
 def test_other_spaces_are_refused(save):

@@ -93,10 +93,11 @@ def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) ->
         message = f"{what}: {how}, no observation, reward or end changes{left_out}"
         yield _finding(dead, message, Severity.ERROR if len(dead) == total else Severity.WARNING)
     if costly:
-        names = list_names(costly, MOST_NAMES)
-        message = f"{names} changes nothing but its own step's reward, a cost for doing nothing{left_out}"
         # If no action moves anything, it is a bandit, or a series that is only watched.
-        yield _finding(costly, message, Severity.WARNING if "lasting" in effects.values() else Severity.INFO)
+        others_last = "lasting" in effects.values()
+        what = f"its own step's reward{', a cost for doing nothing' if others_last else ''}"
+        message = f"{list_names(costly, MOST_NAMES)} changes nothing but {what}{left_out}"
+        yield _finding(costly, message, Severity.WARNING if others_last else Severity.INFO)
     if copied:
         message = f"{list_names(copied, MOST_NAMES)} changes nothing but its own copy in the observation{left_out}"
         yield _finding(copied, message, Severity.INFO)

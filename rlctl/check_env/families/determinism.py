@@ -63,7 +63,7 @@ def compare(records: Records, first: str, second: str) -> tuple[Trajectory, Diff
         raise NotJudged("reset takes no seed (RL202)")
     a, b = records.require_role(first), records.require_role(second)
     if "raised" in (a.ended, b.ended):
-        raise NotJudged("the episode raised (RL207)")
+        raise NotJudged("the episode broke off (RL201, RL207)")
     if not any(series.values.size for series in a.observations.values()):
         raise NotJudged("no observation could be compared")
     return a, find_difference(built, a, b)

@@ -165,7 +165,7 @@ def _find_unreported_success(records: Records) -> Iterator[Finding]:
 def _find_success_at_start(records: Records) -> Iterator[Finding]:
     starts = [each for each in records.role("starts") if each.steps]
     if len(starts) < FEWEST_STARTS:
-        raise NotJudged(records.why_missing("starts"))
+        raise NotJudged("no step could be taken" if records.role("starts") else records.why_missing("starts"))
     reported = [(each, each.infos[SUCCESS]) for each in starts if SUCCESS in each.infos]
     if not reported:
         raise NotApplicable("is_success is not reported at the first step")

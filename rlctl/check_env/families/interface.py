@@ -20,6 +20,7 @@ from rlctl.check_env.finding import RECORDING, Finding, NotApplicable, NotJudged
 from rlctl.check_env.instance import Context
 from rlctl.check_env.messages import FIRST_SEED, Failure, Form, Message, Trajectory
 from rlctl.check_env.records import Records
+from rlctl.errors import RecipeError
 
 NUMBERS = ("float", "int", "numpy.float64")
 """Reward types that both libraries accept."""
@@ -154,6 +155,8 @@ def render(context: Context) -> Iterator[Message]:
             raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
         call = "the constructor" if error.call == "build" else error.call
         message = f"with render_mode='rgb_array' {call} raises {describe(cause)}"
+        if isinstance(cause, RecipeError):  # the constructor was not even called
+            message = f"metadata promises the render mode rgb_array, but {cause}"
         severity = Severity.INFO if NO_GRAPHICS.search(describe(cause)) else None
         yield Finding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity)
         return

@@ -16,7 +16,7 @@ from rlctl import registry
 from rlctl.check_env.bullet_worlds import find_clients
 from rlctl.check_env.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
 from rlctl.check_env.finding import RECORDING, Finding, check, experiment
-from rlctl.check_env.instance import Context, Instance, find_author, find_time_limit, is_task
+from rlctl.check_env.instance import Context, Instance, find_author, find_longest_episode, is_task
 from rlctl.check_env.messages import Built, Message
 from rlctl.check_env.records import Records
 from rlctl.dict_spaces import format_space
@@ -157,7 +157,7 @@ def describe_built(instance: Instance) -> Built:
         action_space=format_space(env.action_space),
         names=dict(inner.observation_sizes) if is_task(env) else {},
         events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
-        max_steps=find_time_limit(env),
+        max_steps=find_longest_episode(env),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         truncation=_read_truncation(inner),
         accepts_seed=instance.accepts_seed,

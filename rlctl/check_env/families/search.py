@@ -26,7 +26,7 @@ from rlctl.check_env.families.rewards import (
     reports_success,
 )
 from rlctl.check_env.finding import Finding, NotJudged, experiment
-from rlctl.check_env.instance import Context, find_time_limit
+from rlctl.check_env.instance import Context, find_longest_episode
 from rlctl.check_env.messages import FIRST_SEED, Message, Skipped, Trajectory
 from rlctl.check_env.recording import Recording
 
@@ -147,7 +147,8 @@ class _Search:
                 two = self.attempts[-1].played
                 is_same = np.array_equal(one.rewards[:at], two.rewards[:at]) and two.ended != "raised"
                 if is_same and two.steps > one.steps and not _finishes(two, is_reported):
-                    longest = find_time_limit(self.instance.env) or max(each.played.steps for each in self.attempts)
+                    limit = find_longest_episode(self.instance.env)
+                    longest = limit or max(each.played.steps for each in self.attempts)
                     stops.append(compare_returns(one, two, at, longest))
         if not is_reported:
             stops = [each for each in stops if each.finishing > 0]  # an end that costs more than it pays is no goal

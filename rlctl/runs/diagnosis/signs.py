@@ -13,6 +13,7 @@ Sign = Callable[[History], str | None]
 _LEAST_RETURNS = 6
 _LEAST_EVALUATIONS = 4
 _NEVER = 0.02  # success rate
+_BY_CHANCE = 0.1  # success rate
 
 
 def flat(run: History) -> str | None:
@@ -65,6 +66,17 @@ def never_succeeds(run: History) -> str | None:
     if not found or run.progress < 0.5 or (best := max(float(each.values.max()) for each in found)) > _NEVER:
         return None
     return f"success at most {best:.1%}"
+
+
+def succeeds_by_exploring(run: History) -> str | None:
+    """Training episodes succeed, by what exploration adds, and not one evaluation does, to the end."""
+    evaluated, trained = run.successes
+    if run.progress < 1 or len(evaluated) < _LEAST_EVALUATIONS or not len(trained):
+        return None
+    best = float(trained.values.max())
+    if evaluated.values.max() > _NEVER or best < _BY_CHANCE:
+        return None
+    return f"success at most {evaluated.values.max():.1%} in {len(evaluated)} evaluations, {best:.0%} while training"
 
 
 def short_episodes(run: History) -> str | None:
