@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
-import itertools
 import json
-import os
 import shlex
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import FrameType
 
 from rlctl import output, registry
-from rlctl.errors import Interrupted, RlctlError, UsageError
+from rlctl.errors import RlctlError, UsageError
 from rlctl.eval.evaluate import EvalRequest
 from rlctl.eval.group import GroupScore, as_json, evaluate_group
-from rlctl.rollout.child_process import LineReader, start_process
 from rlctl.rollout.workers import available_cores
 from rlctl.run import files
 from rlctl.run.group import Group, create_group, parse_seeds, read_group
 from rlctl.run.recipe_sources import resolve
 from rlctl.train.request import TrainRequest
-from rlctl.train.signals import HandledSignals
 from rlctl.train.start import check_arguments, preserve_process_state
+from rlctl.train.trainings import CORES_PER_TRAINING, Trainings, choose_jobs
 from rlctl.train.warm_start import find_source
-
-CORES_PER_TRAINING = 2
-"""One plays while the other learns, in turn or side by side."""
 
 
 class SeedsFailed(RlctlError):
@@ -78,7 +68,13 @@ def train_seeds(
         group, options = read_group(Path(str(request.resume))), list_options(request)
     waiting = [seed for seed in group.seeds if not group.is_done(seed) or options]
     jobs = _choose_jobs(group, len(waiting), jobs)
-    failed = _Trainings(jobs).run({seed: _make_command(group, seed, options) for seed in waiting}, group.path)
+    trainings = Trainings(jobs)
+    calls = [
+        functools.partial(trainings.train, _make_command(group, seed, options), functools.partial(_print_line, seed))
+        for seed in waiting
+    ]
+    codes = trainings.run(calls, f"rlctl train --resume {shlex.quote(str(group.path))}")
+    failed = {seed: code for seed, code in zip(waiting, codes, strict=True) if code}
     score = evaluate_group(group, EvalRequest(None, episodes=episodes))
     files.write_json(group.scores_file, as_json(score))
     return SeedsResult(score, failed)
@@ -117,8 +113,7 @@ def list_options(request: TrainRequest) -> list[str]:
 
 
 def _choose_jobs(group: Group, waiting: int, jobs: int | None) -> int:
-    cores = available_cores()
-    chosen = min(jobs or max(1, cores // CORES_PER_TRAINING), max(waiting, 1))
+    cores, chosen = available_cores(), choose_jobs(jobs, waiting)
     done = len(group.seeds) - waiting
     note = f"{group.path}: {output.format_count(len(group.seeds), 'seed')}"
     if waiting:
@@ -137,62 +132,6 @@ def _make_command(group: Group, seed: int, options: Sequence[str]) -> list[str]:
     if run is not None:
         return ["train", "--resume", str(run.path), *options]
     return ["train", group.task, "--seed", str(seed), "--output", str(group.path), *group.options, *options]
-
-
-class _Trainings:
-    """Processes that train a seed each, some of them at a time, and each of these with its share of the cores."""
-
-    def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
-        self._places = itertools.count()
-        self._running: set[int] = set()  # by process id
-        self._stopped_by: int | None = None
-
-    def run(self, commands: Mapping[int, list[str]], group: Path) -> dict[int, int]:
-        """Train all; return the exit code of each seed that failed. Raises `Interrupted` after a signal."""
-        with HandledSignals(self._pass_on), ThreadPoolExecutor(self._jobs, initializer=self._take_cores) as pool:
-            codes = list(pool.map(self._train, commands, commands.values()))
-        if self._stopped_by is not None:
-            raise Interrupted(
-                f"interrupted; go on with: rlctl train --resume {shlex.quote(str(group))}", self._stopped_by
-            )
-        return {seed: code for seed, code in zip(commands, codes, strict=True) if code}
-
-    def _take_cores(self) -> None:
-        """Let what this thread starts use its share of the cores, from which it also takes its number of workers."""
-        place = next(self._places)
-        if self._jobs > 1 and hasattr(os, "sched_setaffinity"):
-            cores = sorted(os.sched_getaffinity(0))
-            share = max(1, len(cores) // self._jobs)
-            first = place * share % len(cores)
-            os.sched_setaffinity(0, cores[first : first + share])
-
-    def _train(self, seed: int, arguments: Sequence[str]) -> int:
-        """Train a seed; return its exit code."""
-        if self._stopped_by is not None:
-            return 0
-        reader = LineReader(functools.partial(_print_line, seed))
-        process = start_process(
-            [sys.executable, "-m", "rlctl", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=reader.descriptor,
-            process_group=0,  # which a terminal's Ctrl-C does not reach: signals are passed on, once each
-        )
-        self._running.add(process.pid)
-        reader.close_descriptor()
-        if self._stopped_by is not None:  # meanwhile
-            os.kill(process.pid, self._stopped_by)
-        code = process.wait()
-        self._running.discard(process.pid)
-        reader.wait()
-        return code if code >= 0 else 128 - code
-
-    def _pass_on(self, number: int, frame: FrameType | None) -> None:
-        self._stopped_by = self._stopped_by or number
-        for process in list(self._running):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process, number)
 
 
 def _print_line(seed: int, line: str) -> None:
