@@ -14,6 +14,7 @@ LAYERS = [
     {"__main__"},
     {"cli"},
     {"error_boundary", "completion", "python_api"},
+    {"tune"},
     {"train"},
     {"export", "replay", "tasks", "runs"},
     {"check_env", "eval"},

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from rlctl import __version__, error_boundary
-from rlctl.cli import check_env, eval, export, identify, replay, runs, serve, tasks, train
+from rlctl.cli import check_env, eval, export, identify, replay, runs, serve, tasks, train, tune
 from rlctl.errors import RlctlError
 
 
@@ -33,6 +33,7 @@ def _root(
 COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "check-env": check_env.check_env,
     "train": train.train,
+    "tune": tune.tune,
     "eval": eval.evaluate,
     "export": export.export,
     "replay": replay.replay,

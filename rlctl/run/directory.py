@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 ROOT = Path("runs")
 GROUP_FILE = "group.json"
 """In the folder of a group, which holds runs of several seeds."""
+TUNE_FILE = "tune.json"
+"""In the folder of a tuning, which holds the runs of its trials."""
 _DIGITS = 18  # of a training step
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 
@@ -231,8 +233,8 @@ def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
 
 
 def is_group(path: Path) -> bool:
-    """Say whether a folder is that of a group of runs."""
-    return (path / GROUP_FILE).is_file()
+    """Say whether a folder holds runs that belong together: of several seeds, or of a tuning."""
+    return (path / GROUP_FILE).is_file() or (path / TUNE_FILE).is_file()
 
 
 def _point_latest_to(root: Path, run: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from rlctl import registry
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files
-from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, is_group
+from rlctl.run.directory import GROUP_FILE, ROOT, TUNE_FILE, RunDirectory, is_group
 from rlctl.run.lookup import find_run
 
 _MOST_SEEDS = 1000
@@ -35,9 +35,7 @@ class Group:
 
     def find_run(self, seed: int) -> RunDirectory | None:
         """Return the newest run of a seed; None if it has not begun."""
-        pattern = re.compile(rf"_s{seed}(_\d+)?$")
-        found = [file.parent for file in self.path.glob("*/run.json") if pattern.search(file.parent.name)]
-        return RunDirectory(max(found, key=lambda each: each.name)) if found else None
+        return find_run_of_seed(self.path, seed)
 
     def is_done(self, seed: int) -> bool:
         """Say whether a seed's training has finished; False for a run that cannot be read."""
@@ -46,6 +44,13 @@ class Group:
             return run is not None and run.status().get("status") == "finished"
         except ArtifactError:
             return False
+
+
+def find_run_of_seed(folder: Path, seed: int) -> RunDirectory | None:
+    """Return the newest run of a seed in the folder of a group; None if it has not begun."""
+    pattern = re.compile(rf"_s{seed}(_\d+)?$")
+    found = [file.parent for file in folder.glob("*/run.json") if pattern.search(file.parent.name)]
+    return RunDirectory(max(found, key=lambda each: each.name)) if found else None
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -91,6 +96,11 @@ def find_group(text: str, root: Path = ROOT) -> Path | None:
 
 def read_group(path: Path) -> Group:
     """Read a group; raises `ArtifactError` for a folder that is not one, or damaged."""
+    if (path / TUNE_FILE).is_file():
+        raise UsageError(
+            f"{path}: the trials of rlctl tune, not seeds of one recipe; name one of its runs "
+            f"(to go on with it: rlctl tune --resume {path})"
+        )
     if not is_group(path):
         raise ArtifactError(f"{path}: not a group of runs: it has no {GROUP_FILE}")
     content: Any = files.read_json(path / GROUP_FILE)

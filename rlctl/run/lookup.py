@@ -148,7 +148,7 @@ def _describe_choice(
     age = format_duration(max(time.time() - file.stat().st_mtime, 0.0))
     notes = [f"run {run.path}: policy of step {info.training_steps:,}, saved {age} ago"]
     if is_group(run.path.parent):
-        notes.append(f"it is one of a group of seeds: {run.path.parent}")
+        notes.append(f"it is one of a group: {run.path.parent}")
     if passed_over:
         notes.append(f"passed over, without such a policy: {', '.join(str(each.path) for each in passed_over)}")
     if (better := _find_better(info, older)) is not None:
