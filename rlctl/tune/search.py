@@ -17,7 +17,7 @@ from rlctl.train.request import TrainRequest
 from rlctl.train.seeds import list_options
 from rlctl.train.trainings import Trainings
 from rlctl.tune.space import get_value, nest
-from rlctl.tune.tuning import Trial, Tuning
+from rlctl.tune.tuning import Trial, Tuning, find_best
 
 _RANDOM_SHARE = 3  # a third of a step's trials are random, so that there is something to learn from
 _EVALUATIONS_UNJUDGED = 2
@@ -35,8 +35,9 @@ class StepSearch:
         self._tuning, self._number, self._trainings = tuning, number, trainings
         self._dimensions = tuning.steps[number - 1]
         self._distributions = {each.key: each.make_distribution() for each in self._dimensions}
-        earlier = [each for each in tuning.trials if each.step < number]
-        self._recipe, self._kept = recipe, _find_best(earlier).values
+        best = find_best([each for each in tuning.trials if each.step < number])
+        assert best is not None  # the recipe as it is
+        self._recipe, self._kept = recipe, best.values
         self._study = optuna.create_study(
             direction="maximize",
             sampler=optuna.samplers.TPESampler(
@@ -46,7 +47,7 @@ class StepSearch:
         )
         self._lock = threading.Lock()
         # What the best so far has of these dimensions is known already.
-        self._add(_find_best(earlier))
+        self._add(best)
         self._begun: list[Trial] = []
         for trial in (each for each in tuning.trials if each.step == number):
             if trial.state == "begun":
@@ -155,7 +156,7 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
     if code == 0 and finished:
         trial.score = tuning.measure(trial)
         trial.state = "done" if trial.score is not None else "failed"
-        trial.problem = "" if trial.score is not None else f"no evaluation has a {tuning.metric}"
+        trial.problem = "" if trial.score is not None else f"no evaluation has a {tuning.metric}: is it reported?"
     elif trainings.stopped_by is not None:
         return
     elif pruning is not None and pruning.decided:
@@ -178,9 +179,3 @@ def _make_arguments(tuning: Tuning, trial: Trial) -> list[str]:
     request = TrainRequest(tuning.task, config=config, settings=settings, check=trial.number == 0)
     seed = tuning.seed + trial.number
     return ["train", tuning.task, *list_options(request), f"--seed={seed}", "--output", str(tuning.path)]
-
-
-def _find_best(trials: list[Trial]) -> Trial:
-    """Return the best of trials among which the recipe as it is was trained to the end."""
-    done = [each for each in trials if each.state == "done"]
-    return max(done, key=lambda each: each.score if each.score is not None else -math.inf)

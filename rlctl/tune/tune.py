@@ -131,7 +131,7 @@ def _search(tuning: Tuning, jobs: int | None) -> Tuning:
         trainings.run([lambda: train(tuning, first, trainings)], to_go_on)
         tuning.save()
         if first.state == "failed":
-            raise TaskError(f"{tuning.path}: the recipe as it is cannot be trained: {first.problem}")
+            raise TaskError(f"{tuning.path}: the recipe as it is failed: {first.problem}")
     content = recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
     for number in range(1, len(tuning.steps) + 1):
         trainings = Trainings(choose_jobs(jobs, tuning.trials_per_step))

@@ -65,8 +65,7 @@ class Tuning:
     @property
     def best(self) -> Trial | None:
         """Return the trial with the highest score among those that were trained to the end."""
-        done = [each for each in self.trials if each.state == "done" and each.score is not None]
-        return max(done, key=lambda each: each.score or 0.0, default=None)
+        return find_best(self.trials)
 
     def find_run(self, trial: Trial) -> RunDirectory | None:
         """Return the run of a trial; None before it began."""
@@ -97,6 +96,12 @@ class Tuning:
         kept = {key: value for key, value in self.settings.items() if key not in ("seed", "total_timesteps", "eval")}
         config = read(find_config(Path(self.config))) if self.config is not None else {}
         return merge(merge(config, kept), nest(values))
+
+
+def find_best(trials: list[Trial]) -> Trial | None:
+    """Return the trial with the highest score among those that were trained to the end."""
+    done = [(each.score, -each.number, each) for each in trials if each.state == "done" and each.score is not None]
+    return max(done)[2] if done else None
 
 
 def create(root: Path, tuning: Tuning) -> Tuning:

@@ -153,7 +153,7 @@ def test_a_trial_that_fails_stops_no_other(played, tmp_path, rlctl):
 
 def test_a_recipe_that_cannot_be_trained_is_not_tuned(played, tmp_path):
     played.fails = lambda settings: True
-    with pytest.raises(TaskError, match="the recipe as it is cannot be trained: it diverged"):
+    with pytest.raises(TaskError, match="the recipe as it is failed: it diverged"):
         begin(tmp_path, RATES)
     assert len(played.calls) == 1
 
