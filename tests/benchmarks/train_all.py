@@ -1,7 +1,8 @@
 """Trains every bundled task with several seeds, and writes the score tables of the plugins' READMEs: `make train-all`.
 
-What is trained already stays, what was stopped goes on. The numbers come from the runs: means over seeds of the best
-policies' scores, over 100 episodes that their training has not seen, and the spread over seeds.
+What is trained already stays, what was stopped goes on; a task whose runs are not here keeps its row. The numbers come
+from the runs: means over seeds of the best policies' scores, over 100 episodes that their training has not seen, and the
+spread over seeds.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import re
 import statistics
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -109,15 +110,23 @@ def _list(values: list[float], form: str, unit: str = "", *, spread: bool = Fals
     return text
 
 
-def format_table(scores: Sequence[dict[str, Any]]) -> str:
-    """Return the table of some tasks, with what its numbers are."""
+def format_table(scores: Sequence[dict[str, Any]], rows: Mapping[str, str] | None = None) -> str:
+    """Return the table of some tasks, with what its numbers are; `rows` are those of tasks whose runs are not here."""
+    rows = {**(rows or {}), **{each["task"]: format_row(each) for each in scores}}
     first = next((each["score"] for one in scores for each in one["seeds"] if each["score"] is not None), None)
     note = (
         "Values of the training seeds in their order, one where all are alike; ± is the standard deviation between them"
     )
     if first is not None:
         note += f"; {first['episodes']} episodes each, which no training has seen"
-    return HEAD + "".join(map(format_row, scores)) + f"\n{note}.\n"
+    return HEAD + "".join(rows[task] for task in sorted(rows)) + f"\n{note}.\n"
+
+
+def read_rows(readme: Path) -> dict[str, str]:
+    """Return the rows of a README's table, by task."""
+    _, _, rest = readme.read_text().partition(BEGIN)
+    table, _, _ = rest.partition(END)
+    return {match[1]: match[0] for match in re.finditer(r"^\| `([\w-]+)` \|.*\n", table, re.MULTILINE)}
 
 
 def write_table(readme: Path, table: str) -> None:
@@ -150,7 +159,7 @@ def main() -> int:
         if group is not None and entry is not None and entry.module_file is not None:
             by_readme.setdefault(entry.module_file.with_name("README.md"), []).append(read_scores(group))
     for readme, scores in by_readme.items():
-        write_table(readme, format_table(scores))
+        write_table(readme, format_table(scores, read_rows(readme)))
     return worst
 
 

@@ -12,6 +12,7 @@ from tests.benchmarks.train_all import (
     format_row,
     format_table,
     list_tasks,
+    read_rows,
     write_table,
 )
 
@@ -51,6 +52,12 @@ def test_the_table_takes_its_place(tmp_path):
     write_table(readme, table)
     text = readme.read_text()
     assert text == f"# Walking\n\nText.\n\n## Scores\n\n{BEGIN}\n{table}\n{END}"
+    # Another task's runs are elsewhere now: its row stays.
+    write_table(readme, format_table([{"task": "run", "seeds": [seed(3, 0.5, 4.0)]}], read_rows(readme)))
+    rows = read_rows(readme)
+    assert list(rows) == ["run", "walk"]
+    assert rows["walk"] in table
+    assert rows["run"].startswith("| `run` | ppo | 3 |")
 
 
 def test_nothing_is_trained_yet(tmp_path):
