@@ -1,8 +1,8 @@
 """Trains every bundled task with several seeds, and writes the score tables of the plugins' READMEs: `make train-all`.
 
 What is trained already stays, what was stopped goes on; a task whose runs are not here keeps its row. The numbers come
-from the runs: means over seeds of the best policies' scores, over 100 episodes that their training has not seen, and the
-spread over seeds.
+from the runs: means over seeds of the best policies' scores, over 100 episodes that their training has not seen, and
+the spread over seeds.
 """
 
 from __future__ import annotations
