@@ -11,8 +11,8 @@ from typing import Any
 from rlctl import registry
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files
-from rlctl.run.directory import GROUP_FILE, ROOT, TUNE_FILE, RunDirectory, is_group
-from rlctl.run.lookup import find_run
+from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, is_group
+from rlctl.run.lookup import find_run, refuse_tuning
 
 _MOST_SEEDS = 1000
 _RANGE = re.compile(r"(\d{1,9})-(\d{1,9})")
@@ -96,11 +96,7 @@ def find_group(text: str, root: Path = ROOT) -> Path | None:
 
 def read_group(path: Path) -> Group:
     """Read a group; raises `ArtifactError` for a folder that is not one, or damaged."""
-    if (path / TUNE_FILE).is_file():
-        raise UsageError(
-            f"{path}: the trials of rlctl tune, not seeds of one recipe; name one of its runs "
-            f"(to go on with it: rlctl tune --resume {path})"
-        )
+    refuse_tuning(path)
     if not is_group(path):
         raise ArtifactError(f"{path}: not a group of runs: it has no {GROUP_FILE}")
     content: Any = files.read_json(path / GROUP_FILE)

@@ -15,7 +15,7 @@ from rlctl import registry
 from rlctl.env_spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 from rlctl.output import format_duration
-from rlctl.run.directory import ROOT, RunDirectory, is_group
+from rlctl.run.directory import ROOT, TUNE_FILE, RunDirectory, is_group
 from rlctl.run.policy import PolicyInfo, read_info
 from rlctl.run.shipped import PRETRAINED, find_shipped_policy
 from rlctl.run.task_version import describe_task_changes
@@ -51,6 +51,7 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
         return RunDirectory(Path(text))
     if Path(text).name == "latest" and Path(text).is_symlink():  # to a run that was removed
         return find_run("latest", Path(text).parent)
+    refuse_tuning(Path(text))
     if is_group(Path(text)):
         raise UsageError(f"{text}: a group of runs; name one of them: {text.rstrip('/')}/..._s0")
     if found := _list_newest_first(root / registry.make_slug(text), *_IN_TASK):
@@ -62,12 +63,23 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
             f"{text}: a .zip, as Stable-Baselines3 saves models, not a run; make a policy of it: "
             f"rlctl runs import {text} --task TASK"
         )
+    if tunings := sorted((root / registry.make_slug(text)).glob(f"*/{TUNE_FILE}")):
+        raise ArtifactError(f"no run of {text!r} but the trials of rlctl tune; name one in {tunings[-1].parent}")
     names = [each.name for each in root.iterdir() if each.is_dir()] if root.is_dir() else []
     if entry := registry.find(text):
         shipped = "; for the policy that it ships: --pretrained" if entry.policy_file else ""
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
     hint = did_you_mean(text, names) or " All runs: rlctl runs"
     raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{hint}")
+
+
+def refuse_tuning(path: Path) -> None:
+    """Raise `UsageError` for the folder of a tuning, where a run or a group is expected."""
+    if (path / TUNE_FILE).is_file():
+        raise UsageError(
+            f"{path}: the trials of rlctl tune, not seeds of one recipe; name one of its runs "
+            f"(to go on with it, or see its table: rlctl tune --resume {path})"
+        )
 
 
 def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> FoundPolicy:

@@ -70,7 +70,10 @@ def explain(
     """Say what is wrong with the value at `path`, which is called `key`: what was expected, and the closest name."""
     if problem["type"] == "extra_forbidden":
         keys = list_keys(root, find_schema(root, path[:-1]))
-        return f"no key {key!r}{of}.{did_you_mean(str(path[-1]), keys)} Keys here: {', '.join(keys)}."
+        name, outer = path[-1], (find_schema(root, [*path[:-1], each]) for each in keys)
+        inner = [f"{each}.{name}" for each, node in zip(keys, outer, strict=True) if name in list_keys(root, node)]
+        hint = f" Did you mean {inner[0]!r}?" if inner else did_you_mean(str(name), keys)
+        return f"no key {key!r}{of}.{hint} Keys here: {', '.join(keys)}."
     label = f"{key}: " if key else ""
     if problem["type"] == "value_error":  # of a check of ours that needs more than a type
         return f"{label}{problem['ctx']['error']}"

@@ -73,7 +73,8 @@ def import_model(
     except (TypeError, ValueError, AssertionError) as error:
         raise ArtifactError(f"{file}: its policy_kwargs make no network for {task}: {error}") from None
     target = output or Path(f"{file.stem}.safetensors")
-    _write_checked(target, info, _collect_tensors(model, statistics))
+    read = f"{file} with {normalization}" if normalization else str(file)
+    _write_checked(target, read, info, _collect_tensors(model, statistics))
     return ImportedPolicy(target, info)
 
 
@@ -132,8 +133,8 @@ def _collect_tensors(model: SavedModel, normalization: SavedNormalization | None
     return tensors
 
 
-def _write_checked(output: Path, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
-    """Write the file beside its place, load it, and put it in place only if it acts."""
+def _write_checked(output: Path, read: str, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
+    """Write the file beside its place, load it, and put it in place only if it acts; errors name what was `read`."""
     from rlctl.run.torch_policy import TorchPolicy
 
     def write(part: Path) -> None:
@@ -142,7 +143,7 @@ def _write_checked(output: Path, info: PolicyInfo, tensors: dict[str, NDArray[An
             load_policy(part)
             TorchPolicy.load(part)  # which is stricter
         except ArtifactError as error:
-            raise ArtifactError(str(error).replace(str(part), str(output))) from None
+            raise ArtifactError(str(error).replace(str(part), read)) from None
 
     files.write_with(output, write)
 

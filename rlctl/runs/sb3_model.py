@@ -17,7 +17,7 @@ from gymnasium import spaces
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from rlctl.errors import ArtifactError
+from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.run import untrusted
 from rlctl.runs import pickle_data
 from rlctl.runs.pickle_data import Call, Name, NotPlainData, Persistent, read_array, read_dtype, read_plain
@@ -35,6 +35,7 @@ _POLICIES = {
     "sb3_contrib.common.recurrent": "recurrent_ppo",
 }
 """Module of the policy class -> algorithm; a model does not name its algorithm."""
+_SAME_POLICY = ({"ppo", "a2c"}, {"td3", "ddpg"})
 _ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu"}
 _EXTRACTORS = frozenset({"FlattenExtractor", "NatureCNN", "CombinedExtractor"})
 _TRAINING_ONLY = frozenset({"optimizer_class", "optimizer_kwargs"})
@@ -73,13 +74,16 @@ class SavedNormalization:
 def read_model(path: Path, algo: str | None = None) -> SavedModel:
     """Read a model.zip; raises `ArtifactError` for what is not one, is too large, or holds what is not read.
 
-    `algo` is for models whose algorithm does not follow from the file: A2C beside PPO, DDPG beside TD3.
+    `algo` is for models whose algorithm does not follow from the file: A2C beside PPO, DDPG beside TD3. Any other
+    than the file's raises `UsageError`.
     """
     with _explain_errors(path, "a model"), untrusted.open_file(path) as file, zipfile.ZipFile(file) as archive:
         data = json.loads(_read_member(archive, "data"))
         if not isinstance(data, dict):
             raise NotPlainData("its data is not a mapping")
         found = _find_algorithm(data)
+        if algo not in (None, found) and {algo, found} not in _SAME_POLICY:
+            raise UsageError(f"--algo {algo}: {path} is a model of {found}")
         return SavedModel(
             algo=algo or found,
             observation_space=read_space(_decode(data, "observation_space")),
@@ -182,7 +186,7 @@ def _split_object(value: Any, *modules: str) -> tuple[str, dict[str, Any]]:
     """Return the class name and the attributes of an object of certain modules."""
     if not isinstance(value, Call) or not str(value.function).startswith(modules) or not isinstance(value.state, dict):
         given, module = getattr(value, "function", value), modules[-1].rstrip(".")
-        raise NotPlainData(f"{given} where an object of {module} is expected")
+        raise NotPlainData(f"{short_repr(given)} where an object of {module} is expected")
     return value.function.qualname, value.state
 
 

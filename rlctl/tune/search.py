@@ -12,6 +12,7 @@ import optuna
 from optuna.trial import TrialState
 
 from rlctl.env_spec import merge
+from rlctl.errors import UsageError
 from rlctl.run import files
 from rlctl.train.request import TrainRequest
 from rlctl.train.seeds import list_options
@@ -139,18 +140,26 @@ class _Pruning:
 
 
 def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning | None = None) -> None:
-    """Train a trial, or go on with it, and write down how it ended; after a signal it is left as begun."""
+    """Train a trial, or go on with it, and write down how it ended; after a signal it is left as begun.
+
+    Without `pruning` raises `UsageError` as soon as an evaluation does not have the metric.
+    """
     lines: list[str] = []
+
+    def lacks_metric() -> bool:
+        return bool(tuning.list_scores(trial, "return")) and not tuning.list_scores(trial)
 
     def receive(line: str) -> None:
         lines.append(line)
-        if pruning is not None and pruning.decided and line.startswith("error: interrupted"):
-            line = "stopped: below the median of the other trials"
+        if trainings.stopped_by is None and line.startswith("error: interrupted"):
+            line = "stopped: below the median of the other trials" if pruning else f"stopped: no {tuning.metric}"
         print(f"trial {trial.number}: {line}", file=sys.stderr, flush=True)
 
     changes = [f"{key.rpartition('.')[2]}={value}" for key, value in trial.values.items()]
     print(f"trial {trial.number}: {', '.join(changes) or 'the recipe as it is'}", file=sys.stderr, flush=True)
-    code = trainings.train(_make_arguments(tuning, trial), receive, pruning.is_hopeless if pruning else None)
+    code = trainings.train(_make_arguments(tuning, trial), receive, pruning.is_hopeless if pruning else lacks_metric)
+    if pruning is None and lacks_metric():
+        raise UsageError(f"--metric {tuning.metric}: this task reports no success (no is_success); use --metric return")
     run = tuning.find_run(trial)
     finished = run is not None and run.status().get("status") == "finished"
     if code == 0 and finished:

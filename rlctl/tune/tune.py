@@ -145,6 +145,6 @@ def _describe(tuning: Tuning, recipe: Recipe, jobs: int | None) -> str:
     at_a_time = choose_jobs(jobs, tuning.trials_per_step)
     return (
         f"{tuning.path}: {names}; at most {output.format_count(tuning.trials_per_step, 'trial')} "
-        f"{'each' if len(tuning.steps) > 1 else ''} of {recipe.total_timesteps:,} steps, {at_a_time} at a time; "
+        f"{'each, ' if len(tuning.steps) > 1 else ''}of {recipe.total_timesteps:,} steps, {at_a_time} at a time; "
         "-n makes them shorter, --trials fewer, --jobs more at a time"
     )

@@ -176,6 +176,10 @@ def test_other_files_are_refused(save, tmp_path):
     (tmp_path / "half.pkl").write_bytes(request["normalization"].read_bytes()[:200])
     with pytest.raises(ArtifactError, match=r"half\.pkl"):
         read_normalization(tmp_path / "half.pkl")
+    (tmp_path / "observations.pkl").write_bytes(pickle.dumps([np.zeros(3)] * 1000))
+    with pytest.raises(ArtifactError, match=r"observations\.pkl") as caught:
+        read_normalization(tmp_path / "observations.pkl")
+    assert len(str(caught.value)) < len(str(tmp_path)) + 300  # not all that is in it
     with pytest.raises(UsageError, match=r"--output policy: the name of a policy file ends in \.safetensors"):
         import_model(tmp_path / "nothing.zip", "reach", output=Path("policy"))
 
@@ -204,6 +208,13 @@ def test_other_spaces_are_refused(save):
         import_model(request["file"], SMALL, changes=discrete)
     with pytest.raises(UsageError, match="--algo pppo"):
         import_model(request["file"], SMALL, algo="pppo")
+    with pytest.raises(UsageError, match=r"--algo sac: .*model\.zip is a model of ppo"):
+        import_model(request["file"], SMALL, algo="sac")
+    _, other, _ = save(observation="dict")
+    other.save(str(request["normalization"]))
+    PPO("MlpPolicy", "Pendulum-v1", device="cpu").save(request["file"])
+    with pytest.raises(ArtifactError, match=r"model\.zip with .*vecnormalize\.pkl: "):
+        import_model(request["file"], "Pendulum-v1", normalization=request["normalization"], output=request["output"])
 
 
 @pytest.mark.parametrize("protocol", range(6))

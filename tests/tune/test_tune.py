@@ -16,6 +16,7 @@ from rlctl.errors import ArtifactError, Interrupted, RecipeError, TaskError, Usa
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory
 from rlctl.run.group import read_group
+from rlctl.run.lookup import find_run
 from rlctl.runs.listing import list_runs
 from rlctl.runs.removal import plan_removal
 from rlctl.train.trainings import Trainings
@@ -32,6 +33,7 @@ class PlayedTrainings:
 
     def __init__(self, monkeypatch):
         self.calls, self.fails, self.interrupts_at, self.asked = [], lambda settings: False, None, []
+        self.success = "0.5"
         self.lock = threading.Lock()
         monkeypatch.setattr(Trainings, "train", lambda trainings, *arguments: self.train(trainings, *arguments))
 
@@ -62,7 +64,7 @@ class PlayedTrainings:
         score = -abs(kwargs.get("learning_rate", 3e-4) - BEST_RATE) - abs(kwargs.get("gamma", 0.9) - 0.98)
         rows = ["steps,success,return"]
         for step in range(1, 7):
-            rows.append(f"{step * 100},0.5,{score * (10 - step)}")
+            rows.append(f"{step * 100},{self.success},{score * (10 - step)}")
             run.evals_file.write_text("\n".join(rows) + "\n")
             if is_hopeless is not None and is_hopeless():
                 receive("error: interrupted at step 3; checkpoint saved")
@@ -158,6 +160,15 @@ def test_a_recipe_that_cannot_be_trained_is_not_tuned(played, tmp_path):
     assert len(played.calls) == 1
 
 
+def test_a_task_without_success_is_refused_at_its_first_evaluation(played, tmp_path, capsys):
+    played.success = ""
+    with pytest.raises(UsageError, match="--metric success: this task reports no success"):
+        begin(tmp_path, RATES, metric="success")
+    (evals,) = (tmp_path / "runs").rglob("evals.csv")
+    assert len(evals.read_text().splitlines()) == 2
+    assert "trial 0: stopped: no success\n" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("interrupted_at", [1, 3])
 def test_an_interrupted_tuning_goes_on(played, tmp_path, interrupted_at):
     played.interrupts_at = interrupted_at
@@ -189,6 +200,10 @@ def test_its_runs_are_runs(played, tmp_path):
     assert plan_removal([str(tuning.path)], root=root).paths == [tuning.path.resolve()]
     with pytest.raises(UsageError, match="the trials of rlctl tune, not seeds of one recipe"):
         read_group(tuning.path)
+    with pytest.raises(UsageError, match="see its table: rlctl tune --resume"):
+        find_run(str(tuning.path))
+    with pytest.raises(ArtifactError, match=f"but the trials of rlctl tune; name one in {tuning.path}"):
+        find_run(LINE, root)
 
 
 @pytest.mark.parametrize(
