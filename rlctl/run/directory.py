@@ -227,7 +227,8 @@ def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
             continue
         except OSError as error:
             raise ArtifactError(f"{folder}: cannot make a run folder: {error.strerror}") from None
-        _point_latest_to(root, folder / name)
+        if not (folder / TUNE_FILE).is_file():  # a trial is not what was trained last
+            _point_latest_to(root, folder / name)
         return RunDirectory(folder / name)
     raise ArtifactError(f"{folder}: cannot make a run folder")
 

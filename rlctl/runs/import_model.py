@@ -38,13 +38,17 @@ def import_model(
 ) -> ImportedPolicy:
     """Read a model, and a VecNormalize if it has one, and write it as a policy of a task, once it acts.
 
-    Raises `UsageError` for another ending of `output` than .safetensors, `ArtifactError` for a file that is not a
+    Raises `UsageError` for another ending of `output` than .safetensors, or where nothing was said and the model's name
+    is taken, `ArtifactError` for a file that is not a
     model, or one for other spaces than the task has.
     """
     from rlctl.run.torch_policy import ALGORITHMS, build_network, describe_network, policy_name
 
     if output is not None and output.suffix != ".safetensors":
         raise UsageError(f"--output {output}: the name of a policy file ends in .safetensors")
+    target = output or Path(f"{file.stem}.safetensors")
+    if output is None and target.exists():  # rl-zoo3 calls every model best_model.zip
+        raise UsageError(f"{target} is there already; give another name: --output FILE")
     if algo is not None and algo not in ALGORITHMS:
         raise UsageError(f"--algo {algo}: no such algorithm.{did_you_mean(algo, ALGORITHMS)}")
     model = read_model(file, algo)
@@ -72,7 +76,6 @@ def import_model(
         info = info.model_copy(update={"policy_kwargs": describe_network(build_network(info))})
     except (TypeError, ValueError, AssertionError) as error:
         raise ArtifactError(f"{file}: its policy_kwargs make no network for {task}: {error}") from None
-    target = output or Path(f"{file.stem}.safetensors")
     read = f"{file} with {normalization}" if normalization else str(file)
     _write_checked(target, read, info, _collect_tensors(model, statistics))
     return ImportedPolicy(target, info)

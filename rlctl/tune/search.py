@@ -22,6 +22,7 @@ from rlctl.tune.tuning import Trial, Tuning, find_best
 
 _RANDOM_SHARE = 3  # a third of a step's trials are random, so that there is something to learn from
 _EVALUATIONS_UNJUDGED = 2
+_TRIALS_UNJUDGED = 3
 _MOST_REPEATS = 50
 _STATES = {"done": TrialState.COMPLETE, "pruned": TrialState.PRUNED, "failed": TrialState.FAIL}
 
@@ -44,7 +45,7 @@ class StepSearch:
             sampler=optuna.samplers.TPESampler(
                 seed=tuning.seed + number, n_startup_trials=max(2, tuning.trials_per_step // _RANDOM_SHARE)
             ),
-            pruner=optuna.pruners.MedianPruner(n_startup_trials=3, n_warmup_steps=_EVALUATIONS_UNJUDGED),
+            pruner=optuna.pruners.MedianPruner(0, n_warmup_steps=_EVALUATIONS_UNJUDGED, n_min_trials=_TRIALS_UNJUDGED),
         )
         self._lock = threading.Lock()
         # What the best so far has of these dimensions is known already.
@@ -151,8 +152,9 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
 
     def receive(line: str) -> None:
         lines.append(line)
-        if trainings.stopped_by is None and line.startswith("error: interrupted"):
-            line = "stopped: below the median of the other trials" if pruning else f"stopped: no {tuning.metric}"
+        if line.startswith("error: interrupted"):
+            behind = "stopped: below the median of the other trials" if pruning else f"stopped: no {tuning.metric}"
+            line = behind if trainings.stopped_by is None else "interrupted"
         print(f"trial {trial.number}: {line}", file=sys.stderr, flush=True)
 
     changes = [f"{key.rpartition('.')[2]}={value}" for key, value in trial.values.items()]

@@ -8,6 +8,7 @@ that are below the median of the others at the same evaluation are stopped.
 from __future__ import annotations
 
 import dataclasses
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from rlctl import output, registry
 from rlctl.env_spec import merge
 from rlctl.errors import TaskError, UsageError
 from rlctl.run.directory import ROOT, RunLock
+from rlctl.run.hyperparameters import ON_POLICY
 from rlctl.run.recipe import Recipe
 from rlctl.run.recipe_sources import find_config, resolve
 from rlctl.train.start import preserve_process_state
@@ -122,7 +124,7 @@ def _search(tuning: Tuning, jobs: int | None) -> Tuning:
     constructor: Any = registry.load(tuning.task)
     stages = constructor.stages if registry.is_task(constructor) else ()
     recipe = resolve(tuning.task, config, tuning.settings, stages)
-    output.print_notes([_describe(tuning, recipe, jobs)])
+    output.print_notes([_describe(tuning, recipe, jobs), *_warn_of_long_rollouts(recipe)])
     if not tuning.trials:
         tuning.trials.append(Trial(0, 0, {}))
     first = tuning.trials[0]
@@ -138,6 +140,17 @@ def _search(tuning: Tuning, jobs: int | None) -> Tuning:
         step = StepSearch(tuning, number, content, trainings)
         trainings.run([step.run_next] * step.count_waiting(), to_go_on)
     return tuning
+
+
+def _warn_of_long_rollouts(recipe: Recipe) -> list[str]:
+    rollout = int(fill_parameters(recipe)["n_steps"]) * recipe.n_envs
+    if recipe.algo not in ON_POLICY or rollout * _FEWEST_EVALUATIONS <= recipe.total_timesteps:
+        return []
+    evaluations = output.format_count(math.ceil(recipe.total_timesteps / rollout), "evaluation")
+    return [
+        f"warning: a trial is judged by {evaluations}, which come between rollouts, of {rollout:,} steps here "
+        "(n_steps x n_envs); -n makes it longer"
+    ]
 
 
 def _describe(tuning: Tuning, recipe: Recipe, jobs: int | None) -> str:

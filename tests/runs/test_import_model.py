@@ -157,7 +157,7 @@ def test_a_call_that_is_not_on_the_list_is_refused_and_not_made(save, tmp_path):
     assert not proof.exists()
 
 
-def test_other_files_are_refused(save, tmp_path):
+def test_other_files_are_refused(save, tmp_path, monkeypatch):
     _, _, request = save()
     for name, content in {
         "text.zip": b"not an archive",
@@ -182,6 +182,10 @@ def test_other_files_are_refused(save, tmp_path):
     assert len(str(caught.value)) < len(str(tmp_path)) + 300  # not all that is in it
     with pytest.raises(UsageError, match=r"--output policy: the name of a policy file ends in \.safetensors"):
         import_model(tmp_path / "nothing.zip", "reach", output=Path("policy"))
+    monkeypatch.chdir(tmp_path)
+    Path("best_model.safetensors").write_bytes(b"of another")
+    with pytest.raises(UsageError, match=r"best_model\.safetensors is there already; give another name: --output FILE"):
+        import_model(Path("agents/best_model.zip"), "reach")
 
 
 def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path):

@@ -105,6 +105,16 @@ def test_the_best_of_all_trials_is_a_recipe(played, tmp_path, rlctl):
     assert shown.stdout.splitlines()[2].split()[0] == str(best.number)
 
 
+def test_too_few_evaluations_are_named(played, tmp_path, capsys):
+    begin(tmp_path, RATES, trials=1, settings={"algo_kwargs": {"n_steps": 32, "batch_size": 32}})
+    assert (
+        "warning: a trial is judged by 2 evaluations, which come between rollouts, of 64 steps"
+        in capsys.readouterr().err
+    )
+    begin(tmp_path / "longer", RATES, trials=1, settings={"total_timesteps": 1024})
+    assert "warning" not in capsys.readouterr().err
+
+
 def test_only_the_first_trial_checks_the_environment(played, tmp_path):
     begin(tmp_path, RATES, trials=2)
     assert ["--no-check" in call for call in played.calls] == [False, True, True]
@@ -200,6 +210,7 @@ def test_its_runs_are_runs(played, tmp_path):
     assert plan_removal([str(tuning.path)], root=root).paths == [tuning.path.resolve()]
     with pytest.raises(UsageError, match="the trials of rlctl tune, not seeds of one recipe"):
         read_group(tuning.path)
+    assert not (root / "latest").exists()
     with pytest.raises(UsageError, match="see its table: rlctl tune --resume"):
         find_run(str(tuning.path))
     with pytest.raises(ArtifactError, match=f"but the trials of rlctl tune; name one in {tuning.path}"):
