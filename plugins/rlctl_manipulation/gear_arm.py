@@ -40,9 +40,11 @@ TABLE_HEIGHT = 0.08  # [m]
 DROP = np.array([0.0, 0.0, 0.02])  # [m], from where the cube falls onto the table
 NEAR = 0.05  # [m]
 HELD = 0.025  # [m], from the tool to an object that is between the fingers, and not below closed ones
+HALF_OBJECT = 0.02  # [m]
+OVER = 0.02  # [m], the way to the object at which fingers go down beside it
 CLEARANCE = 0.06  # [m], above an object, at which the tool goes there from beside it
 LIFTED = 0.05  # [m], above the table
-LOST = 0.5  # [m]
+FARTHEST = 0.5  # [m], that an object counts as being away
 HOLD_S = 0.5  # [s]
 
 
@@ -54,6 +56,7 @@ class GearArm(Task):
     goal_range: float = 0.3  # [m], of the goal's x and y around the base
     tolerance: float = NEAR  # [m]
     start_noise: float = HOME_NOISE  # [rad], of JOINTS, to each side of the home pose
+    head_start: float = 0.0  # mean part of the way to the object that is gone already when grasp or lift begins
     episode_s: float = 10.0  # [s], 500 steps
 
     robot = "gear arm"
@@ -73,6 +76,7 @@ class GearArm(Task):
         "arrival": 1.0,
         "grasp": 1.0,
         "lift": 2.0,
+        "lost": -50.0,
         "energy": -0.001,
         "amplitude": -0.01,
         "time": -0.5,
@@ -132,9 +136,16 @@ class GearArm(Task):
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start near the home pose, a goal on the table; where there is an object to grasp, with open fingers."""
-        opening = OPEN / 2 if self.stage == "reach" else 0.95 * OPEN
-        self.arm.set_joints(self.pose(HOME + rng.uniform(-self.start_noise, self.start_noise, 3), opening))
+        joints = HOME + rng.uniform(-self.start_noise, self.start_noise, 3)
         self.goal = np.array([*rng.uniform(-self.goal_range, self.goal_range, 2), GOAL_HEIGHT])
+        opening = OPEN / 2 if self.stage == "reach" else 0.95 * OPEN
+        if self.head_start > 0 and self.stage != "reach":
+            # Anywhere on the way, evenly, and over the object where that is beyond it: 1 begins half of them there.
+            way = min(rng.uniform(0.0, 2 * self.head_start), 1.0)
+            over = find_joints_for(self.goal + np.array([0.0, 0.0, rng.uniform(0.01, 0.06)]))
+            joints = (1 - way) * joints + way * (over + rng.uniform(-0.01, 0.01, 3))
+            opening = OPEN * rng.uniform(0.75, 1.0)
+        self.arm.set_joints(self.pose(joints, opening))
         if self.stage != "reach":
             # One side faces the base: the gripper turns with the arm, and not by itself. A box, and let fall, because
             # contacts of round shapes, and those that last through a fast reset, do not repeat bit for bit.
@@ -188,8 +199,9 @@ class GearArm(Task):
         return {
             "distance": way,
             "arrival": rewards.closeness(way, NEAR),
-            "grasp": rewards.grasp(way, NEAR, held),
+            "grasp": self.measure_grasp(way, held),
             "lift": min(max(height, 0.0), LIFTED) / LIFTED if held else 0.0,
+            "lost": float(self.is_lost()),
             "energy": rewards.power(torques, self.arm.joint_velocities[self.motors]),
             "amplitude": rewards.squared(action),
             "time": rewards.time_spent(self.control_dt),
@@ -198,17 +210,37 @@ class GearArm(Task):
     def measure_way(self) -> float:
         """Return how far the tool is from above the object, and the nearer to its axis the lower above it [m].
 
-        Straight for the object, the fingers would push it away. It counts as LOST at most, wherever an object lies.
+        Straight for the object, the fingers would push it away. It counts as FARTHEST at most.
         """
         x, y, z = self.object - self.tool
         aside = math.hypot(x, y)
-        return min(math.hypot(aside, z + min(max(2 * (aside - 0.01), 0.0), CLEARANCE)), LOST)
+        return min(math.hypot(aside, z + min(max(2 * (aside - 0.01), 0.0), CLEARANCE)), FARTHEST)
+
+    def measure_grasp(self, way: float, held: bool) -> float:
+        """Return how far a grasp has come, in [0, 1]: half for going down with open fingers, half for closing them.
+
+        Closed before they are beside the object, the fingers would stand on it.
+        """
+        if self.stage == "reach":
+            return rewards.grasp(way, NEAR, held)
+        opening = min(max(float(self.arm.joint_positions[self.left_finger]), 0.0), OPEN)
+        if rewards.distance(self.tool, self.object) > HELD:
+            return 0.5 * rewards.closeness(way, OVER) * opening / OPEN
+        return 0.5 + 0.25 * min((OPEN - opening) / (OPEN - HALF_OBJECT), 1.0) + 0.25 * held
 
     def is_held(self) -> bool:
         """Both fingers touch the object, which is between them."""
         if self.stage == "reach" or rewards.distance(self.tool, self.object) > HELD:
             return False
         return self.arm.links_touching(self.cube) >= {"left_finger", "right_finger"}
+
+    def is_lost(self) -> bool:
+        """The object is not on the table any more, nor above it."""
+        return self.stage != "reach" and self.object[2] < TABLE_HEIGHT
+
+    def is_terminated(self) -> bool:
+        """The object is lost."""
+        return self.is_lost()
 
     def is_success(self) -> bool:
         """The tool is at the goal; or the object has been held, or held above the table, for half a second."""
@@ -223,6 +255,16 @@ class GearArm(Task):
     def describe_joints(self) -> Joints:
         """The motors', which get torques, and a finger's, which gets a speed."""
         return self.arm.describe_joints([*MOTORS, FINGERS[0]])
+
+
+def find_joints_for(point: np.ndarray) -> np.ndarray:
+    """Return the angles of JOINTS [rad], shape (3,), that bring the tool to a point [m]: law of cosines, elbow up."""
+    x, y, z = point
+    away, drop = math.hypot(x, y), BASE[2] - TOOL - z
+    cosine = (away**2 + drop**2 - UPPER_ARM**2 - FOREARM**2) / (2 * UPPER_ARM * FOREARM)
+    elbow = math.acos(min(max(cosine, math.cos(ELBOW[1])), math.cos(ELBOW[0])))
+    shoulder = math.atan2(drop, away) - elbow / 2
+    return np.array([math.atan2(y, x), shoulder, shoulder + elbow])
 
 
 def stop_torque(angle: float, low: float, high: float) -> float:

@@ -9,26 +9,26 @@ from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
 from rlctl.task.inertia import find_inertia_faults
-from rlctl_manipulation.gear_arm import BASE, ELBOW, GEAR, HOME, STOPS, TOOL, TORQUE, GearArm, stop_torque
+from rlctl_manipulation.gear_arm import (
+    ELBOW,
+    GEAR,
+    HOME,
+    OPEN,
+    STOPS,
+    TORQUE,
+    GearArm,
+    find_joints_for,
+    stop_torque,
+)
 
 
 def slow(*values):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
-def solve(point):
-    """Angles of turn, shoulder and crank [rad] that bring the tool to a point [m]: law of cosines, elbow up."""
-    x, y, z = point
-    r, drop = math.hypot(x, y), BASE[2] - TOOL - z
-    distance = math.hypot(r, drop)
-    elbow = math.acos((distance**2 - 2 * 0.3**2) / (2 * 0.3**2))
-    shoulder = math.atan2(drop, r) - elbow / 2
-    return np.array([math.atan2(y, x), shoulder, shoulder + elbow])
-
-
 def steer(task, point, fingers=0.0):
     """Return the action of a controller that holds the tool at a point: a spring and a damper at each joint."""
-    error = solve(point) - task.arm.joint_positions[task.joints]
+    error = find_joints_for(point) - task.arm.joint_positions[task.joints]
     torque = 60 * error - 1.0 * task.arm.joint_velocities[task.joints]  # [N m]
     torque[1:] -= (2.5, 0.8)  # [N m], about what the arm's weight does
     return np.clip([*(GEAR * torque / TORQUE), fingers], -1, 1).astype(np.float32)
@@ -84,7 +84,7 @@ def test_the_linkage_drives_the_forearm(env):
 def test_goals_are_in_reach(env):
     for x in (-0.3, 0.0, 0.3):
         for y in (-0.3, 0.0, 0.3):
-            turn, shoulder, crank = solve((x, y, 0.1))
+            turn, shoulder, crank = find_joints_for((x, y, 0.1))
             assert STOPS["shoulder"][0] < shoulder < STOPS["shoulder"][1]
             assert STOPS["crank"][0] < crank < STOPS["crank"][1]
             assert ELBOW[0] < crank - shoulder < ELBOW[1]
@@ -160,13 +160,62 @@ def test_the_way_to_an_object_goes_over_it(env):
     assert task.measure_way() == 0.5
 
 
-def test_a_cube_off_the_table_lies_on_the_floor():
+def test_an_object_off_the_table_is_lost():
     env = TaskEnv(GearArm(stage="lift"))
     env.reset(seed=0)
+    for _ in range(10):
+        _, reward, terminated, _, info = env.step(np.zeros(4, np.float32))
+        assert (info["metrics"]["lost"], terminated) == (0, False)
     env.task.cube.set_base((0.8, 0.0, 0.1))
-    for _ in range(50):
-        env.step(np.zeros(4, np.float32))
-    assert env.task.cube.base_position[2] == pytest.approx(0.02, abs=0.002)
+    while not terminated:
+        _, reward, terminated, _, info = env.step(np.zeros(4, np.float32))
+    assert info["metrics"]["lost"] == 1
+    assert reward < -50
+    assert info["is_success"] is False
+    env.close()
+
+
+def test_a_head_start():
+    """Half way on average: the tool is anywhere between its home and the place over the object."""
+    env = TaskEnv(GearArm(stage="lift", head_start=0.5))
+    ways = []
+    for seed in range(30):
+        env.reset(seed=seed)
+        task = env.task
+        over = find_joints_for(task.goal + np.array([0.0, 0.0, 0.035]))
+        ways.append((task.arm.joint_positions[task.joints] - HOME)[0] / (over - HOME)[0])
+        assert task.linkage.gap < 1e-3
+    assert 0.3 < np.mean(ways) < 0.7
+    assert np.min(ways) < 0.25 < 0.75 < np.max(ways)
+    env.close()
+    env = TaskEnv(GearArm(stage="lift", head_start=100.0))
+    for seed in range(10):
+        env.reset(seed=seed)
+        x, y, z = env.task.tool - env.task.goal
+        assert math.hypot(x, y) < 0.01
+        assert 0 < z < 0.075
+        env.step(np.array([0, 0, 0, 1], np.float32))
+        assert np.linalg.norm((env.task.cube.base_position - env.task.goal)[:2]) < 0.002  # untouched
+    env.close()
+
+
+def test_a_grasp_by_hand():
+    env = TaskEnv(GearArm(stage="grasp", head_start=100.0))
+    env.reset(seed=0)
+    task = env.task
+    fingers = [task.left_finger, task.left_finger + 1]
+
+    def measure(above, opening, held=False):
+        task.object = task.tool - np.array([0.0, 0.0, above])
+        task.arm.set_joints(task.pose(find_joints_for(task.tool), opening))
+        return task.measure_grasp(task.measure_way(), held)
+
+    assert task.arm.joint_positions[fingers].min() > 0.7 * OPEN
+    assert measure(0.04, OPEN) == pytest.approx(0.5 * math.exp(-4))  # twice the scale of 2 cm
+    assert measure(0.04, 0.0) == 0  # closed, the fingers would stand on it
+    assert measure(0.0, OPEN) == pytest.approx(0.5)
+    assert measure(0.0, 0.027) == pytest.approx(0.5 + 0.25 * 0.5)  # half closed, to a cube of 4 cm
+    assert measure(0.0, 0.02, held=True) == pytest.approx(1.0)
     env.close()
 
 

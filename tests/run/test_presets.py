@@ -44,7 +44,7 @@ def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("task", "cls", "preset", "count"),
-    [("biped", Biped, "presets/biped-ladder", 4), ("gear-arm", GearArm, "presets/gear-arm-ladder", 3)],
+    [("biped", Biped, "presets/biped-ladder", 4), ("gear-arm", GearArm, "presets/gear-arm-ladder", 4)],
 )
 def test_the_ladders_can_be_built(task, cls, preset, count):
     stages = recipe_sources.resolve(task, Path(preset), {}).stages
