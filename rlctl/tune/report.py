@@ -19,7 +19,7 @@ def show(tuning: Tuning, json: str | None) -> None:
         return
     out = output.out()
     keys = list(dict.fromkeys(dimension.key for step in tuning.steps for dimension in step))
-    columns = ("trial", *(key.rpartition(".")[2] for key in keys), "return", "success", "steps", "minutes", "")
+    columns = ("trial", *(key.rpartition(".")[2] for key in keys), "return", "success", "min", "")
     ranked = sorted(tuning.trials, key=_rank, reverse=True)
     out.print(f"{tuning.task}: {tuning.path}, by {tuning.metric}; means over the last third of the evaluations")
     output.print_table(columns, [_list_cells(tuning, each, keys, runs.get(each.number)) for each in ranked], left=("",))
@@ -31,11 +31,12 @@ def show(tuning: Tuning, json: str | None) -> None:
         return
     seeds = f"{tuning.seed + 100}-{tuning.seed + 104}"
     out.print(
-        f"best: trial {best.number}, in {tuning.best_file}. One seed each, and the best of "
-        f"{len(tuning.trials)} looks better than it is; on new seeds:\n"
+        f"best: trial {best.number}, in {tuning.best_file}\n"
+        f"One seed each, and the best of {len(tuning.trials)} looks better than it is. On new seeds:\n"
         f"  rlctl train {task} --config {file} --seeds {seeds}\n"
         f"  rlctl train {task} --seeds {seeds}\n"
-        "and rlctl runs compare, with the two groups, says whether it is better"
+        "and rlctl runs compare, with the two groups, says whether it is better",
+        soft_wrap=True,
     )
 
 
@@ -46,16 +47,14 @@ def _rank(trial: Trial) -> tuple[bool, float]:
 def _list_cells(tuning: Tuning, trial: Trial, keys: list[str], run: RunSummary | None) -> tuple[str, ...]:
     notes = {"done": "", "failed": f"failed: {trial.problem}", "begun": "not finished"}
     total, success = tuning.measure(trial, "return"), tuning.measure(trial, "success")
-    steps = None if run is None else run.steps
     seconds = None if run is None else run.seconds
     return (
         str(trial.number),
         *(str(trial.values.get(key, "-")) for key in keys),
         "-" if total is None else f"{total:.4g}",
         "-" if success is None else f"{success:.1%}",
-        "-" if steps is None else f"{steps:,}",
         "-" if seconds is None else f"{seconds / 60:.1f}",
-        "the recipe as it is" if trial.number == 0 and trial.state == "done" else notes.get(trial.state, trial.state),
+        "recipe" if trial.number == 0 and trial.state == "done" else notes.get(trial.state, trial.state),
     )
 
 
