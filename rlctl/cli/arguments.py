@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -26,6 +27,17 @@ Run = Annotated[
 Set = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="Set a key, e.g. task.tolerance=0.02, randomize=true.")
 ]
+Config = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Recipe that goes over the task's own, or presets/NAME.")
+]
+Algo = Annotated[
+    str | None,
+    typer.Option(
+        help="ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.",
+        autocompletion=completion.complete_algorithm,
+    ),
+]
+RunsFolder = Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where run folders go.")]
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE", help="Write JSON too; - for stdout, alone.")]
 EpisodeSeed = Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)]
 EnvTimeout = Annotated[float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1)]

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rlctl import completion
-from rlctl.cli.arguments import EnvTimeout, Json, NEnvs, OptionalTask, Set, claim_stdout
+from rlctl.cli.arguments import Algo, Config, EnvTimeout, Json, NEnvs, OptionalTask, RunsFolder, Set, claim_stdout
 from rlctl.errors import UsageError
 
 
@@ -32,17 +32,9 @@ def train(
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Go on with a run even if its task has changed.")] = False,
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Recipe that goes over the task's own, or presets/NAME.")
-    ] = None,
+    config: Config = None,
     settings: Set = [],
-    algo: Annotated[
-        str | None,
-        typer.Option(
-            help="ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.",
-            autocompletion=completion.complete_algorithm,
-        ),
-    ] = None,
+    algo: Algo = None,
     seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
     seeds: Annotated[
         str | None, typer.Option(metavar="0-4", help="Train these seeds, each an ordinary run, as a group.")
@@ -61,9 +53,7 @@ def train(
     record: Annotated[int, typer.Option(metavar="N", help="Write the last N evaluation episodes as .rrd.", min=0)] = 0,
     no_check: Annotated[bool, typer.Option("--no-check", help="Train without checking the environment first.")] = False,
     env_timeout: EnvTimeout = 60.0,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where run folders go.")] = Path(
-        "runs"
-    ),
+    output: RunsFolder = Path("runs"),
     json: Json = None,
 ) -> None:
     """Train a policy, evaluate as it goes, and keep the best and the last."""

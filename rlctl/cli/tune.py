@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl import completion
-from rlctl.cli.arguments import Json, NEnvs, OptionalTask, Set, claim_stdout
+from rlctl.cli.arguments import Algo, Config, Json, NEnvs, OptionalTask, RunsFolder, Set, claim_stdout
 from rlctl.errors import UsageError
 
 
@@ -30,22 +29,15 @@ def tune(
     jobs: Annotated[
         int | None, typer.Option(help="How many train at a time.", min=1, show_default="half as many as cores")
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Recipe that goes over the task's own, or presets/NAME.")
-    ] = None,
+    config: Config = None,
     settings: Set = [],
-    algo: Annotated[
-        str | None,
-        typer.Option(help="Algorithm, as in rlctl train.", autocompletion=completion.complete_algorithm),
-    ] = None,
+    algo: Algo = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the first trial; the others have the next ones.")] = None,
     total_timesteps: Annotated[
         str | None, typer.Option("--total-timesteps", "-n", metavar="STEPS", help="Environment steps of a trial.")
     ] = None,
     n_envs: NEnvs = None,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where the folder goes.")] = Path(
-        "runs"
-    ),
+    output: RunsFolder = Path("runs"),
     json: Json = None,
 ) -> None:
     """Find hyperparameters: the learning rate, then rollout and minibatch, then the discount, with Optuna."""

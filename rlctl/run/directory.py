@@ -215,7 +215,7 @@ def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
 
     Where `root` is the folder of a group the run is in it, and `latest` where it is for all runs.
     """
-    now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    now = _format_now()
     folder = root / registry.make_slug(task)
     if is_group(root):
         folder, root = root, root.parent.parent
@@ -231,6 +231,20 @@ def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
             _point_latest_to(root, folder / name)
         return RunDirectory(folder / name)
     raise ArtifactError(f"{folder}: cannot make a run folder")
+
+
+def create_group_folder(task: str, kind: str, root: Path) -> Path:
+    """Make a folder for runs that belong together, `<root>/<task>/<time>_<kind>`."""
+    folder = root / registry.make_slug(task) / f"{_format_now()}_{kind}"
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise ArtifactError(f"{folder}: cannot make a group's folder: {error.strerror}") from None
+    return folder
+
+
+def _format_now() -> str:
+    return datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
 
 
 def is_group(path: Path) -> bool:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import re
 from pathlib import Path
 from typing import Any
 
-from rlctl import registry
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files
-from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, is_group
+from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, create_group_folder, is_group
 from rlctl.run.lookup import find_run, refuse_tuning
 
 _MOST_SEEDS = 1000
@@ -76,12 +74,7 @@ def parse_seeds(text: str) -> list[int]:
 
 def create_group(task: str, seeds: list[int], options: list[str], root: Path) -> Group:
     """Make a new group folder, `<root>/<task>/<time>_seeds`."""
-    now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder = root / registry.make_slug(task) / f"{now}_seeds"
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise ArtifactError(f"{folder}: cannot make a group's folder: {error.strerror}") from None
+    folder = create_group_folder(task, "seeds", root)
     files.write_json(folder / GROUP_FILE, {"task": task, "seeds": seeds, "options": options})
     return Group(folder, task, seeds, options)
 

@@ -49,10 +49,15 @@ def resolve(
     return fill_defaults(validate(merged, *sources))
 
 
+def resolve_with_stages(task: str, config: Path | None, settings: Mapping[str, Any]) -> Recipe:
+    """Return what `resolve` does, with the stages that the task's class declares; the task is imported."""
+    constructor: Any = registry.load(task)
+    return resolve(task, config, settings, constructor.stages if registry.is_task(constructor) else ())
+
+
 def resolve_packaged(task: str, settings: Mapping[str, Any] | None = None) -> Recipe:
     """Return the recipe that a task comes with, with the stages that its class declares; the task is imported."""
-    constructor: Any = registry.load(task)
-    return resolve(task, None, settings or {}, constructor.stages if registry.is_task(constructor) else ())
+    return resolve_with_stages(task, None, settings or {})
 
 
 def fill_defaults(recipe: Recipe) -> Recipe:

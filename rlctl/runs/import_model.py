@@ -39,8 +39,7 @@ def import_model(
     """Read a model, and a VecNormalize if it has one, and write it as a policy of a task, once it acts.
 
     Raises `UsageError` for another ending of `output` than .safetensors, or where nothing was said and the model's name
-    is taken, `ArtifactError` for a file that is not a
-    model, or one for other spaces than the task has.
+    is taken, `ArtifactError` for a file that is not a model, or one for other spaces than the task has.
     """
     from rlctl.run.torch_policy import ALGORITHMS, build_network, describe_network, policy_name
 

@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlctl import registry
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.run import directory, lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.recipe import Recipe, validate
-from rlctl.run.recipe_sources import describe_rounding, resolve
+from rlctl.run.recipe_sources import describe_rounding, resolve_with_stages
 from rlctl.run.task_version import describe_task_changes
 from rlctl.train.warm_start import find_source
 
@@ -119,9 +118,7 @@ def check_arguments(request: TrainRequest) -> None:
 def _find_new(request: TrainRequest) -> Start:
     task = request.task or ""
     with preserve_process_state():
-        constructor: Any = registry.load(task)
-    stages = constructor.stages if registry.is_task(constructor) else ()
-    recipe = resolve(task, request.config, request.settings, stages)
+        recipe = resolve_with_stages(task, request.config, request.settings)
     note = describe_rounding(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
     return Start(request, task, recipe, notes=(note,) if note else (), source=source)

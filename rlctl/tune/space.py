@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from rlctl.env_spec import merge
 from rlctl.errors import UsageError
 from rlctl.run import yaml_text
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS, ON_POLICY
@@ -162,11 +163,9 @@ def nest(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return `{"algo_kwargs": {"gamma": 0.98}}` for `{"algo_kwargs.gamma": 0.98}`."""
     result: dict[str, Any] = {}
     for key, value in values.items():
-        *path, last = key.split(".")
-        place = result
-        for part in path:
-            place = place.setdefault(part, {})
-        place[last] = value
+        for part in reversed(key.split(".")):
+            value = {part: value}
+        result = merge(result, value)
     return result
 
 

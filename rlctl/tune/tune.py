@@ -14,13 +14,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rlctl import output, registry
+from rlctl import output
 from rlctl.env_spec import merge
 from rlctl.errors import TaskError, UsageError
 from rlctl.run.directory import ROOT, RunLock
 from rlctl.run.hyperparameters import ON_POLICY
 from rlctl.run.recipe import Recipe
-from rlctl.run.recipe_sources import find_config, resolve
+from rlctl.run.recipe_sources import find_config, resolve_with_stages
 from rlctl.train.start import preserve_process_state
 from rlctl.train.trainings import Trainings, choose_jobs
 from rlctl.tune import tuning as folder
@@ -55,12 +55,10 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
     """
     _require_optuna()
     with preserve_process_state():
-        constructor: Any = registry.load(request.task)
-    stages = constructor.stages if registry.is_task(constructor) else ()
-    recipe = resolve(request.task, request.config, request.settings, stages)
+        recipe = resolve_with_stages(request.task, request.config, request.settings)
     steps = [parse_search(request.search)] if request.search else list_usual_steps(recipe)
     for dimension in (each for step in steps for each in step):
-        _check(dimension, request, stages)
+        _check(dimension, request)
     tuning = Tuning(
         path=request.root,
         task=request.task,
@@ -79,7 +77,7 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
 def resume(path: Path, *, jobs: int | None = None) -> Tuning:
     """Go on with a tuning; trials that were interrupted go on where they stopped."""
     _require_optuna()
-    folder.load(path)
+    folder.load(path)  # before a lock is written into a folder that is none
     with RunLock(path):
         return _search(folder.load(path), jobs)
 
@@ -91,7 +89,7 @@ def _require_optuna() -> None:
         raise UsageError(f"rlctl tune needs {error.name}: pip install 'rlctl[tune]'") from None
 
 
-def _check(dimension: Dimension, request: TuneRequest, stages: Sequence[Mapping[str, Any]]) -> None:
+def _check(dimension: Dimension, request: TuneRequest) -> None:
     """Raise `UsageError` for a key that cannot be searched, and `RecipeError` for a value that it cannot have."""
     first = dimension.key.partition(".")[0]
     if dimension.key in ("seed", "total_timesteps", "stop_success") or first in ("eval", "checkpoint"):
@@ -104,7 +102,7 @@ def _check(dimension: Dimension, request: TuneRequest, stages: Sequence[Mapping[
             "give --metric success"
         )
     for value in dimension.ends():
-        resolve(request.task, request.config, merge(request.settings, nest({dimension.key: value})), stages)
+        resolve_with_stages(request.task, request.config, merge(request.settings, nest({dimension.key: value})))
 
 
 def _evaluate_often_enough(recipe: Recipe, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -116,14 +114,13 @@ def _evaluate_often_enough(recipe: Recipe, settings: Mapping[str, Any]) -> dict[
 
 
 def _search(tuning: Tuning, jobs: int | None) -> Tuning:
-    # What takes a second and a half to import.
+    # It imports optuna, which may not be there.
     from rlctl.tune.search import StepSearch, train
 
     to_go_on = f"rlctl tune --resume {shlex.quote(str(tuning.path))}"
     config = None if tuning.config is None else Path(tuning.config)
-    constructor: Any = registry.load(tuning.task)
-    stages = constructor.stages if registry.is_task(constructor) else ()
-    recipe = resolve(tuning.task, config, tuning.settings, stages)
+    with preserve_process_state():
+        recipe = resolve_with_stages(tuning.task, config, tuning.settings)
     output.print_notes([_describe(tuning, recipe, jobs), *_warn_of_long_rollouts(recipe)])
     if not tuning.trials:
         tuning.trials.append(Trial(0, 0, {}))

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import pydantic
 
-from rlctl import registry
 from rlctl.env_spec import merge
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files, yaml_text
-from rlctl.run.directory import TUNE_FILE, RunDirectory
+from rlctl.run.directory import TUNE_FILE, RunDirectory, create_group_folder
 from rlctl.run.group import find_run_of_seed
 from rlctl.run.recipe_sources import find_config, read
 from rlctl.runs.summary import list_points, read_table
@@ -106,13 +104,7 @@ def find_best(trials: list[Trial]) -> Trial | None:
 
 def create(root: Path, tuning: Tuning) -> Tuning:
     """Make the folder of a new tuning, `<root>/<task>/<time>_tune`."""
-    now = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder = root / registry.make_slug(tuning.task) / f"{now}_tune"
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise ArtifactError(f"{folder}: cannot make a folder: {error.strerror}") from None
-    created = dataclasses.replace(tuning, path=folder)
+    created = dataclasses.replace(tuning, path=create_group_folder(tuning.task, "tune", root))
     created.save()
     return created
 
