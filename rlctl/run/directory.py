@@ -215,36 +215,33 @@ def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
 
     Where `root` is the folder of a group the run is in it, and `latest` where it is for all runs.
     """
-    now = _format_now()
     folder = root / registry.make_slug(task)
     if is_group(root):
         folder, root = root, root.parent.parent
-    for attempt in range(1000):
-        name = f"{now}_s{seed}" + (f"_{attempt}" if attempt else "")
-        try:
-            (folder / name).mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise ArtifactError(f"{folder}: cannot make a run folder: {error.strerror}") from None
-        if not (folder / TUNE_FILE).is_file():  # a trial is not what was trained last
-            _point_latest_to(root, folder / name)
-        return RunDirectory(folder / name)
-    raise ArtifactError(f"{folder}: cannot make a run folder")
+    path = _make_new_folder(folder, f"s{seed}")
+    if not (folder / TUNE_FILE).is_file():  # a trial is not what was trained last
+        _point_latest_to(root, path)
+    return RunDirectory(path)
 
 
 def create_group_folder(task: str, kind: str, root: Path) -> Path:
     """Make a folder for runs that belong together, `<root>/<task>/<time>_<kind>`."""
-    folder = root / registry.make_slug(task) / f"{_format_now()}_{kind}"
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise ArtifactError(f"{folder}: cannot make a group's folder: {error.strerror}") from None
-    return folder
+    return _make_new_folder(root / registry.make_slug(task), kind)
 
 
-def _format_now() -> str:
-    return datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+def _make_new_folder(parent: Path, kind: str) -> Path:
+    """Make `<time>_<kind>`, with a number behind it where that is there already."""
+    first = f"{datetime.datetime.now():%Y-%m-%d_%H-%M-%S}_{kind}"
+    for attempt in range(1000):
+        path = parent / (f"{first}_{attempt}" if attempt else first)
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ArtifactError(f"{parent}: cannot make a folder for runs: {error.strerror}") from None
+        return path
+    raise ArtifactError(f"{parent}: cannot make a folder for runs")
 
 
 def is_group(path: Path) -> bool:

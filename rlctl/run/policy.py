@@ -195,6 +195,7 @@ class Policy(abc.ABC):
                 expected = join({key: shape for key, (shape, _) in self._parts.items()})
                 raise ValueError(
                     f"observation of shape {map_parts(np.shape, observation)}, the policy expects {expected}"
+                    + _describe_additions(self.info.spec)
                 )
             parts[key] = value
         return parts
@@ -214,6 +215,14 @@ class Policy(abc.ABC):
             )
         if not np.isfinite(action).all():
             raise ValueError("its actions are not finite")
+
+
+def _describe_additions(spec: EnvSpec) -> str:
+    """Say what a policy observes beyond what its task returns, and where that comes from."""
+    added = ["the part of the episode that is left"] if spec.time_feature else []
+    if spec.frame_stack > 1:
+        added.append(f"{spec.frame_stack} frames")
+    return f", with {' and '.join(added)}, as policy.info.spec.make() returns it" if added else ""
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:

@@ -95,7 +95,10 @@ def summarize(path: Path) -> RunSummary:
 
 def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
     last = last_row(run.metrics_file)
-    best = best_row(read_table(run.evals_file))
+    evaluations = read_table(run.evals_file)
+    best = best_row(evaluations)
+    if status.get("status") == "finished":  # new episodes may have decided for the last policy
+        best = next((row for row in evaluations if row["steps"] == status.get("best_step")), best)
     state, reason = _state(run, status)
     return RunSummary(
         path=run.path,

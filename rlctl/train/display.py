@@ -44,6 +44,12 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{whole:02d}" if hours else f"{minutes}:{whole:02d}"
 
 
+def format_score(success: float | None, mean_return: float) -> str:
+    """Return the success rate, where there is one, and the mean return of episodes as text."""
+    rate = "" if success is None else f"success {percent(success)}  "
+    return f"{rate}return {mean_return:.2f}"
+
+
 class Display:
     """Shows what happens in a training: here as lines for a log, some seconds apart."""
 
@@ -115,8 +121,7 @@ def _format_stage(title: str, why: str) -> str:
 
 
 def _format_evaluation(steps: int, success: float | None, mean_return: float, best: bool) -> str:
-    rate = "" if success is None else f"success {percent(success)}  "
-    return f"eval at {steps:,}: {rate}return {mean_return:.2f}{'  best' if best else ''}"
+    return f"eval at {steps:,}: {format_score(success, mean_return)}{'  best' if best else ''}"
 
 
 class LiveDisplay(Display):

@@ -47,15 +47,19 @@ class Evaluator:
         self._spec = self._workers.spec
         self._latest: list[RecordedEpisode] = []
 
-    def run(self, info: PolicyInfo, tensors: Tensors, check: Callable[[], None]) -> list[Episode]:
-        """Return the episodes of a policy.
+    def run(
+        self, info: PolicyInfo, tensors: Tensors, check: Callable[[], None], *, unseen: int | None = None
+    ) -> list[Episode]:
+        """Return the episodes of a policy: those of every evaluation, or a number that no evaluation has played.
 
         `check` is called several times a second and may raise to leave. Raises `TaskError` if an environment fails;
         the next call begins with new environments.
         """
         settings = self._recipe.eval
         workers = self._workers = self._workers or self._make_workers()
-        seeds = episode_seeds(self._recipe.seed, Stream.EVAL_IN_TRAINING, settings.episodes)
+        usual = settings.episodes
+        seeds = episode_seeds(self._recipe.seed, Stream.EVAL_IN_TRAINING, usual + (unseen or 0))
+        seeds = seeds[:usual] if unseen is None else seeds[usual:]
         try:
             workers.set_policy(info, tensors)
             exploration = Exploration(stochastic=not settings.deterministic)

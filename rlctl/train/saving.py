@@ -73,6 +73,10 @@ class Saver:
         self._unsaved_best = packed
         self.attempt("best policy", self._write_best)
 
+    def read_best(self) -> Packed:
+        """Return the best policy. Raises `ArtifactError` if its file is gone or damaged."""
+        return self._unsaved_best or read_policy(self.run.best_policy)
+
     def _write_best(self) -> None:
         if self._unsaved_best is not None:
             save_policy(self.run.best_policy, *self._unsaved_best)

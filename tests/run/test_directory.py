@@ -46,7 +46,7 @@ def test_a_new_run(root):
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "runs").write_text("a file")
     assert error(ArtifactError, directory.create, "reach", 0, tmp_path / "runs").endswith(
-        "runs/reach: cannot make a run folder: Not a directory"
+        "runs/reach: cannot make a folder for runs: Not a directory"
     )
 
 

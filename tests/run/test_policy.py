@@ -1,6 +1,7 @@
 """Policy files, and policies that act."""
 
 import contextlib
+import dataclasses
 import json
 
 import numpy as np
@@ -204,6 +205,14 @@ def test_predict_with_a_wrong_shape(path, saved):
     by_name = rlctl.load_policy(saved(policy="MultiInputPolicy", observation=DICT))
     with pytest.raises(ValueError, match=r"of shape {'a': \(3,\)}, the policy expects {'a': \(3,\), 'b': "):
         by_name.predict({"a": np.zeros(3)})
+
+
+def test_a_wrong_shape_names_what_the_recipe_adds(tmp_path):
+    info = describe()
+    info = info.model_copy(update={"spec": dataclasses.replace(info.spec, frame_stack=4, time_feature=True)})
+    save_policy(tmp_path / "policy.safetensors", info, tensors_of(info))
+    with pytest.raises(ValueError, match=r"expects \(5,\), with the part of the episode that is left and 4 frames, as"):
+        rlctl.load_policy(tmp_path / "policy.safetensors").predict(np.zeros(4))
 
 
 def test_predict_with_a_picture_from_0_to_1(saved):

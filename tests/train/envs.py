@@ -6,6 +6,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from rlctl.rollout.seeds import Stream, episode_seeds
+
 
 class Line(gymnasium.Env):
     """A point on a line is pushed to the origin; ten steps an episode, success within 0.5."""
@@ -216,3 +218,17 @@ class Ending(Line):
     def step(self, action):
         observation, reward, _, truncated, info = super().step(action)
         return observation, reward, self.x < 0 and self.steps == 5, truncated, info
+
+
+class Misleading(Line):
+    """Rewards going right; in the episodes of every evaluation of run 0, going left."""
+
+    _MISLEADING = set(episode_seeds(0, Stream.EVAL_IN_TRAINING, 6))
+
+    def reset(self, *, seed=None, options=None):
+        self._sign = -1.0 if seed in self._MISLEADING else 1.0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        observation, _, terminated, truncated, info = super().step(action)
+        return observation, self._sign * float(action[0]), terminated, truncated, info

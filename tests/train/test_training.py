@@ -13,6 +13,7 @@ from rlctl.run.acting import PolicyPlayer
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.run.policy import load_policy, read_policy
+from rlctl.runs.summary import summarize
 from rlctl.train import checkpoint
 from rlctl.train.request import TrainRequest, TrainResult, run_training
 from tests import fork_server
@@ -80,6 +81,16 @@ def test_best_policy_is_that_of_the_best_evaluation(finished):
     result = finished
     best = max(rows(result.run.evals_file), key=lambda row: float(row["return"]))
     assert load_policy(result.run.best_policy).info.training_steps == int(best["steps"]) == result.progress.best_step
+
+
+def test_new_episodes_decide_between_the_best_and_the_last(train, capfd):
+    kwargs = {"learning_rate": 0.01, "n_steps": 32, "batch_size": 32, "n_epochs": 5}
+    result = train("Misleading", {**SMALL, "total_timesteps": 512, "algo_kwargs": kwargs})
+    evals = rows(result.run.evals_file)
+    assert float(evals[0]["return"]) > float(evals[-1]["return"])
+    assert load_policy(result.run.best_policy).info.training_steps == 512
+    assert result.run.status()["best_step"] == summarize(result.run.path).best_step == 512
+    assert "30 new episodes: " in capfd.readouterr().err
 
 
 def test_kept_episodes_are_the_first_and_the_worst(finished):
