@@ -18,6 +18,9 @@ from rlctl.train.updates.mlp import Mlp, is_mlp, share_gradients
 from rlctl.train.updates.side_by_side import SideBySide
 from rlctl.train.updates.squashed_actor import Sample, SquashedActor
 
+_LOSS_EVERY = 8
+"""Of so many updates in a row the first computes the critics' loss, which is only logged and takes TQC a while."""
+
 
 class SacUpdate:
     """Updates a SAC model whose networks are multi-layer perceptrons."""
@@ -58,7 +61,8 @@ class SacUpdate:
         model._update_learning_rate(optimizers)
         logged: dict[str, list[float]] = collections.defaultdict(list)
         for step in range(gradient_steps):
-            self._update(model.replay_buffer.sample(batch_size, env=model._vec_normalize_env), logged)
+            batch = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
+            self._update(batch, logged, with_loss=step % _LOSS_EVERY == 0)
             if step % model.target_update_interval == 0:
                 torch._foreach_lerp_(self._following, self._followed, model.tau)
         model._n_updates += gradient_steps
@@ -66,7 +70,7 @@ class SacUpdate:
             model.logger.record(f"train/{name}", np.mean(values))
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
-    def _update(self, batch: Any, logged: dict[str, list[float]]) -> None:
+    def _update(self, batch: Any, logged: dict[str, list[float]], *, with_loss: bool) -> None:
         actor = self._model.actor
         features, next_features = (
             actor.extract_features(each, actor.features_extractor)
@@ -77,7 +81,9 @@ class SacUpdate:
         sample = self._actor.sample(features)
         coefficient = self._update_coefficient(sample, logged)
         target = self._compute_target(batch, next_features, coefficient)
-        logged["critic_loss"].append(self._update_critics(torch.cat([features, batch.actions], 1), target))
+        outputs = self._update_critics(torch.cat([features, batch.actions], 1), target)
+        if with_loss:
+            logged["critic_loss"].append(sum(self._compute_loss(output, target) for output in outputs))
         logged["actor_loss"].append(self._update_actor(features, sample, coefficient))
 
     def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> float:
@@ -104,20 +110,19 @@ class SacUpdate:
         result: Tensor = batch.rewards + (1 - batch.dones) * discount * (estimates - coefficient * sample.log_prob)
         return result
 
-    def _update_critics(self, inputs: Tensor, target: Tensor) -> float:
-        """Return the sum of the critics' losses."""
-        losses = self._side_by_side.run(
+    def _update_critics(self, inputs: Tensor, target: Tensor) -> list[Tensor]:
+        """Return the critics' outputs before the update."""
+        outputs = self._side_by_side.run(
             [functools.partial(self._compute_critic_gradients, critic, inputs, target) for critic in self._critics]
         )
         self._model.critic.optimizer.step()
-        return sum(losses)
+        return outputs
 
-    def _compute_critic_gradients(self, critic: Mlp, inputs: Tensor, target: Tensor) -> float:
-        """Set the gradients of a critic's weights; return its loss."""
+    def _compute_critic_gradients(self, critic: Mlp, inputs: Tensor, target: Tensor) -> Tensor:
+        """Set the gradients of a critic's weights; return its output."""
         values = critic.run(inputs)
-        loss, to_output = self._compare(values[-1], target)
-        critic.backpropagate(values, to_output)
-        return loss
+        critic.backpropagate(values, self._differentiate_loss(values[-1], target))
+        return values[-1]
 
     def _update_actor(self, features: Tensor, sample: Sample, coefficient: float) -> float:
         """Return the actor's loss."""
@@ -139,10 +144,13 @@ class SacUpdate:
         """Return the estimates of target critics that count, shape (batch, estimates)."""
         return torch.cat(outputs, 1).amin(1, keepdim=True)
 
-    def _compare(self, output: Tensor, target: Tensor) -> tuple[float, Tensor]:
-        """Return a critic's share of the loss, and its gradient with respect to the critic's output."""
-        error = output - target
-        return 0.5 * error.square().mean().item(), error / len(error)
+    def _compute_loss(self, output: Tensor, target: Tensor) -> float:
+        """Return a critic's share of the loss."""
+        return 0.5 * (output - target).square().mean().item()
+
+    def _differentiate_loss(self, output: Tensor, target: Tensor) -> Tensor:
+        """Return the gradient of a critic's share of the loss with respect to its output."""
+        return (output - target) / len(output)
 
     def _judge(self, outputs: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
         """Return the value of actions by the critics' outputs, shape (batch, 1), and its gradient for each output."""

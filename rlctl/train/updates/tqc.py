@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import torch
 from sb3_contrib import TQC
-from torch import Tensor
+from torch import Tensor, nn
 
 from rlctl.train.updates.sac import SacUpdate
 
@@ -25,25 +25,20 @@ class TqcUpdate(SacUpdate):
         estimates = torch.cat(outputs, 1).sort(1)[0]
         return estimates[:, : estimates.shape[1] - dropped]
 
-    def _compare(self, output: Tensor, target: Tensor) -> tuple[float, Tensor]:
-        """Compare each quantile with each estimate by the quantile Huber loss.
+    def _compute_loss(self, output: Tensor, target: Tensor) -> float:
+        """Compare each quantile with each estimate by the quantile Huber loss."""
+        errors = target[:, None, :] - output[:, :, None]
+        sizes = nn.functional.huber_loss(errors, torch.zeros_like(errors), reduction="none")
+        shares = _quantile_shares(output)[:, None]
+        loss: float = (sizes * torch.where(errors < 0, 1 - shares, shares)).mean().item()
+        return loss / len(self._critics)
 
-        Its slope is the error, at most 1 either way; the loss is half the error's square, and beyond 1 its size less a
-        half. The estimates are sorted, so the sums over those within a range come from where its ends are: not every
-        quantile has to be compared with every estimate.
-        """
-        place, size = output.double(), output.shape[1]
-        share = (torch.arange(size, device=output.device) + 0.5) / size
-        ends = torch.searchsorted(target, torch.cat([output - 1, output, output + 1], 1))
-        number, total, square = (_sum_between(target.double().pow(power), ends) for power in range(3))
-        # In the ranges of errors below -1, to 0, to 1, and above it.
-        errors, squares = total - number * place, square - 2 * place * total + number * place.square()
-        slope_below, slope_above = errors[1] - number[0], errors[2] + number[3]
-        loss_below = 0.5 * (squares[1] - number[0]) - errors[0]
-        loss_above = 0.5 * (squares[2] - number[3]) + errors[3]
-        compared = output.numel() * target.shape[1] * len(self._critics)
-        loss = ((1 - share) * loss_below + share * loss_above).sum().item() / compared
-        return loss, (((1 - share) * slope_below + share * slope_above) / -compared).float()
+    def _differentiate_loss(self, output: Tensor, target: Tensor) -> Tensor:
+        # The slope of Huber's loss is the error, at most 1 either way. It counts by the quantile's share where it is
+        # positive, by the rest where it is negative; both sums come from the slopes' and their sizes'.
+        slopes = (target[:, None, :] - output[:, :, None]).clamp_(-1, 1)
+        total, size = slopes.sum(2), slopes.abs_().sum(2)
+        return (total + (2 * _quantile_shares(output) - 1) * size) / (-2 * slopes.numel() * len(self._critics))
 
     def _judge(self, outputs: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
         mean = torch.cat(outputs, 1)
@@ -51,8 +46,7 @@ class TqcUpdate(SacUpdate):
         return mean.mean(1, keepdim=True), [to_output] * len(outputs)
 
 
-def _sum_between(values: Tensor, ends: Tensor) -> Tensor:
-    """Return sums over a row's values before, between and after three ends, shape (4, batch, quantiles)."""
-    sums = torch.nn.functional.pad(values.cumsum(1), (1, 0))
-    first, second, third = sums.gather(1, ends).chunk(3, 1)
-    return torch.stack([first, second - first, third - second, sums[:, -1:] - third])
+def _quantile_shares(output: Tensor) -> Tensor:
+    """Return how much of the returns is to lie below each quantile, shape (quantiles,)."""
+    count = output.shape[1]
+    return (torch.arange(count, device=output.device) + 0.5) / count
