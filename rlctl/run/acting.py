@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -101,8 +100,8 @@ class PolicyPlayer(Player):
         self.exploration = Exploration()
         self._network = Network(info, tensors)
         _, self._space = info.env.spaces()
-        self._settings: Mapping[str, Any] = info.policy_kwargs
         self._uses_sde = bool(info.policy_kwargs.get("use_sde"))
+        self._to_std = _expln if info.policy_kwargs.get("use_expln") else np.exp
         self._algo = info.algo
         self._noise = Noise(max(1, math.prod(self._space.shape or ())))
         self._matrix: Array | None = None
@@ -125,9 +124,8 @@ class PolicyPlayer(Player):
         """Draw gSDE's exploration matrix, shape (latent, actions); with reduced parameters a column serves all."""
         log_std = self._network.log_std
         assert log_std is not None  # gSDE has it as a parameter
-        std = _expln(log_std) if self._settings.get("use_expln") else np.exp(log_std)
         size = (log_std.shape[0], len(self._low))
-        self._matrix = std * make_generator(seed, _MATRIX, step).standard_normal(size, np.float32)
+        self._matrix = self._to_std(log_std) * make_generator(seed, _MATRIX, step).standard_normal(size, np.float32)
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
         exploration = self.exploration

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -54,7 +53,7 @@ class CPolicy(Policy):
     def load(cls, path: Path) -> CPolicy:
         """Load a library whose description is the JSON file beside it; raises `ArtifactError` if it does not load."""
         try:
-            info = PolicyInfo.model_validate(json.loads(path.with_suffix(".json").read_text()))
+            info = PolicyInfo.model_validate_json(path.with_suffix(".json").read_text())
             return cls(info, ctypes.CDLL(str(path)))
         except OSError as error:
             raise ArtifactError(f"{path}: the compiled policy does not load: {error}") from None

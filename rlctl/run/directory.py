@@ -72,10 +72,7 @@ class RunDirectory:
 
     def checkpoints(self) -> list[Path]:
         """Return the folders of the complete checkpoints, oldest first."""
-        folder = self.path / "checkpoints"
-        if not folder.is_dir():
-            return []
-        return sorted(each for each in folder.iterdir() if each.name.isdecimal())
+        return sorted(each for each in self.path.glob("checkpoints/*") if each.name.isdecimal())
 
     def episode_file(self, number: int) -> Path:
         """Return the file of a recorded episode."""
@@ -133,7 +130,7 @@ class RunDirectory:
 
     def recover(self) -> None:
         """Repair what a killed process left half-done; only for the holder of the lock."""
-        for folder in [self.path, *(each for each in self.path.glob("*") if each.is_dir()), self.replay_segments]:
+        for folder in [self.path, *self.path.glob("*/"), self.replay_segments]:
             files.recover(folder)
 
     def lock(self) -> RunLock:
@@ -179,17 +176,12 @@ class RunLock(contextlib.AbstractContextManager["RunLock"]):
 def is_being_written(folder: Path) -> bool:
     """Say whether a process trains in a run folder now; False where the file system has no locks."""
     try:
-        descriptor = os.open(folder / ".lock", os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        with (folder / ".lock").open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except OSError:
+    except OSError:  # never locked, or no locks here
         return False
-    finally:
-        os.close(descriptor)
     return False
 
 

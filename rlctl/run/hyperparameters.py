@@ -36,13 +36,16 @@ class Parameters(Section):
     """Parameters by SB3's names; those that a recipe leaves out are not passed on."""
 
 
-class _OnPolicy(Parameters):
+class _Learning(Parameters):
     learning_rate: _Schedule = 3e-4
     """Step size of the optimiser; `lin_3e-4` falls from 3e-4 to zero over the training."""
-    n_steps: _Count = Field(2048, json_schema_extra=decide_by("4096 / n_envs, from 16 to 2048"))
-    """Steps per environment and rollout."""
     gamma: _PositiveFraction = 0.99
     """Discount per step."""
+
+
+class _OnPolicy(_Learning):
+    n_steps: _Count = Field(2048, json_schema_extra=decide_by("4096 / n_envs, from 16 to 2048"))
+    """Steps per environment and rollout."""
     gae_lambda: _Fraction = 0.95
     """Bias against variance of the advantage estimate (GAE); 1 is the Monte Carlo return."""
     ent_coef: _NotNegative = 0.0
@@ -98,9 +101,7 @@ class A2c(_OnPolicy):
     """Whether to use RMSProp instead of Adam."""
 
 
-class _OffPolicy(Parameters):
-    learning_rate: _Schedule = 3e-4
-    """Step size of the optimiser; `lin_3e-4` falls from 3e-4 to zero over the training."""
+class _OffPolicy(_Learning):
     buffer_size: Annotated[Whole, Field(ge=1, le=10**15)] = Field(
         1_000_000, json_schema_extra=decide_by("total_timesteps, from 1,000 to 1,000,000")
     )
@@ -109,8 +110,6 @@ class _OffPolicy(Parameters):
     """Steps of random actions before the first update."""
     batch_size: Whole = Field(256, ge=2, le=10**9)
     """Transitions per gradient step."""
-    gamma: _PositiveFraction = 0.99
-    """Discount per step."""
     train_freq: _Count = Field(1, json_schema_extra=decide_by("1"))
     """Steps of each environment between updates."""
     gradient_steps: _Count | Literal[-1] = Field(1, json_schema_extra=decide_by("-1"))
@@ -168,7 +167,6 @@ class Ddpg(_Continuous):
     tau: _PositiveFraction = 0.005
     """Share of the online network in each update of the target network."""
     action_noise: _NotNegative | None = Field(None, json_schema_extra=decide_by("0.1"))
-    """Standard deviation of normal noise on actions scaled to [-1, 1]; null: none."""
 
 
 class Td3(Ddpg):
@@ -190,7 +188,6 @@ class Dqn(_OffPolicy):
     tau: _PositiveFraction = 1.0
     """Share of the online network in each update of the target network."""
     train_freq: _Count = Field(4, json_schema_extra=decide_by("1"))
-    """Steps of each environment between updates."""
     target_update_interval: _Count = 10_000
     """Steps between updates of the target network."""
     exploration_fraction: _Fraction = 0.1

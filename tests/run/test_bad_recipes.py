@@ -141,8 +141,7 @@ def test_values_that_cannot_be(setting, expected):
     assert message.startswith(f"command line: {expected}")
 
 
-def test_a_key_that_never_ends():
-    assert "a key is names joined by dots" in refused(None, ["task" + ".a" * 10_000 + "=1"])
+def test_a_key_with_an_empty_part():
     assert "a key is names joined by dots" in refused(None, ["task..a=1"])
 
 
