@@ -114,12 +114,7 @@ def _take_place(new: Path, path: Path) -> None:
     aside = path.with_name(f".{path.name}{_OLD}")
     if path.exists():
         os.rename(path, aside)
-    try:
-        os.rename(new, path)
-    except OSError:
-        if aside.exists():
-            os.rename(aside, path)
-        raise
+    os.rename(new, path)
     remove_tree(aside)
 
 

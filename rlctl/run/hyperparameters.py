@@ -20,6 +20,7 @@ _Positive = Annotated[Number, Field(gt=0)]
 _ClipRange = Annotated[Number, Field(gt=0, le=10)]
 _Count = Annotated[Whole, Field(ge=1, le=10**9)]
 _CountFrom0 = Annotated[Whole, Field(ge=0, le=10**9)]
+_Minibatch = Annotated[Whole, Field(ge=2, le=10**9)]
 
 _Schedule = _PositiveFraction | Annotated[str, NumberAfter("lin_", _PositiveFraction)]
 _ClipSchedule = _ClipRange | Annotated[str, NumberAfter("lin_", _ClipRange)]
@@ -30,6 +31,10 @@ _EntropyCoefficient = _NotNegative | Literal["auto"] | Annotated[str, NumberAfte
 def decide_by(rule: str) -> dict[str, Any]:
     """Return the `json_schema_extra` of a parameter that rlctl chooses where a recipe does not: by which rule."""
     return {"default_text": f"{rule} *rlctl*"}
+
+
+_ROLLOUT = decide_by("4096 / n_envs, from 16 to 2048")
+_MINIBATCH = decide_by("128, or the whole rollout where that is smaller")
 
 
 class Parameters(Section):
@@ -44,7 +49,7 @@ class _Learning(Parameters):
 
 
 class _OnPolicy(_Learning):
-    n_steps: _Count = Field(2048, json_schema_extra=decide_by("4096 / n_envs, from 16 to 2048"))
+    n_steps: _Count = Field(2048, json_schema_extra=_ROLLOUT)
     """Steps per environment and rollout."""
     gae_lambda: _Fraction = 0.95
     """Bias against variance of the advantage estimate (GAE); 1 is the Monte Carlo return."""
@@ -65,9 +70,7 @@ class _OnPolicy(_Learning):
 class Ppo(_OnPolicy):
     """Proximal policy optimisation."""
 
-    batch_size: Whole = Field(
-        64, ge=2, le=10**9, json_schema_extra=decide_by("128, or the whole rollout where that is smaller")
-    )
+    batch_size: _Minibatch = Field(64, json_schema_extra=_MINIBATCH)
     """Minibatch size."""
     n_epochs: _Count = 10
     """Passes over each rollout."""
@@ -82,10 +85,8 @@ class Ppo(_OnPolicy):
 class RecurrentPpo(Ppo):
     """PPO with an LSTM."""
 
-    n_steps: _Count = Field(128, json_schema_extra=decide_by("4096 / n_envs, from 16 to 2048"))
-    batch_size: Whole = Field(
-        128, ge=2, le=10**9, json_schema_extra=decide_by("128, or the whole rollout where that is smaller")
-    )
+    n_steps: _Count = Field(128, json_schema_extra=_ROLLOUT)
+    batch_size: _Minibatch = Field(128, json_schema_extra=_MINIBATCH)
 
 
 class A2c(_OnPolicy):
@@ -108,7 +109,7 @@ class _OffPolicy(_Learning):
     """Transitions in the replay buffer."""
     learning_starts: _CountFrom0 = 100
     """Steps of random actions before the first update."""
-    batch_size: Whole = Field(256, ge=2, le=10**9)
+    batch_size: _Minibatch = 256
     """Transitions per gradient step."""
     train_freq: _Count = Field(1, json_schema_extra=decide_by("1"))
     """Steps of each environment between updates."""
@@ -184,7 +185,7 @@ class Dqn(_OffPolicy):
     """Deep Q-network."""
 
     learning_rate: _Schedule = 1e-4
-    batch_size: Whole = Field(32, ge=2, le=10**9)
+    batch_size: _Minibatch = 32
     tau: _PositiveFraction = 1.0
     """Share of the online network in each update of the target network."""
     train_freq: _Count = Field(4, json_schema_extra=decide_by("1"))
