@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import errno
 import fcntl
 import os
 from collections.abc import Mapping
@@ -23,8 +22,6 @@ GROUP_FILE = "group.json"
 """In the folder of a group, which holds runs of several seeds."""
 TUNE_FILE = "tune.json"
 """In the folder of a tuning, which holds the runs of its trials."""
-_DIGITS = 18  # of a training step
-_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 
 
 class _Place:
@@ -75,10 +72,7 @@ class RunDirectory:
 
     def checkpoints(self) -> list[Path]:
         """Return the folders of the complete checkpoints, oldest first."""
-        folder = self.path / "checkpoints"
-        if not folder.is_dir():
-            return []
-        return sorted(each for each in folder.iterdir() if each.name.isdecimal())
+        return sorted(each for each in self.path.glob("checkpoints/*") if each.name.isdecimal())
 
     def episode_file(self, number: int) -> Path:
         """Return the file of a recorded episode."""
@@ -126,7 +120,7 @@ class RunDirectory:
                 hint = "train longer, or use --checkpoint last" if which == "best" else "it saved none"
                 raise ArtifactError(f"{self.path}: no {which} policy yet; {hint}")
             return file
-        if not which.isdecimal() or len(which) > _DIGITS:
+        if not which.isdecimal():
             raise UsageError(f"--checkpoint {short_repr(which)!r}: give best, last, or the step of a checkpoint")
         file = self.checkpoint(int(which)) / "policy.safetensors"
         if not file.is_file():
@@ -136,7 +130,7 @@ class RunDirectory:
 
     def recover(self) -> None:
         """Repair what a killed process left half-done; only for the holder of the lock."""
-        for folder in [self.path, *(each for each in self.path.glob("*") if each.is_dir()), self.replay_segments]:
+        for folder in [self.path, *self.path.glob("*/"), self.replay_segments]:
             files.recover(folder)
 
     def lock(self) -> RunLock:
@@ -151,43 +145,29 @@ class RunDirectory:
         return RunLock(self.path)
 
 
-class RunLock:
+class RunLock(contextlib.AbstractContextManager["RunLock"]):
     """Keeps a second process from writing a run; the system releases it when the process ends, however it ends."""
 
     def __init__(self, folder: Path) -> None:
         self.keeps_out = True
         """Whether it does keep others out: some network file systems have no locks."""
-        self._file = folder / ".lock"
-        self._descriptor = self._claim()
-
-    def _claim(self) -> int:
-        descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o644)
+        self._file = (folder / ".lock").open("a+b", buffering=0)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            owner = os.read(descriptor, 100).decode(errors="replace").strip()
-            os.close(descriptor)
-            raise UsageError(
-                f"{self._file.parent}: another process is writing this run ({owner or 'unknown'})"
-            ) from None
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                os.close(descriptor)
-                raise
+            self._file.seek(0)
+            owner = self._file.read(100).decode(errors="replace").strip()
+            self._file.close()
+            raise UsageError(f"{folder}: another process is writing this run ({owner or 'unknown'})") from None
+        except OSError:
             self.keeps_out = False
         with contextlib.suppress(OSError):  # a full disk: only the name of the owner is missing then
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"pid {os.getpid()} on {os.uname().nodename}".encode(), 0)
-        return descriptor
+            self._file.truncate(0)
+            self._file.write(f"pid {os.getpid()} on {os.uname().nodename}".encode())
 
     def release(self) -> None:
         """Let go of the folder; a second call does nothing."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-        self._descriptor = -1
-
-    def __enter__(self) -> RunLock:
-        return self
+        self._file.close()
 
     def __exit__(self, *_: object) -> None:
         self.release()
@@ -196,17 +176,12 @@ class RunLock:
 def is_being_written(folder: Path) -> bool:
     """Say whether a process trains in a run folder now; False where the file system has no locks."""
     try:
-        descriptor = os.open(folder / ".lock", os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        with (folder / ".lock").open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except OSError:
+    except OSError:  # never locked, or no locks here
         return False
-    finally:
-        os.close(descriptor)
     return False
 
 

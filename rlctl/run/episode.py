@@ -75,7 +75,7 @@ def load_episode(path: Path) -> RecordedEpisode:
         raise ArtifactError(f"{path}: not an episode of rlctl: it has no info, actions, rewards and terms")
     info = untrusted.parse_model(str(arrays["info"]), EpisodeInfo, path, "episode")
     prefix = "observations/"
-    parts = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
+    parts = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
     observations: Observations = parts or arrays["observations"]
     episode = RecordedEpisode(info, arrays["actions"], observations, arrays["rewards"], arrays["terms"])
     if (problem := _find_mismatch(episode)) is not None:

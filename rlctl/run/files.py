@@ -20,41 +20,30 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-@contextlib.contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """Give a path beside `path`; what was written there takes its place when the block ends well."""
+def write_with(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` make a file beside its place, flush it to the disk, and rename it into place."""
     os.makedirs(path.parent, exist_ok=True)
     beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # keeps the suffix: some writers look at it
     try:
-        yield beside
+        write(beside)
+        sync(beside)
         os.replace(beside, path)
     except BaseException:
-        _remove(beside)
+        with contextlib.suppress(OSError):  # the error that led here is the one to report
+            os.unlink(beside)
         raise
     _sync_folder(path.parent)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file beside its place, flush it to the disk, and rename it into place."""
-    with _replacing(path) as beside:
-        write_new(beside, content)
-
-
-def write_with(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` make a file beside its place, flush it to the disk, and rename it into place."""
-    with _replacing(path) as beside:
-        write(beside)
-        sync(beside)
+    """Write a file, whole or not at all."""
+    write_with(path, lambda beside: append(beside, content, 0))
 
 
 def write_new(path: Path, content: bytes) -> None:
     """Write a file and flush it to the disk: for a folder that is not in its place yet."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
-    try:
-        _write_all(descriptor, content)
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    append(path, content, 0)
+    sync(path)
 
 
 def write_text(path: Path, content: str) -> None:
@@ -85,9 +74,16 @@ def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Read a `.npz` without pickle; raises `ArtifactError` if it is missing, damaged or of another kind."""
+    """Read a `.npz` without pickle; raises `ArtifactError` if it is missing, damaged, too large or of another kind."""
+    import numpy as np
+
     try:
-        return untrusted.read_arrays(path)
+        untrusted.check_archive(path)
+        arrays: dict[str, NDArray[Any]] = dict(np.load(path, allow_pickle=False))
+        for name, content in arrays.items():
+            if not isinstance(content, np.ndarray):  # numpy gives back the bytes of what has no header
+                raise ValueError(f"{name!r} is not an array")
+        return arrays
     except ArtifactError:
         raise
     except Exception as error:  # numpy raises whatever zipfile, zlib and its own parser raise
@@ -118,12 +114,7 @@ def _take_place(new: Path, path: Path) -> None:
     aside = path.with_name(f".{path.name}{_OLD}")
     if path.exists():
         os.rename(path, aside)
-    try:
-        os.rename(new, path)
-    except OSError:
-        if aside.exists():
-            os.rename(aside, path)
-        raise
+    os.rename(new, path)
     remove_tree(aside)
 
 
@@ -136,7 +127,7 @@ def recover(folder: Path) -> None:
         elif place.is_dir() and not place.is_symlink():
             remove_tree(place)
         else:
-            _remove(place)
+            remove(place)
 
 
 def remove_tree(path: Path) -> None:
@@ -152,18 +143,15 @@ def remove_tree(path: Path) -> None:
 
 
 def append(path: Path, content: bytes, size: int) -> None:
-    """Append to the `size` bytes that a file has, and cut it back to them if the disk does not take it all."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
+    """Append to the first `size` bytes of a file, and cut it back to them if the disk does not take it all."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     try:
-        if os.lseek(descriptor, 0, os.SEEK_END) > size:
+        os.ftruncate(descriptor, size)
+        _write_all(descriptor, content)
+    except OSError:
+        with contextlib.suppress(OSError):  # the next one to append cuts it back again
             os.ftruncate(descriptor, size)
-        os.lseek(descriptor, size, os.SEEK_SET)
-        try:
-            _write_all(descriptor, content)
-        except OSError:
-            with contextlib.suppress(OSError):  # the next one to append cuts it back again
-                os.ftruncate(descriptor, size)
-            raise
+        raise
     finally:
         os.close(descriptor)
 
@@ -224,11 +212,6 @@ def set_aside(path: Path) -> None:
 def remove(path: Path) -> None:
     """Remove a file, if it is there."""
     with contextlib.suppress(FileNotFoundError):
-        os.unlink(path)
-
-
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):  # the error that led here is the one to report
         os.unlink(path)
 
 

@@ -20,6 +20,7 @@ _Positive = Annotated[Number, Field(gt=0)]
 _ClipRange = Annotated[Number, Field(gt=0, le=10)]
 _Count = Annotated[Whole, Field(ge=1, le=10**9)]
 _CountFrom0 = Annotated[Whole, Field(ge=0, le=10**9)]
+_Minibatch = Annotated[Whole, Field(ge=2, le=10**9)]
 
 _Schedule = _PositiveFraction | Annotated[str, NumberAfter("lin_", _PositiveFraction)]
 _ClipSchedule = _ClipRange | Annotated[str, NumberAfter("lin_", _ClipRange)]
@@ -32,17 +33,24 @@ def decide_by(rule: str) -> dict[str, Any]:
     return {"default_text": f"{rule} *rlctl*"}
 
 
+_ROLLOUT = decide_by("4096 / n_envs, from 16 to 2048")
+_MINIBATCH = decide_by("128, or the whole rollout where that is smaller")
+
+
 class Parameters(Section):
     """Parameters by SB3's names; those that a recipe leaves out are not passed on."""
 
 
-class _OnPolicy(Parameters):
+class _Learning(Parameters):
     learning_rate: _Schedule = 3e-4
     """Step size of the optimiser; `lin_3e-4` falls from 3e-4 to zero over the training."""
-    n_steps: _Count = Field(2048, json_schema_extra=decide_by("4096 / n_envs, from 16 to 2048"))
-    """Steps per environment and rollout."""
     gamma: _PositiveFraction = 0.99
     """Discount per step."""
+
+
+class _OnPolicy(_Learning):
+    n_steps: _Count = Field(2048, json_schema_extra=_ROLLOUT)
+    """Steps per environment and rollout."""
     gae_lambda: _Fraction = 0.95
     """Bias against variance of the advantage estimate (GAE); 1 is the Monte Carlo return."""
     ent_coef: _NotNegative = 0.0
@@ -62,9 +70,7 @@ class _OnPolicy(Parameters):
 class Ppo(_OnPolicy):
     """Proximal policy optimisation."""
 
-    batch_size: Whole = Field(
-        64, ge=2, le=10**9, json_schema_extra=decide_by("128, or the whole rollout where that is smaller")
-    )
+    batch_size: _Minibatch = Field(64, json_schema_extra=_MINIBATCH)
     """Minibatch size."""
     n_epochs: _Count = 10
     """Passes over each rollout."""
@@ -79,10 +85,8 @@ class Ppo(_OnPolicy):
 class RecurrentPpo(Ppo):
     """PPO with an LSTM."""
 
-    n_steps: _Count = Field(128, json_schema_extra=decide_by("4096 / n_envs, from 16 to 2048"))
-    batch_size: Whole = Field(
-        128, ge=2, le=10**9, json_schema_extra=decide_by("128, or the whole rollout where that is smaller")
-    )
+    n_steps: _Count = Field(128, json_schema_extra=_ROLLOUT)
+    batch_size: _Minibatch = Field(128, json_schema_extra=_MINIBATCH)
 
 
 class A2c(_OnPolicy):
@@ -98,19 +102,15 @@ class A2c(_OnPolicy):
     """Whether to use RMSProp instead of Adam."""
 
 
-class _OffPolicy(Parameters):
-    learning_rate: _Schedule = 3e-4
-    """Step size of the optimiser; `lin_3e-4` falls from 3e-4 to zero over the training."""
+class _OffPolicy(_Learning):
     buffer_size: Annotated[Whole, Field(ge=1, le=10**15)] = Field(
         1_000_000, json_schema_extra=decide_by("total_timesteps, from 1,000 to 1,000,000")
     )
     """Transitions in the replay buffer."""
     learning_starts: _CountFrom0 = 100
     """Steps of random actions before the first update."""
-    batch_size: Whole = Field(256, ge=2, le=10**9)
+    batch_size: _Minibatch = 256
     """Transitions per gradient step."""
-    gamma: _PositiveFraction = 0.99
-    """Discount per step."""
     train_freq: _Count = Field(1, json_schema_extra=decide_by("1"))
     """Steps of each environment between updates."""
     gradient_steps: _Count | Literal[-1] = Field(1, json_schema_extra=decide_by("-1"))
@@ -168,7 +168,6 @@ class Ddpg(_Continuous):
     tau: _PositiveFraction = 0.005
     """Share of the online network in each update of the target network."""
     action_noise: _NotNegative | None = Field(None, json_schema_extra=decide_by("0.1"))
-    """Standard deviation of normal noise on actions scaled to [-1, 1]; null: none."""
 
 
 class Td3(Ddpg):
@@ -186,11 +185,10 @@ class Dqn(_OffPolicy):
     """Deep Q-network."""
 
     learning_rate: _Schedule = 1e-4
-    batch_size: Whole = Field(32, ge=2, le=10**9)
+    batch_size: _Minibatch = 32
     tau: _PositiveFraction = 1.0
     """Share of the online network in each update of the target network."""
     train_freq: _Count = Field(4, json_schema_extra=decide_by("1"))
-    """Steps of each environment between updates."""
     target_update_interval: _Count = 10_000
     """Steps between updates of the target network."""
     exploration_fraction: _Fraction = 0.1

@@ -65,11 +65,10 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
         )
     if tunings := sorted((root / registry.make_slug(text)).glob(f"*/{TUNE_FILE}")):
         raise ArtifactError(f"no run of {text!r} but the trials of rlctl tune; name one in {tunings[-1].parent}")
-    names = [each.name for each in root.iterdir() if each.is_dir()] if root.is_dir() else []
     if entry := registry.find(text):
         shipped = "; for the policy that it ships: --pretrained" if entry.policy_file else ""
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
-    hint = did_you_mean(text, names) or " All runs: rlctl runs"
+    hint = did_you_mean(text, [each.name for each in root.glob("*/")]) or " All runs: rlctl runs"
     raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{hint}")
 
 

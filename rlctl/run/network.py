@@ -23,19 +23,20 @@ _BATCH_RENORM_EPSILON = 1e-3
 _SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq")
 DETERMINISTIC = ("td3", "ddpg")
 """Algorithms whose policy has no distribution to sample from."""
-_RELU_BY_DEFAULT = (*_SQUASHED_GAUSSIAN, *DETERMINISTIC, "dqn")
+_ACTOR_CRITIC = (*_SQUASHED_GAUSSIAN, *DETERMINISTIC)
+_RELU_BY_DEFAULT = (*_ACTOR_CRITIC, "dqn")
 _NATURE_STRIDES = {"0": 4, "2": 2, "4": 1}
 """Strides of the convolutions of SB3's NatureCNN, the only one here, by their index."""
 
 
 def select_actor_tensors(info: PolicyInfo, tensors: Tensors) -> dict[str, Array]:
     """Return the tensors of a policy file that acting needs: the actor's and the normalisation's."""
-    prefixes = ["normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(info.algo))]
-    return {name: value for name, value in tensors.items() if name.startswith(tuple(prefixes))}
+    prefixes = ("normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(info.algo)))
+    return {name: value for name, value in tensors.items() if name.startswith(prefixes)}
 
 
 def _list_prefixes(algo: str) -> tuple[str, ...]:
-    if algo in (*_SQUASHED_GAUSSIAN, *DETERMINISTIC):
+    if algo in _ACTOR_CRITIC:
         return ("actor.",)
     if algo == "dqn":
         return ("q_net.",)
@@ -50,9 +51,8 @@ class Network:
 
     def __init__(self, info: PolicyInfo, tensors: Tensors) -> None:
         algo, read = info.algo, _Reader(info, tensors)
-        extractor = {"dqn": "q_net.features_extractor"}.get(algo, "pi_features_extractor")
-        if algo in (*_SQUASHED_GAUSSIAN, *DETERMINISTIC):
-            extractor = "actor.features_extractor"
+        owner = "actor." if algo in _ACTOR_CRITIC else "q_net." if algo == "dqn" else "pi_"
+        extractor = f"{owner}features_extractor"
         self.parts = {
             key: read.features(key, space, f"{extractor}.extractors.{key}" if key else extractor)
             for key, space in split_space(info.env.spaces()[0]).items()
@@ -61,9 +61,7 @@ class Network:
         self.lstm = read.lstm("lstm_actor") if algo == "recurrent_ppo" else None
         self.trunk, self.head = _read_actor(algo, read)
         """The head's result is the mean of the action, the action of TD3 and DDPG, logits, or values."""
-        self.is_squashed = algo in (*_SQUASHED_GAUSSIAN, *DETERMINISTIC) or bool(
-            info.policy_kwargs.get("squash_output")
-        )
+        self.is_squashed = algo in _ACTOR_CRITIC or bool(info.policy_kwargs.get("squash_output"))
         """Whether actions in a Box are in [-1, 1], and scaled to its bounds."""
         self.ends_with_tanh = self.is_squashed and algo not in DETERMINISTIC  # of these the head does
         """Whether tanh comes after the head, and after noise that is added to its result."""

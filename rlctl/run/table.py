@@ -68,7 +68,4 @@ class Table:
 
 def _read_size(path: Path) -> int:
     """Return a file's size in bytes; 0 if it is not there."""
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:
-        return 0
+    return path.stat().st_size if path.exists() else 0

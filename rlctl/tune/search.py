@@ -48,14 +48,11 @@ class StepSearch:
             pruner=optuna.pruners.MedianPruner(0, n_warmup_steps=_EVALUATIONS_UNJUDGED, n_min_trials=_TRIALS_UNJUDGED),
         )
         self._lock = threading.Lock()
+        own = [each for each in tuning.trials if each.step == number]
+        self._begun = [each for each in own if each.state == "begun"]
         # What the best so far has of these dimensions is known already.
-        self._add(best)
-        self._begun: list[Trial] = []
-        for trial in (each for each in tuning.trials if each.step == number):
-            if trial.state == "begun":
-                self._begun.append(trial)
-            else:
-                self._add(trial)
+        for trial in (best, *(each for each in own if each.state != "begun")):
+            self._add(trial)
 
     def count_waiting(self) -> int:
         """Return how many trials are still to be trained, those that were begun included."""

@@ -17,15 +17,14 @@ from typing import Any
 from rlctl import output
 from rlctl.env_spec import merge
 from rlctl.errors import TaskError, UsageError
-from rlctl.run.directory import ROOT, RunLock
+from rlctl.run.directory import ROOT, RunLock, create_group_folder
 from rlctl.run.hyperparameters import ON_POLICY
 from rlctl.run.recipe import Recipe
 from rlctl.run.recipe_sources import find_config, resolve_with_stages
 from rlctl.train.start import preserve_process_state
 from rlctl.train.trainings import Trainings, choose_jobs
-from rlctl.tune import tuning as folder
 from rlctl.tune.space import Dimension, fill_parameters, list_usual_steps, nest, parse_search
-from rlctl.tune.tuning import Metric, Trial, Tuning
+from rlctl.tune.tuning import Metric, Trial, Tuning, load
 
 _FEWEST_EVALUATIONS = 6
 _EVALUATIONS = 10
@@ -60,7 +59,7 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
     for dimension in (each for step in steps for each in step):
         _check(dimension, request)
     tuning = Tuning(
-        path=request.root,
+        path=create_group_folder(request.task, "tune", request.root),
         task=request.task,
         config=None if request.config is None else str(find_config(request.config).absolute()),
         settings=_evaluate_often_enough(recipe, request.settings),
@@ -69,7 +68,7 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
         seed=recipe.seed,
         steps=steps,
     )
-    tuning = folder.create(request.root, tuning)
+    tuning.save()
     with RunLock(tuning.path):
         return _search(tuning, jobs)
 
@@ -77,9 +76,9 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
 def resume(path: Path, *, jobs: int | None = None) -> Tuning:
     """Go on with a tuning; trials that were interrupted go on where they stopped."""
     _require_optuna()
-    folder.load(path)  # before a lock is written into a folder that is none
+    load(path)  # before a lock is written into a folder that is none
     with RunLock(path):
-        return _search(folder.load(path), jobs)
+        return _search(load(path), jobs)
 
 
 def _require_optuna() -> None:

@@ -12,7 +12,7 @@ import pydantic
 from rlctl.env_spec import merge
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files, yaml_text
-from rlctl.run.directory import TUNE_FILE, RunDirectory, create_group_folder
+from rlctl.run.directory import TUNE_FILE, RunDirectory
 from rlctl.run.group import find_run_of_seed
 from rlctl.run.recipe_sources import find_config, read
 from rlctl.runs.summary import list_points, read_table
@@ -100,13 +100,6 @@ def find_best(trials: list[Trial]) -> Trial | None:
     """Return the trial with the highest score among those that were trained to the end."""
     done = [(each.score, -each.number, each) for each in trials if each.state == "done" and each.score is not None]
     return max(done)[2] if done else None
-
-
-def create(root: Path, tuning: Tuning) -> Tuning:
-    """Make the folder of a new tuning, `<root>/<task>/<time>_tune`."""
-    created = dataclasses.replace(tuning, path=create_group_folder(tuning.task, "tune", root))
-    created.save()
-    return created
 
 
 def load(folder: Path) -> Tuning:
