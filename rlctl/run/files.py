@@ -114,7 +114,12 @@ def _take_place(new: Path, path: Path) -> None:
     aside = path.with_name(f".{path.name}{_OLD}")
     if path.exists():
         os.rename(path, aside)
-    os.rename(new, path)
+    try:
+        os.rename(new, path)
+    except OSError:
+        if aside.exists():
+            os.rename(aside, path)
+        raise
     remove_tree(aside)
 
 

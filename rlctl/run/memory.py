@@ -37,16 +37,19 @@ def _read_control_groups() -> list[int]:
         return []
     own = next((entry[3:] for entry in entries if entry.startswith("0::")), "/")
     folder = _CGROUPS / own.strip("/")
-    found = (_read_group(each) for each in (folder, *folder.parents) if each.is_relative_to(_CGROUPS))
+    groups = [each for each in (folder, *folder.parents) if each.is_relative_to(_CGROUPS)]
+    found = [_read_group(group, "memory.max", "memory.current", "file") for group in groups]
+    found.append(_read_group(_CGROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "cache"))
     return [value for value in found if value is not None]
 
 
-def _read_group(group: Path) -> int | None:
+def _read_group(group: Path, limit: str, used: str, given_back: str) -> int | None:
     try:
-        limit, used = (int((group / f"memory.{name}").read_text(encoding="ascii")) for name in ("max", "current"))
+        ceiling = int((group / limit).read_text(encoding="ascii"))  # "max" where there is none
+        taken = int((group / used).read_text(encoding="ascii"))
         rows = (group / "memory.stat").read_text(encoding="ascii").splitlines()
-    except (OSError, ValueError):  # the limit is "max" where there is none
+    except (OSError, ValueError):
         return None
     # Cached files count as used, and are given back when memory is short.
-    cached = next((int(row.split()[1]) for row in rows if row.startswith("file ")), 0)
-    return limit - used + cached
+    cached = next((int(row.split()[1]) for row in rows if row.startswith(f"{given_back} ")), 0)
+    return ceiling - taken + cached
