@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import sys
 import threading
-from pathlib import Path
 from typing import Any
 
 import optuna
@@ -182,8 +181,7 @@ def _make_arguments(tuning: Tuning, trial: Trial) -> list[str]:
     if run is not None and run.checkpoints():
         return ["train", "--resume", str(run.path)]
     settings = merge(tuning.settings, nest(trial.values))
-    config = Path(tuning.config) if tuning.config is not None else None
     # The recipe as it is has had the environment checked.
-    request = TrainRequest(tuning.task, config=config, settings=settings, check=trial.number == 0)
+    request = TrainRequest(tuning.task, config=tuning.config, settings=settings, check=trial.number == 0)
     seed = tuning.seed + trial.number
     return ["train", tuning.task, *list_options(request), f"--seed={seed}", "--output", str(tuning.path)]

@@ -61,7 +61,7 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
     tuning = Tuning(
         path=create_group_folder(request.task, "tune", request.root),
         task=request.task,
-        config=None if request.config is None else str(find_config(request.config).absolute()),
+        config=None if request.config is None else find_config(request.config).absolute(),
         settings=_evaluate_often_enough(recipe, request.settings),
         metric=request.metric,
         trials_per_step=request.trials,
@@ -117,9 +117,8 @@ def _search(tuning: Tuning, jobs: int | None) -> Tuning:
     from rlctl.tune.search import StepSearch, train
 
     to_go_on = f"rlctl tune --resume {shlex.quote(str(tuning.path))}"
-    config = None if tuning.config is None else Path(tuning.config)
     with preserve_process_state():
-        recipe = resolve_with_stages(tuning.task, config, tuning.settings)
+        recipe = resolve_with_stages(tuning.task, tuning.config, tuning.settings)
     output.print_notes([_describe(tuning, recipe, jobs), *_warn_of_long_rollouts(recipe)])
     if not tuning.trials:
         tuning.trials.append(Trial(0, 0, {}))

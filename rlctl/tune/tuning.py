@@ -14,7 +14,7 @@ from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files, yaml_text
 from rlctl.run.directory import TUNE_FILE, RunDirectory
 from rlctl.run.group import find_run_of_seed
-from rlctl.run.recipe_sources import find_config, read
+from rlctl.run.recipe_sources import read
 from rlctl.runs.summary import list_points, read_table
 from rlctl.tune.space import Dimension, nest
 
@@ -45,7 +45,7 @@ class Tuning:
 
     path: Path
     task: str
-    config: str | None
+    config: Path | None
     settings: dict[str, Any]
     """Of `--set` and the other flags, for every trial."""
     metric: Metric
@@ -83,7 +83,7 @@ class Tuning:
 
     def save(self) -> None:
         """Write `tune.json`, and the best recipe so far."""
-        content = dataclasses.asdict(self)
+        content = dataclasses.asdict(self) | {"config": None if self.config is None else str(self.config)}
         del content["path"]
         files.write_json(self.path / TUNE_FILE, content)
         if (best := self.best) is not None:
@@ -92,7 +92,7 @@ class Tuning:
     def _make_recipe(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return what goes over the task's recipe; how long and with which seed is left to the training."""
         kept = {key: value for key, value in self.settings.items() if key not in ("seed", "total_timesteps", "eval")}
-        config = read(find_config(Path(self.config))) if self.config is not None else {}
+        config = read(self.config) if self.config is not None else {}
         return merge(merge(config, kept), nest(values))
 
 
