@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -100,8 +101,8 @@ class PolicyPlayer(Player):
         self.exploration = Exploration()
         self._network = Network(info, tensors)
         _, self._space = info.env.spaces()
+        self._settings: Mapping[str, Any] = info.policy_kwargs
         self._uses_sde = bool(info.policy_kwargs.get("use_sde"))
-        self._to_std = _expln if info.policy_kwargs.get("use_expln") else np.exp
         self._algo = info.algo
         self._noise = Noise(max(1, math.prod(self._space.shape or ())))
         self._matrix: Array | None = None
@@ -124,13 +125,14 @@ class PolicyPlayer(Player):
         """Draw gSDE's exploration matrix, shape (latent, actions); with reduced parameters a column serves all."""
         log_std = self._network.log_std
         assert log_std is not None  # gSDE has it as a parameter
+        std = _expln(log_std) if self._settings.get("use_expln") else np.exp(log_std)
         size = (log_std.shape[0], len(self._low))
-        self._matrix = self._to_std(log_std) * make_generator(seed, _MATRIX, step).standard_normal(size, np.float32)
+        self._matrix = std * make_generator(seed, _MATRIX, step).standard_normal(size, np.float32)
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
         exploration = self.exploration
         if exploration.warmup:
-            return self._act_uniform(self._noise.draw(seed, step)[1])
+            return self._act_uniform(*self._noise.draw(seed, step))
         every = exploration.sde_every
         if every and step % every == 0 and self._uses_sde and exploration.stochastic:
             self._draw_matrix(seed, step)
@@ -169,7 +171,7 @@ class PolicyPlayer(Player):
         action: Array = low + np.float32(0.5) * (value + np.float32(1.0)) * (high - low)
         return action.astype(self._space.dtype, copy=False).reshape(self._space.shape or ())
 
-    def _act_uniform(self, uniform: Array) -> tuple[Any, Any]:
+    def _act_uniform(self, normal: Array, uniform: Array) -> tuple[Any, Any]:
         space = self._space
         if isinstance(space, spaces.Box):
             value = (2.0 * uniform[:-1] - 1.0).astype(np.float32)
@@ -179,10 +181,12 @@ class PolicyPlayer(Player):
 
     def _act_discrete(self, values: Array, seed: int, step: int) -> tuple[Any, Any]:
         exploration, space = self.exploration, self._space
-        uniform = self._noise.draw(seed, step)[1]
-        if uniform[-1] < exploration.epsilon:
-            return self._act_uniform(uniform)
-        sampled = uniform[:-1] if exploration.stochastic and self._algo != "dqn" else None
+        normal, uniform = (
+            self._noise.draw(seed, step) if exploration.stochastic or exploration.epsilon else (None, None)
+        )
+        if exploration.epsilon and uniform is not None and normal is not None and uniform[-1] < exploration.epsilon:
+            return self._act_uniform(normal, uniform)
+        sampled = None if uniform is None or self._algo == "dqn" else uniform[:-1]
         choice: Any
         if isinstance(space, spaces.MultiBinary):
             probability = 1.0 / (1.0 + np.exp(-values))

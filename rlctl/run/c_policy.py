@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -40,20 +41,23 @@ class CPolicy(Policy):
         self._act.argtypes, self._act.restype = [ctypes.c_void_p] * 3, None
         library.rlctl_repeat.argtypes, library.rlctl_repeat.restype = [*[ctypes.c_void_p] * 3, ctypes.c_long], None
         library.rlctl_state_size.restype = ctypes.c_size_t
-        size = sum(math.prod(shape) for shape, _ in self._parts.values())
+        self._keys = list(split_space(self.observation_space))
+        size = sum(math.prod(part.shape or ()) for part in split_space(self.observation_space).values())
         # C gets one observation and stacks frames by itself: the newest is the last.
         self._observation = np.zeros(size // info.spec.frame_stack, observation_type(info))
-        self._action = np.zeros(self.action_space.shape or (), action_type(info))
+        self._frames = info.spec.frame_stack
+        self._action = np.zeros(math.prod(self.action_space.shape or ()), action_type(info))
         # Opaque, and a multiple of four bytes.
         self._memory = np.zeros(library.rlctl_state_size() // 4, np.float32)
         self._pointers = tuple(each.ctypes.data for each in (self._observation, self._memory, self._action))
+        self._shape = self.action_space.shape or ()
         self._dtype = self._action.dtype if isinstance(self.action_space, spaces.Box) else np.dtype(np.int64)
 
     @classmethod
     def load(cls, path: Path) -> CPolicy:
         """Load a library whose description is the JSON file beside it; raises `ArtifactError` if it does not load."""
         try:
-            info = PolicyInfo.model_validate_json(path.with_suffix(".json").read_text())
+            info = PolicyInfo.model_validate(json.loads(path.with_suffix(".json").read_text()))
             return cls(info, ctypes.CDLL(str(path)))
         except OSError as error:
             raise ArtifactError(f"{path}: the compiled policy does not load: {error}") from None
@@ -64,7 +68,7 @@ class CPolicy(Policy):
             raise UsageError("an exported policy cannot sample: only its deterministic action is in the C file")
         self._fill(split(observation))
         self._act(*self._pointers)
-        return self._action.astype(self._dtype)
+        return self._action.reshape(self._shape).astype(self._dtype)
 
     def reset(self) -> None:
         """Begin an episode: forget the recurrent state and earlier frames."""
@@ -76,7 +80,10 @@ class CPolicy(Policy):
         self.library.rlctl_repeat(*self._pointers, count)
 
     def _fill(self, parts: dict[str, Any]) -> None:
-        if (frames := self.info.spec.frame_stack) > 1:
-            self._observation[:] = np.reshape(parts[SINGLE], (frames, -1))[-1]
+        if self._frames > 1:
+            value = np.reshape(parts[SINGLE], (self._frames, -1))[-1]
+        elif len(parts) > 1:
+            value = np.concatenate([parts[key] for key in self._keys], axis=None)
         else:
-            self._observation[:] = np.concatenate([parts[key] for key in self._parts], axis=None)
+            value = np.ravel(parts[self._keys[0]])
+        self._observation[:] = value

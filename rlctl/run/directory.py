@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
 import fcntl
 import os
 from collections.abc import Mapping
@@ -22,6 +23,8 @@ GROUP_FILE = "group.json"
 """In the folder of a group, which holds runs of several seeds."""
 TUNE_FILE = "tune.json"
 """In the folder of a tuning, which holds the runs of its trials."""
+_DIGITS = 18  # of a training step
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 
 
 class _Place:
@@ -72,7 +75,10 @@ class RunDirectory:
 
     def checkpoints(self) -> list[Path]:
         """Return the folders of the complete checkpoints, oldest first."""
-        return sorted(each for each in self.path.glob("checkpoints/*") if each.name.isdecimal())
+        folder = self.path / "checkpoints"
+        if not folder.is_dir():
+            return []
+        return sorted(each for each in folder.iterdir() if each.name.isdecimal())
 
     def episode_file(self, number: int) -> Path:
         """Return the file of a recorded episode."""
@@ -120,7 +126,7 @@ class RunDirectory:
                 hint = "train longer, or use --checkpoint last" if which == "best" else "it saved none"
                 raise ArtifactError(f"{self.path}: no {which} policy yet; {hint}")
             return file
-        if not which.isdecimal():
+        if not which.isdecimal() or len(which) > _DIGITS:
             raise UsageError(f"--checkpoint {short_repr(which)!r}: give best, last, or the step of a checkpoint")
         file = self.checkpoint(int(which)) / "policy.safetensors"
         if not file.is_file():
@@ -130,7 +136,7 @@ class RunDirectory:
 
     def recover(self) -> None:
         """Repair what a killed process left half-done; only for the holder of the lock."""
-        for folder in [self.path, *self.path.glob("*/"), self.replay_segments]:
+        for folder in [self.path, *(each for each in self.path.glob("*") if each.is_dir()), self.replay_segments]:
             files.recover(folder)
 
     def lock(self) -> RunLock:
@@ -145,29 +151,43 @@ class RunDirectory:
         return RunLock(self.path)
 
 
-class RunLock(contextlib.AbstractContextManager["RunLock"]):
+class RunLock:
     """Keeps a second process from writing a run; the system releases it when the process ends, however it ends."""
 
     def __init__(self, folder: Path) -> None:
         self.keeps_out = True
         """Whether it does keep others out: some network file systems have no locks."""
-        self._file = (folder / ".lock").open("a+b", buffering=0)
+        self._file = folder / ".lock"
+        self._descriptor = self._claim()
+
+    def _claim(self) -> int:
+        descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            self._file.seek(0)
-            owner = self._file.read(100).decode(errors="replace").strip()
-            self._file.close()
-            raise UsageError(f"{folder}: another process is writing this run ({owner or 'unknown'})") from None
-        except OSError:
+            owner = os.read(descriptor, 100).decode(errors="replace").strip()
+            os.close(descriptor)
+            raise UsageError(
+                f"{self._file.parent}: another process is writing this run ({owner or 'unknown'})"
+            ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                os.close(descriptor)
+                raise
             self.keeps_out = False
         with contextlib.suppress(OSError):  # a full disk: only the name of the owner is missing then
-            self._file.truncate(0)
-            self._file.write(f"pid {os.getpid()} on {os.uname().nodename}".encode())
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"pid {os.getpid()} on {os.uname().nodename}".encode(), 0)
+        return descriptor
 
     def release(self) -> None:
         """Let go of the folder; a second call does nothing."""
-        self._file.close()
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+        self._descriptor = -1
+
+    def __enter__(self) -> RunLock:
+        return self
 
     def __exit__(self, *_: object) -> None:
         self.release()
@@ -176,12 +196,17 @@ class RunLock(contextlib.AbstractContextManager["RunLock"]):
 def is_being_written(folder: Path) -> bool:
     """Say whether a process trains in a run folder now; False where the file system has no locks."""
     try:
-        with (folder / ".lock").open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        descriptor = os.open(folder / ".lock", os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except OSError:  # never locked, or no locks here
+    except OSError:
         return False
+    finally:
+        os.close(descriptor)
     return False
 
 

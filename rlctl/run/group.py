@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
-
-import pydantic
+from typing import Any
 
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run import files
@@ -93,8 +92,11 @@ def read_group(path: Path) -> Group:
     refuse_tuning(path)
     if not is_group(path):
         raise ArtifactError(f"{path}: not a group of runs: it has no {GROUP_FILE}")
-    content = files.read_json(path / GROUP_FILE)
+    content: Any = files.read_json(path / GROUP_FILE)
     try:
-        return pydantic.TypeAdapter(Group).validate_python({**content, "path": path})
-    except (pydantic.ValidationError, TypeError):
+        task, seeds, options = content["task"], content["seeds"], content["options"]
+        if not isinstance(task, str) or not all(isinstance(each, int) for each in seeds):
+            raise TypeError
+        return Group(path, task, list(seeds), [str(each) for each in options])
+    except (KeyError, TypeError):
         raise ArtifactError(f"{path / GROUP_FILE}: damaged: it does not name a task, seeds and options") from None

@@ -19,11 +19,15 @@ _ZEROS = b"0" * 64
 
 def encode(model: onnx.ModelProto) -> bytes:
     """Return the bytes of a model, with their sha256 in its metadata."""
-    kept = [each for each in model.metadata_props if each.key != DIGEST_KEY]
-    del model.metadata_props[:]
-    model.metadata_props.extend(kept)
-    model.metadata_props.add(key=DIGEST_KEY, value=_ZEROS.decode())
+    for index, entry in enumerate(model.metadata_props):
+        if entry.key == DIGEST_KEY:
+            del model.metadata_props[index]
+            break
+    entry = model.metadata_props.add()
+    entry.key, entry.value = DIGEST_KEY, _ZEROS.decode()
     content: bytes = model.SerializeToString()
+    if content.count(_ZEROS) != 1:
+        raise ValueError("it has 64 zeros as text, which is where the sha256 goes")
     return content.replace(_ZEROS, files.digest(content).encode())
 
 

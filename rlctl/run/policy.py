@@ -81,9 +81,13 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
             raise ArtifactError(f"{file}: this policy is not for this task: {difference}")
 
 
-@functools.cache  # each is read from a file, and every checkpoint needs them
 def collect_versions() -> dict[str, str]:
-    """Return the versions that a result depends on; do not change them."""
+    """Return the versions that a result depends on."""
+    return dict(_read_versions())
+
+
+@functools.cache  # each is read from a file, and every checkpoint needs them
+def _read_versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "rlctl": rlctl.__version__}
     for name in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet"):
         try:

@@ -204,8 +204,7 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
     try:
         return Recipe.model_validate(values)
     except pydantic.ValidationError as error:
-        algo = values.get("algo", "ppo")
-        schema = build_schema(algo if algo in ALGORITHMS else None)
+        schema = build_schema(values.get("algo", "ppo"))
 
         def explain(problem: Any, path: schema_text.Place) -> str:
             origins = (each if isinstance(each, str) else each.find(path) for each in sources)
@@ -215,9 +214,13 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
         raise RecipeError(schema_text.explain_all(error, schema, explain)) from None
 
 
-@functools.cache
-def build_schema(algo: str | None = None) -> schema_text.Schema:
+def build_schema(algo: Any = None) -> schema_text.Schema:
     """Return the JSON schema of a recipe, with the parameters of an algorithm and its networks; do not change it."""
+    return _build_schema(algo if isinstance(algo, str) and algo in ALGORITHMS else None)
+
+
+@functools.cache
+def _build_schema(algo: str | None) -> schema_text.Schema:
     schema = Recipe.model_json_schema()
     for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
         if algo in models:

@@ -55,8 +55,8 @@ stages:
 
 def render() -> str:
     """Return the page."""
-    lines = [_HEAD, "## Keys", "", *_render_table(build_schema(), (), Recipe)]
-    lines += [_STAGES, *_render_table(build_schema(), ("stages", 0), Stage)]
+    lines = [_HEAD, "## Keys", "", *_render_table(build_schema(None), (), Recipe)]
+    lines += [_STAGES, *_render_table(build_schema(None), ("stages", 0), Stage)]
     for algo in ALGORITHM_PARAMETERS:
         for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
             model = models[algo]

@@ -16,6 +16,7 @@ from rlctl.run.recipe import Normalize, Recipe, Source, validate
 
 _PRESETS = Path(__file__).with_name("presets")
 """Recipes that `--config` finds by name."""
+_DEEPEST_KEY = 20
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
 _OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events")
 _OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
@@ -134,7 +135,7 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
         if not equals or not key.strip():
             raise RecipeError(f"--set {short_repr(text)!r}: write key=value, for example --set task.tolerance=0.02")
         *path, last = key.strip().split(".")
-        if not all((*path, last)):
+        if len(path) >= _DEEPEST_KEY or not all((*path, last)):
             raise RecipeError(f"--set {short_repr(text)!r}: a key is names joined by dots, such as task.tolerance")
         place = result
         for part in path:

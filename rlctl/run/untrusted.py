@@ -18,12 +18,15 @@ from rlctl.errors import ArtifactError, short_repr
 from rlctl.run import memory
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
     from pydantic import BaseModel
 
 Model = TypeVar("Model", bound="BaseModel")
 
 JSON_LIMIT = 16 * 2**20  # [bytes]
 _ALWAYS_READ = 1_000_000  # [bytes]
+_MEMBERS = 1000
+"""How many arrays a file may have."""
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How arrays may be packed: as numpy does it. LZMA lets a file choose how much memory unpacking takes."""
 
@@ -72,19 +75,6 @@ def check_safetensors(path: Path) -> None:
         _check_size(path, os.fstat(file.fileno()).st_size)
 
 
-def check_archive(path: Path) -> None:
-    """Check what an `.npz` file says of its arrays' sizes; raises `ArtifactError`, and what zipfile raises if damaged.
-
-    An array whose own header says another size is no danger: numpy touches no memory before it is read.
-    """
-    with open_file(path) as file, zipfile.ZipFile(file) as archive:
-        members = archive.infolist()
-    for each in members:
-        if not each.filename.endswith(".npy") or each.compress_type not in _PACKED:
-            raise ValueError(f"{each.filename!r} is not an array, or not packed as numpy does it")
-    _check_size(path, sum(each.file_size for each in members), "unpacked ")
-
-
 def parse_json(text: str | bytes) -> Any:
     """Parse JSON; raises `ValueError` for what is damaged, nested too deeply or has a number too large to be one."""
     try:
@@ -116,3 +106,26 @@ def _explain_error(error: ValueError) -> str:
         place = ".".join(str(part) for part in problem["loc"]) or "it"
         return short_repr(f"{place}: {problem['msg']}, got {short_repr(problem['input'])}", 200)
     return short_repr(str(error), 200)
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an `.npz` file, by name, once what the archive says of their sizes was checked.
+
+    Raises `ArtifactError` for what is not a file, or is too large, and whatever numpy and zipfile raise for a damaged
+    one. An array whose own header says another size than the archive is one: numpy touches no memory before it is read.
+    """
+    import numpy as np
+
+    with open_file(path) as file, zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        if len(members) > _MEMBERS:
+            raise ValueError(f"it has {len(members):,} members, at most {_MEMBERS:,} are read")
+        for each in members:
+            if not each.filename.endswith(".npy") or each.compress_type not in _PACKED:
+                raise ValueError(f"{each.filename!r} is not an array, or not packed as numpy does it")
+        _check_size(path, sum(each.file_size for each in members), "unpacked ")
+        arrays: dict[str, NDArray[Any]] = dict(np.load(path, allow_pickle=False))
+    for name, content in arrays.items():
+        if not isinstance(content, np.ndarray):  # numpy gives back the bytes of what has no header
+            raise ValueError(f"{name!r} is not an array")
+    return arrays

@@ -13,6 +13,7 @@ from rlctl.errors import RecipeError, short_repr
 from rlctl.run import untrusted
 
 _PREFIX = "tag:yaml.org,2002:"
+_DEEPEST = 50
 _LONGEST = 2**20  # [bytes] of a file
 _MOST_DIGITS = 100  # of a whole number: one of thousands cannot even be read
 
@@ -22,6 +23,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 class _Loader(yaml.SafeLoader):
+    depth = 0
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # filled below: no dates
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
@@ -30,7 +32,12 @@ class _Loader(yaml.SafeLoader):
             raise _make_error("anchors and aliases (&name, *name) are not supported: write the values out", event)
         if getattr(event, "tag", None) is not None:  # bytes, sets, objects of Python
             raise _make_error("tags (!!int, !name) are not supported: write the value alone", event)
-        return super().compose_node(parent, index)
+        if self.depth >= _DEEPEST:
+            raise _make_error(f"nested more than {_DEEPEST} deep", event)
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[Any] = set()
@@ -98,7 +105,7 @@ def load(text: str, source: str) -> Any:
         finally:
             loader.dispose()
     except RecursionError:
-        raise RecipeError(f"{source}: nested too deeply") from None
+        raise RecipeError(f"{source}: nested more than {_DEEPEST} deep") from None
     except yaml.reader.ReaderError as error:
         raise RecipeError(f"{source}: character {error.character:#x} at {error.position:,} cannot be in YAML") from None
     except yaml.YAMLError as error:

@@ -41,9 +41,10 @@ def refused(config, settings=()):
         ("task: *b\n", ":1: anchors and aliases (&name, *name) are not supported"),
         ("base: &b {n_envs: 1}\n<<: *b\n", ":1: anchors and aliases (&name, *name) are not supported"),
         ("n_envs: 1\n<<: {seed: 1}\n", ":2: no key '<<'."),
-        ("task: " + "[" * 10_000 + "]" * 10_000, ": nested too deeply"),
-        ("task: " + "{a: " * 10_000 + "}" * 10_000, ": nested too deeply"),
-        ("- " * 10_000 + "a", ": nested too deeply"),
+        ("task: " + "[" * 10_000 + "]" * 10_000, ": nested more than 50 deep"),
+        ("task: " + "{a: " * 10_000 + "}" * 10_000, ": nested more than 50 deep"),
+        ("task: " + "[" * 60 + "]" * 60, ":1: nested more than 50 deep"),
+        ("- " * 10_000 + "a", ": nested more than 50 deep"),
         ("task: !!python/object/apply:os.system [touch pwned]\n", ":1: tags (!!int, !name) are not supported"),
         ("task: {a: !!binary aGk=}\n", ":1: tags (!!int, !name) are not supported: write the value alone"),
         ("n_envs: !!int many\n", ":1: tags (!!int, !name) are not supported"),
@@ -141,7 +142,8 @@ def test_values_that_cannot_be(setting, expected):
     assert message.startswith(f"command line: {expected}")
 
 
-def test_a_key_with_an_empty_part():
+def test_a_key_that_never_ends():
+    assert "a key is names joined by dots" in refused(None, ["task" + ".a" * 10_000 + "=1"])
     assert "a key is names joined by dots" in refused(None, ["task..a=1"])
 
 

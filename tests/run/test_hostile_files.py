@@ -74,6 +74,7 @@ def test_a_pickle_in_a_member(name, episode, tmp_path):
         ([("a.npy", header((11,)) + b"\0" * 80)], "EOF: reading array data, expected 88 bytes got 80"),
         ([("a.npy", b"\x93NUMPY\x09\x00" + b"\0" * 99)], "we only support format version"),
         ([("a.npy", b"not an array")], "'a' is not an array"),
+        ([(f"{n}.npy", array_file(np.zeros(0))) for n in range(1001)], "it has 1,001 members, at most 1,000 are read"),
     ],
 )
 def test_members_that_are_refused(members, message, tmp_path):
@@ -246,7 +247,7 @@ def test_a_run_with_a_link_out_of_it_is_not_written(name, tmp_path):
     assert outside.read_text() == "kept"
 
 
-@pytest.mark.parametrize("step", ["²", "-1", "../../x", ""])
+@pytest.mark.parametrize("step", ["²", "9" * 5000, "-1", "../../x", ""])
 def test_a_checkpoint_that_is_no_step(step, tmp_path):
     (tmp_path / "checkpoints" / "²").mkdir(parents=True)
     run = RunDirectory(tmp_path)
