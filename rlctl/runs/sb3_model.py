@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import math
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -227,7 +228,13 @@ def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
             raise NotPlainData("tensors of a big-endian machine")
         state = pickle_data.read(_read_member(archive, f"{prefix}data.pkl"))
         entries = state.items if isinstance(state, Call) else state
-        return {str(name): _read_tensor(value, archive, prefix) for name, value in dict(entries).items()}
+        tensors: dict[str, NDArray[Any]] = {}
+        left = LARGEST_MEMBER
+        for name, value in dict(entries).items():
+            tensors[str(name)] = tensor = _read_tensor(value, archive, prefix)
+            if (left := left - tensor.nbytes) < 0:  # many names may share one storage
+                raise NotPlainData(f"tensors of more than {LARGEST_MEMBER:,} bytes")
+        return tensors
 
 
 def _read_tensor(value: Any, archive: zipfile.ZipFile, prefix: str) -> NDArray[Any]:
@@ -246,5 +253,7 @@ def _read_tensor(value: Any, archive: zipfile.ZipFile, prefix: str) -> NDArray[A
         raise NotPlainData("a tensor that reaches out of its storage")
     if 0 in shape:
         return np.zeros(shape, dtype)
+    if math.prod(shape) > numbers.size:  # strides of 0 repeat numbers without end
+        raise NotPlainData("a tensor larger than its storage")
     steps = [stride * dtype.itemsize for stride in strides]
     return as_strided(numbers[offset:], shape, steps).copy()

@@ -55,6 +55,7 @@ def test_a_word_that_stands_for_no_run(root, make_run, tmp_path):
     assert error(ArtifactError, find_run, "raech", root) == (
         "no run 'raech': not a folder, and no task with a run. Did you mean 'reach'?"
     )
+    assert error(ArtifactError, find_run, "hoper", root).endswith("no task with a run. Did you mean 'hopper'?")
     (tmp_path / "stuff").mkdir()
     assert error(ArtifactError, find_run, "stuff", root) == "stuff: not a run of rlctl: it has no run.json"
 

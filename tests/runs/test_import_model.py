@@ -283,3 +283,22 @@ def test_tensors_cannot_reach_out_of_their_storage(save):
             archive.writestr(each, content)
     with pytest.raises(NotPlainData, match="reaches out of its storage"):
         read_tensors(short.getvalue())
+
+
+def test_tensors_cannot_repeat_their_storage_without_end(monkeypatch):
+    from rlctl.runs import sb3_model
+
+    def saved(state):
+        buffer = io.BytesIO()
+        torch.save(state, buffer)
+        return buffer.getvalue()
+
+    repeated = torch.ones(1).expand(1_000_000, 1_000_000)
+    with pytest.raises(NotPlainData, match="larger than its storage"):
+        sb3_model.read_tensors(saved({"a": repeated}))
+    shared = torch.ones(100)
+    content = saved({str(number): shared for number in range(11)})
+    assert len(sb3_model.read_tensors(content)) == 11
+    monkeypatch.setattr(sb3_model, "LARGEST_MEMBER", 4_000)
+    with pytest.raises(NotPlainData, match="more than 4,000 bytes"):
+        sb3_model.read_tensors(content)
