@@ -49,6 +49,9 @@ class PolicyClient:
         except (aiohttp.ClientError, OSError, ValueError) as error:
             await self._session.close()
             raise UsageError(f"{self.url}: no policy server answers: {describe_exception(error)}") from None
+        except PolicyError:
+            await self._session.close()
+            raise
 
     def _unpack(self, message: aiohttp.WSMessage) -> dict[str, Any]:
         if message.type is aiohttp.WSMsgType.TEXT:

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 import json
 import threading
 
@@ -11,7 +12,7 @@ from aiohttp import web
 from gymnasium import spaces
 
 from rlctl.deploy import messages
-from rlctl.deploy.client import RemotePlayer
+from rlctl.deploy.client import PolicyClient, RemotePlayer
 from rlctl.errors import PolicyError, RecipeError, UsageError
 from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.eval.report import as_json, count_interventions
@@ -150,3 +151,10 @@ def test_self_test_of_an_exported_policy(rlctl, tmp_path):
     content = json.loads(done.stdout)
     assert content["served"]["success_rate"] == content["direct"]["success_rate"] == 1.0
     assert (done.returncode == 0) == (content["problems"] == [])
+
+
+def test_a_server_that_greets_with_something_else(caplog):
+    with serve_answer(["hello"], {}) as url, pytest.raises(PolicyError, match="a list, not an answer"):
+        PolicyClient(url)
+    gc.collect()
+    assert "Unclosed" not in caplog.text
