@@ -29,7 +29,8 @@ def check_score(task: str, info: PolicyInfo, episodes: int = 20) -> None:
     assert provenance is not None, f"{task}: not written by rlctl export RUN --policy FILE"
     advice = (
         f"Has {task} changed since its policy was shipped? Then train it again and ship what it learns: rlctl train "
-        f"{task}; rlctl export {task} --policy {find_shipped_policy(task)}. If not, the change is a mistake"
+        f"{task}; rlctl export {task} --policy {find_shipped_policy(task)}. (If what it scores now is good enough, "
+        "measure it anew: the same with --pretrained.) If not, the change is a mistake"
     )
     known = provenance.score
     try:
@@ -112,8 +113,22 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
     assert scores["policy"].mean_return > scores["zero"].mean_return
     with pytest.raises(UsageError, match=r"policy.txt: the name of a policy file ends in .safetensors"):
         export_actor(str(run.path), checkpoint="best", target=tmp_path / "policy.txt")
+    save_policy(target, info, tensors)
     with pytest.raises(UsageError, match="no recipe is known of this policy; give the run"):
         export_actor(str(target), checkpoint="best", target=tmp_path / "other.safetensors")
+
+
+def test_a_shipped_policy_is_measured_anew(tmp_path):
+    shipped = read_info(find_shipped_policy("reach")).provenance
+    target = tmp_path / "reach.safetensors"
+    for source, checkpoint in (("reach", "pretrained"), (str(target), "best")):  # the second in its own place
+        again = export_actor(source, checkpoint=checkpoint, target=target, episodes=2).provenance
+        assert (again.run, again.recipe, again.git_commit) == (shipped.run, shipped.recipe, shipped.git_commit)
+        assert again.source_sha256 == shipped.source_sha256
+        assert again.score.episodes == 2
+    before, after = (read_policy(each)[1] for each in (find_shipped_policy("reach"), target))
+    assert all((before[name] == after[name]).all() for name in before)
+    assert before.keys() == after.keys()
 
 
 PUSH = """

@@ -34,22 +34,29 @@ class PolicyFileReport:
 def export_actor(run: str | None, *, checkpoint: str, target: Path, episodes: int = 100) -> PolicyFileReport:
     """Measure a run's policy and write its actor, with that score, recipe, task version and commit.
 
-    Zero and random actions are measured on the same episodes. Raises `UsageError` for a policy without a run.
+    Zero and random actions are measured on the same episodes. A policy file that was written so is measured anew, as
+    its task is now. Raises `UsageError` for any other policy without a run.
     """
     if target.suffix != ".safetensors":
         raise UsageError(f"--policy {target}: the name of a policy file ends in .safetensors")
     found = lookup.find_policy(run, checkpoint)
     output.print_notes(found.notes)
-    if found.run is None:
-        raise UsageError(f"{found.file}: no recipe is known of this policy; give the run that it is from")
     info, tensors = read_policy(found.file)
+    if found.run is not None:
+        run_name = "/".join(found.run.path.resolve().parts[-2:])
+        recipe = found.run.recipe().model_dump(mode="json", by_alias=True)
+        git_commit = found.run.status().get("git_commit")
+    elif (before := info.provenance) is not None:
+        run_name, recipe, git_commit = before.run, before.recipe, before.git_commit
+    else:
+        raise UsageError(f"{found.file}: no recipe is known of this policy; give the run that it is from")
     spec = found.locate(info.spec)
     request = EvalRequest(run=str(found.file), episodes=episodes)
     provenance = Provenance(
-        run="/".join(found.run.path.resolve().parts[-2:]),
+        run=run_name,
         **identify_task(spec.task),
-        git_commit=found.run.status().get("git_commit"),
-        recipe=found.run.recipe().model_dump(mode="json", by_alias=True),
+        git_commit=git_commit,
+        recipe=recipe,
         score=measure_score(request),
         baselines={name: measure_score(dataclasses.replace(request, baseline=name, spec=spec)) for name in BASELINES},
     )
