@@ -68,7 +68,7 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
     if entry := registry.find(text):
         shipped = "; for the policy that it ships: --pretrained" if entry.policy_file else ""
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
-    names = {each.name for each in [*root.glob("*/"), *registry.list_installed()]}
+    names = {each.name for each in root.glob("*/")} | {each.name for each in registry.list_installed()}
     hint = did_you_mean(text, sorted(names)) or " All runs: rlctl runs"
     raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{hint}")
 
