@@ -116,6 +116,9 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
     save_policy(target, info, tensors)
     with pytest.raises(UsageError, match="no recipe is known of this policy; give the run"):
         export_actor(str(target), checkpoint="best", target=tmp_path / "other.safetensors")
+    (tmp_path / "policy.onnx").touch()
+    with pytest.raises(UsageError, match=r"policy.onnx: no recipe is known of this policy; give the run"):
+        export_actor(str(tmp_path / "policy.onnx"), checkpoint="best", target=target)
 
 
 def test_a_shipped_policy_is_measured_anew(tmp_path):

@@ -14,8 +14,9 @@ from rlctl.eval.evaluate import EvalRequest
 from rlctl.eval.score import describe_score, measure_score
 from rlctl.rollout.baselines import BASELINES
 from rlctl.run import lookup
+from rlctl.run.lookup import FoundPolicy
 from rlctl.run.network import select_actor_tensors
-from rlctl.run.policy import PolicyInfo, read_policy, save_policy
+from rlctl.run.policy import PolicyInfo, read_info, read_policy, save_policy
 from rlctl.run.shipped import Provenance
 from rlctl.run.task_version import identify_task
 
@@ -41,28 +42,33 @@ def export_actor(run: str | None, *, checkpoint: str, target: Path, episodes: in
         raise UsageError(f"--policy {target}: the name of a policy file ends in .safetensors")
     found = lookup.find_policy(run, checkpoint)
     output.print_notes(found.notes)
+    origin = _find_origin(found)
     info, tensors = read_policy(found.file)
-    if found.run is not None:
-        run_name = "/".join(found.run.path.resolve().parts[-2:])
-        recipe = found.run.recipe().model_dump(mode="json", by_alias=True)
-        git_commit = found.run.status().get("git_commit")
-    elif (before := info.provenance) is not None:
-        run_name, recipe, git_commit = before.run, before.recipe, before.git_commit
-    else:
-        raise UsageError(f"{found.file}: no recipe is known of this policy; give the run that it is from")
     spec = found.locate(info.spec)
     request = EvalRequest(run=str(found.file), episodes=episodes)
     provenance = Provenance(
-        run=run_name,
+        **origin,
         **identify_task(spec.task),
-        git_commit=git_commit,
-        recipe=recipe,
         score=measure_score(request),
         baselines={name: measure_score(dataclasses.replace(request, baseline=name, spec=spec)) for name in BASELINES},
     )
     info = info.model_copy(update={"provenance": provenance})
     save_policy(target, info, select_actor_tensors(info, tensors))
     return PolicyFileReport(target, info, provenance, target.stat().st_size)
+
+
+def _find_origin(found: FoundPolicy) -> dict[str, Any]:
+    """Return which training a policy is from, as `Provenance` has it."""
+    if found.run is not None:
+        return {
+            "run": "/".join(found.run.path.resolve().parts[-2:]),
+            "git_commit": found.run.status().get("git_commit"),
+            "recipe": found.run.recipe().model_dump(mode="json", by_alias=True),
+        }
+    before = read_info(found.file).provenance if found.file.suffix == ".safetensors" else None
+    if before is None:
+        raise UsageError(f"{found.file}: no recipe is known of this policy; give the run that it is from")
+    return before.model_dump(include={"run", "git_commit", "recipe"})
 
 
 def show(report: PolicyFileReport, json: str | None) -> None:
