@@ -15,9 +15,11 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import obs_as_tensor
 
-from rlctl.dict_spaces import split
+from rlctl.dict_spaces import join, split, split_names
 from rlctl.eval.statistics import mean_metrics, mean_return, mean_terms, success_rate
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.env_info import EnvInfo
@@ -67,6 +69,8 @@ def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timest
             model.logger.record(f"rollout/{name}", value)
     part = max(1, total_timesteps // HISTOGRAMS)
     if last is not None and steps // part > last_row // part:
+        if last.values is None:
+            last = dataclasses.replace(last, values=estimate_values(model, last))
         for name, values in collect_histograms(last, env.workers.info).items():
             model.logger.record(name, values)
     return row
@@ -189,22 +193,37 @@ def recent_gradient_norm(optimizer: torch.optim.Optimizer) -> float | None:
 
 
 def collect_histograms(last: LastSteps, info: EnvInfo) -> dict[str, torch.Tensor]:
-    """Return what TensorBoard draws distributions of: actions, values, and observed angles."""
-    found = {"actions": last.action, **_angles(last.observation, info)}
+    """Return what TensorBoard draws distributions of: actions, values, and observations by name."""
+    found = {"actions": last.action, **_named_observations(last.observation, info)}
     if last.values is not None:
         found["values"] = last.values
     return {f"histograms/{name}": _sample(values) for name, values in found.items()}
 
 
-def _angles(observation: Mapping[str, NDArray[Any]], info: EnvInfo) -> dict[str, NDArray[Any]]:
-    named = dict(observation)
-    if list(observation) == [""] and info.observation_sizes:  # flat: its parts in their order
-        bounds = np.cumsum([0, *info.observation_sizes.values()])
-        named = {
-            name: observation[""][..., low:high]
-            for name, low, high in zip(info.observation_sizes, bounds, bounds[1:], strict=False)
-        }
-    return {name: named[name] for name, unit in info.observation_units.items() if unit == "rad" and name in named}
+def _named_observations(observation: Mapping[str, NDArray[Any]], info: EnvInfo) -> dict[str, NDArray[Any]]:
+    rows = join({key: values.reshape(-1, *values.shape[2:]) for key, values in observation.items()})
+    named = split_names(rows, info.observation_sizes)
+    return {name: values for name, values in named.items() if name and np.issubdtype(values.dtype, np.floating)}
+
+
+def estimate_values(model: BaseAlgorithm, last: LastSteps) -> NDArray[Any]:
+    """Return what an off-policy critic expects of some of the steps: the mean of its networks and quantiles."""
+    picked = slice(None, None, max(1, last.action[..., 0].size // _SAMPLES))
+    rows = {key: values.reshape(-1, *values.shape[2:])[picked] for key, values in last.observation.items()}
+    observation, normalizer = join(rows), model.get_vec_normalize_env()
+    if normalizer is not None:
+        observation = normalizer.normalize_obs(observation)
+    tensors: Any = obs_as_tensor(observation, model.device)
+    actions = torch.as_tensor(last.action.reshape(-1, *last.action.shape[2:])[picked], device=model.device)
+    model.policy.set_training_mode(False)
+    with torch.no_grad():
+        if isinstance(model, DQN):
+            values = model.q_net(tensors).gather(1, actions.long())
+        else:
+            found = model.critic(tensors, actions.float())  # type: ignore[attr-defined]
+            values = found if isinstance(found, torch.Tensor) else torch.cat(found, dim=1)
+    result: NDArray[Any] = values.flatten(1).mean(1).cpu().numpy()
+    return result
 
 
 def _sample(values: NDArray[Any]) -> torch.Tensor:

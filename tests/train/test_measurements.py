@@ -1,12 +1,24 @@
 """What rows of metrics say of actions, by hand."""
 
+import dataclasses
+
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import DQN, SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rlctl.run.env_info import EnvInfo, space_to_json
-from rlctl.train.measurements import LastSteps, collect_histograms, recent_gradient_norm, summarize_steps
+from rlctl.train.measurements import (
+    LastSteps,
+    collect_histograms,
+    estimate_values,
+    recent_gradient_norm,
+    summarize_steps,
+)
 
 
 def play(actions, done=(), terminated=()):
@@ -58,15 +70,43 @@ def test_adam_remembers_how_large_gradients_were():
     assert recent_gradient_norm(optimizer) == pytest.approx(5.0, rel=1e-4)
 
 
-def test_angles_have_histograms_by_name():
-    info = EnvInfo(
+def test_observations_have_histograms_by_name():
+    names = EnvInfo(
         observation_space=space_to_json(spaces.Box(-9.0, 9.0, (3,))),
         action_space=space_to_json(LINE),
         observation_sizes={"joint_positions": 2, "height": 1},
-        observation_units={"joint_positions": "rad", "height": "m"},
+        observation_units={"joint_positions": "rad"},
     )
-    found = collect_histograms(play([0.0] * 5), info)
+    steps = play([0.0] * 5)
+    found = collect_histograms(steps, names)
     assert {name: tuple(values.shape) for name, values in found.items()} == {
         "histograms/actions": (5,),
         "histograms/joint_positions": (10,),
+        "histograms/height": (5,),
     }
+    # Pictures and what has no name have none.
+    picture = {"camera": np.zeros((1, 5, 4, 4, 3), np.uint8)}
+    for nameless in (steps, dataclasses.replace(steps, observation=picture)):
+        assert collect_histograms(nameless, names.model_copy(update={"observation_sizes": {}})).keys() == {
+            "histograms/actions"
+        }
+
+
+@pytest.mark.parametrize(("algorithm", "env"), [(SAC, "Pendulum-v1"), (TQC, "Pendulum-v1"), (DQN, "CartPole-v1")])
+def test_the_values_of_an_off_policy_critic(algorithm, env):
+    venv = VecNormalize(DummyVecEnv([lambda: gymnasium.make(env)]), norm_reward=False)
+    model = algorithm("MlpPolicy", venv, buffer_size=10, device="cpu", policy_kwargs={"net_arch": [8]})
+    venv.obs_rms.mean[:] = 1.0
+    rng, discrete = np.random.default_rng(0), algorithm is DQN
+    observation = rng.normal(size=(2, 4, *venv.observation_space.shape)).astype(np.float32)
+    action = np.arange(8).reshape(2, 4, 1) % 2 if discrete else rng.uniform(-1, 1, (2, 4, 1)).astype(np.float32)
+    never = np.zeros((2, 4), bool)
+    values = estimate_values(model, LastSteps({"": observation}, action, never, never, None))
+    assert values.shape == (8,)
+    last = torch.as_tensor((observation[1, 3:] - 1.0) / np.sqrt(1 + 1e-8))  # of step 4 of environment 2, normalised
+    with torch.no_grad():
+        if discrete:
+            expected = model.q_net(last)[0, 1]
+        else:
+            expected = torch.stack(tuple(model.critic(last, torch.as_tensor(action[1, 3:])))).mean()
+    assert values[7] == pytest.approx(float(expected), rel=1e-5)
