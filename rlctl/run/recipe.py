@@ -44,6 +44,14 @@ class Normalize(Section):
     clip_reward: Number = Field(10.0, gt=0)
     """Bound of normalised rewards."""
 
+    @pydantic.model_validator(mode="after")
+    def _check_bounds(self) -> Normalize:
+        for name, normalized in (("observation", self.observation), ("reward", self.reward)):
+            bound = f"clip_{name}"
+            if not normalized and getattr(self, bound) != type(self).model_fields[bound].default:
+                raise ValueError(f"{bound} has no effect with {name}: false; what is normalised is clipped")
+        return self
+
 
 class Evaluation(Section):
     """Evaluation while training; steps are environment steps, all environments together."""

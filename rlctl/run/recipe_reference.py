@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 from pydantic import BaseModel
@@ -10,6 +11,7 @@ from rlctl.run import schema_text, yaml_text
 from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.run.network_parameters import NETWORK_PARAMETERS
 from rlctl.run.recipe import Recipe, build_schema
+from rlctl.run.recipe_sources import list_presets
 from rlctl.run.schema_text import Schema
 from rlctl.run.stages import Stage
 
@@ -40,6 +42,10 @@ policy was trained with.
 
 A default with *rlctl* is chosen by rlctl; the others are those of Stable-Baselines3.
 
+Presets come with rlctl and go over the task's own recipe like a file, by `--config presets/NAME`:
+
+{presets}
+
 This page is generated: `python -m rlctl.run.recipe_reference > docs/recipe.md`.
 """
 _STAGES = """
@@ -55,7 +61,12 @@ stages:
 
 def render() -> str:
     """Return the page."""
-    lines = [_HEAD, "## Keys", "", *_render_table(build_schema(None), (), Recipe)]
+    lines = [
+        _HEAD.replace("{presets}", "\n".join(_render_presets())),
+        "## Keys",
+        "",
+        *_render_table(build_schema(None), (), Recipe),
+    ]
     lines += [_STAGES, *_render_table(build_schema(None), ("stages", 0), Stage)]
     for algo in ALGORITHM_PARAMETERS:
         for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
@@ -64,6 +75,13 @@ def render() -> str:
             lines += ["", f"{heading}`{key}`: {(model.__doc__ or '').strip()}", ""]
             lines += _render_table(build_schema(algo), (key,), model)
     return "\n".join(lines) + "\n"
+
+
+def _render_presets() -> Iterator[str]:
+    """Yield a line for each preset, with the first sentence of its file's comment."""
+    for name, file in list_presets().items():
+        comment = itertools.takewhile(lambda line: line.startswith("# "), file.read_text().splitlines())
+        yield f"- `{name}`: {' '.join(line[2:] for line in comment).partition('. ')[0].rstrip('.')}."
 
 
 def _render_table(root: Schema, path: Path, model: type[BaseModel]) -> list[str]:

@@ -106,9 +106,9 @@ def read(path: Path) -> dict[str, Any]:
     return content or {}
 
 
-def list_presets() -> list[str]:
-    """Return the names that `--config` knows: `presets/ppo`, and so on."""
-    return sorted(f"presets/{file.stem}" for file in _PRESETS.glob("*.yaml"))
+def list_presets() -> dict[str, Path]:
+    """Return the names that `--config` knows, `presets/ppo` and so on, and their files."""
+    return {f"{_PRESETS.name}/{file.stem}": file for file in sorted(_PRESETS.glob("*.yaml"))}
 
 
 def find_config(config: Path) -> Path:
