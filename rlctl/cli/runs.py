@@ -76,6 +76,7 @@ def compare_runs(
     episodes: Annotated[int, typer.Option(help="Episodes that each run plays.", min=2)] = 100,
     seed: EpisodeSeed = 0,
     task: Annotated[str | None, typer.Option(help="Evaluate all on this task.")] = None,
+    settings: Set = [],
     threshold: Annotated[
         float | None, typer.Option(help="Success rate (or return) to be reached soon; 0.9 where success is known.")
     ] = None,
@@ -88,7 +89,8 @@ def compare_runs(
     from rlctl.runs.comparison import compare
     from rlctl.runs.comparison_report import show
 
-    result = compare(runs, EvalRequest(None, task=task, episodes=episodes, seed=seed), threshold)
+    changes = parse_changes(settings)
+    result = compare(runs, EvalRequest(None, task=task, episodes=episodes, seed=seed, changes=changes), threshold)
     show(result, json)
     if gate:
         result.check()

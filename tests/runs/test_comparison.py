@@ -54,6 +54,13 @@ def test_all_play_in_the_world_of_the_first(root):
     assert result.world_differences == ["task.goal", "randomize"]
 
 
+def test_settings_change_that_world(root, rlctl):
+    runs = map(str, sorted((root / "0.9/Line").iterdir()))
+    result = rlctl("runs", "compare", *runs, "--set", "task.goal=0.3")
+    assert result.returncode == 2
+    assert "has no parameter 'goal'" in result.stderr
+
+
 def test_recipes_are_compared_seed_by_seed(root):
     result = compare([str(root / "0.9/Line"), f"{root}/0.99/Line/*"], EvalRequest(None, episodes=3))
     assert result.of_recipes
