@@ -52,7 +52,6 @@ class Locomotion(Task):
         "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
         "friction": Event("reset", events.set_friction, body="floor", friction=(0.3, 1.5)),
         "gravity": Event("reset", events.shift_gravity, change=(-0.5, 0.5)),  # [m/s^2]
-        "joint_damping": Event("reset", events.scale_joint_damping, body="robot", factor=(0.5, 1.5)),
         "color": Event("reset", events.set_color, body="robot", red=(0, 1), green=(0, 1), blue=(0, 1)),
         "motor_strength": Event("reset", events.scale_motor_strength, body="robot", factor=(0.8, 1.0)),
         "start": Event("start", events.offset_joints, body="robot", velocity=(-0.1, 0.1)),  # [rad/s]

@@ -1,5 +1,7 @@
 """Ant, half-cheetah, hopper, walker and humanoid: the attributes that make each of them of `Locomotion`."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from rlctl.task import Box, Event, events
@@ -11,12 +13,16 @@ PLANAR = {
 }
 
 
-def pushes(force: float, link: str | None = None) -> dict[str, Event]:
-    """Return the events of all robots, and a push of at most `force` [N]: a tenth of the robot's weight."""
+def vary(motors: Iterable[str], force: float, link: str | None = None) -> dict[str, Event]:
+    """Return the events of all robots, damping [N m s/rad] of joints, and a push of at most `force` [N].
+
+    The models have no damping to scale. A push is a tenth of the robot's weight.
+    """
+    damping = Event("reset", events.set_joint_damping, body="robot", joints=list(motors), damping=(0.0, 0.5))
     push = Event(
         "interval", events.push, every_s=3.0, body="robot", link=link, force=(0.0, force), duration_s=(0.2, 0.2)
     )
-    return {**Locomotion.events, "push": push}
+    return {**Locomotion.events, "joint_damping": damping, "push": push}
 
 
 class Ant(Locomotion):
@@ -27,7 +33,7 @@ class Ant(Locomotion):
     feet = ("front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot")
     motors = dict.fromkeys((f"{joint}_{leg}" for leg in (1, 2, 3, 4) for joint in ("hip", "ankle")), 2.5 * 100)  # [N m]
     action_space = Box(-1.0, 1.0, (8,), np.float32)
-    events = pushes(force=180.0)
+    events = vary(motors, force=180.0)
     rlctl_ignore = {
         **Locomotion.rlctl_ignore,
         "RL804": "the family starts every joint within 0.1 rad of 0, and no ankle can be there",
@@ -53,7 +59,7 @@ class HalfCheetah(Locomotion):
         "ffoot": 0.9 * 30,
     }  # [N m]
     action_space = Box(-1.0, 1.0, (6,), np.float32)
-    events = pushes(force=37.0, link="torso")
+    events = vary(motors, force=37.0, link="torso")
     rlctl_ignore = {**PLANAR, "RL804": "its motors are strong enough to push a foot through the springs at its limits"}
 
     def stands(self, height: float, pitch: float) -> bool:
@@ -74,7 +80,7 @@ class Hopper(Locomotion):
     feet = ("foot",)
     motors = dict.fromkeys(("thigh_joint", "leg_joint", "foot_joint"), 0.75 * 100)  # [N m]
     action_space = Box(-1.0, 1.0, (3,), np.float32)
-    events = pushes(force=15.0, link="torso")
+    events = vary(motors, force=15.0, link="torso")
     rlctl_ignore = PLANAR
 
     def stands(self, height: float, pitch: float) -> bool:
@@ -97,7 +103,7 @@ class Walker2D(Locomotion):
         "foot_left_joint": 0.4 * 30,
     }  # [N m]
     action_space = Box(-1.0, 1.0, (6,), np.float32)
-    events = pushes(force=23.0, link="torso")
+    events = vary(motors, force=23.0, link="torso")
     rlctl_ignore = PLANAR
 
     def stands(self, height: float, pitch: float) -> bool:
@@ -130,7 +136,7 @@ class Humanoid(Locomotion):
     alive_bonus = 2.0  # seventeen noisy motors cost a lot: living must be better than falling
     power_weight, torque_weight = 4.25 * 2.0, 4.25 * 0.1
     action_space = Box(-1.0, 1.0, (17,), np.float32)
-    events = pushes(force=40.0)
+    events = vary(motors, force=40.0)
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start as the others do."""

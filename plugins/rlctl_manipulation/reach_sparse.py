@@ -17,7 +17,7 @@ class ReachSparse(Reach):
 
     observation_layout = "dict"
     observation_units = {"achieved_goal": "m", "desired_goal": "m"}
-    reward_weights = {"away": -1.0, "within_2_cm": 0.0}
+    reward_weights = {"away": -1.0, "within_2_cm": 0.0, "distance": 0.0}
     events = {
         name: event for name, event in Reach.events.items() if not name.endswith("noise") or name == "action_noise"
     } | {
@@ -35,9 +35,10 @@ class ReachSparse(Reach):
         }
 
     def rewards(self, action: np.ndarray) -> dict[str, float]:
-        """Return 1 for every step away from the goal; within 2 cm is the strict measure, and not rewarded."""
+        """Return 1 for every step away from the goal; how far away, and within 2 cm or not, is not rewarded."""
         distance = self.distance()
-        return {"away": float(distance >= self.tolerance), "within_2_cm": float(distance < STRICT)}
+        away, strict = float(distance >= self.tolerance), float(distance < STRICT)
+        return {"away": away, "within_2_cm": strict, "distance": distance}
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
         """Return -1 away from the goal, 0 at it."""

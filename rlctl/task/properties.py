@@ -154,9 +154,14 @@ class Properties:
             self._change(link, lateralFriction=friction)
 
     def scale_joint_damping(self, factor: float, joints: Sequence[str] = ()) -> None:
-        """Set the joints' damping to `factor` times the built world's values, until the next reset."""
-        nominal = self._damping
-        self._set_damping({index: factor * nominal[index] for index in self.find_joints(joints)})
+        """Set the joints' damping to `factor` times the built world's values, until the next reset.
+
+        Raises `TaskError` if all of these are 0, which no factor changes.
+        """
+        nominal, chosen = self._damping, self.find_joints(joints)
+        if not any(nominal[index] for index in chosen):
+            raise TaskError(f"{self.file.name}: these joints have no damping to scale; use set_joint_damping")
+        self._set_damping({index: factor * nominal[index] for index in chosen})
 
     def set_joint_damping(self, damping: float, joints: Sequence[str] = ()) -> None:
         """Set the joints' damping [N m s/rad or N s/m], until the next reset."""

@@ -56,6 +56,18 @@ def test_joints_start_within_a_tenth_of_a_radian(robot):
     env.close()
 
 
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_damping_acts_on_the_motors_joints_alone(robot):
+    env = TaskEnv(robot(), events=EventSettings(changes={"joint_damping": {"damping": [0.3, 0.3]}}))
+    env.reset(seed=0)
+    body = env.task.body
+    pybullet.syncBodyInfo(physicsClientId=env.sim.client)
+    infos = [pybullet.getJointInfo(body.id, index, physicsClientId=env.sim.client) for index in body.joint_indices]
+    damping = {info[1].decode(): info[6] for info in infos}
+    assert damping == {name: 0.3 if name in robot.motors else 0.0 for name in body.joint_names}
+    env.close()
+
+
 def test_the_terms_of_a_falling_ant():
     env = TaskEnv(Ant())
     env.reset(seed=0)

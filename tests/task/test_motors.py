@@ -103,6 +103,12 @@ def test_a_cap_of_nothing(sim, tmp_path):
         wheels.cap_joint_speed(0)
 
 
+def test_no_damping_to_scale(sim, tmp_path):
+    wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
+    with pytest.raises(TaskError, match=r"^model.urdf: these joints have no damping to scale; use set_joint_damping$"):
+        wheels.scale_joint_damping(1.2)
+
+
 def test_a_value_too_few_or_too_many(sim, tmp_path):
     wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
     message = r"^model.urdf: {} of shape \({},\) for {} joints; joint_names of the body has all$"
