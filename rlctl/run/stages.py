@@ -75,6 +75,15 @@ def check_promotions(stages: list[Stage]) -> list[Stage]:
     return stages
 
 
+def format_value(key: str, value: Any) -> str:
+    """Return the value of a recipe's key for people: of stages, as plain data, only what they change."""
+    try:
+        stages = [Stage.model_validate(each) for each in value] if key == "stages" else []
+    except (TypeError, ValueError):  # not set, or what a file by hand holds
+        stages = []
+    return f"{len(stages)} stages: " + "; ".join(map(str, stages)) if stages else str(value)
+
+
 def format_title(number: int, stages: Sequence[Stage]) -> str:
     """Return a stage for people: `stage 2 of 3: tolerance 0.1`."""
     return f"stage {number} of {len(stages)}: {stages[number - 1]}"

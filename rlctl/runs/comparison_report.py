@@ -9,6 +9,7 @@ from rich.text import Text
 
 from rlctl import output
 from rlctl.eval.statistics import Spread
+from rlctl.run.stages import format_value
 from rlctl.runs.comparison import Candidate, Comparison, EvaluatedRun, Quantity, Side
 from rlctl.runs.statistics import ALPHA, Difference, SeedDifference, Verdict, interquartile_mean_interval
 
@@ -79,7 +80,7 @@ def _show_candidate(result: Comparison, candidate: Candidate) -> None:
     if candidate.verdict is Verdict.CANNOT_TELL:
         out.print(f"  {format_needed(candidate, result.of_recipes)}")
     for key, (value, before) in candidate.recipe_changes.items():
-        out.print(f"  recipe: {key}: {before} -> {value}")
+        out.print(f"  recipe: {key}: {format_value(key, before)} -> {format_value(key, value)}")
     if not candidate.recipe_changes:
         out.print("  recipe: the same")
 

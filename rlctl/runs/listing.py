@@ -73,7 +73,8 @@ def _cells(run: RunSummary) -> list[Any]:
 
 def format_changes(changes: dict[str, Any]) -> str:
     """Return recipe changes as `key=value`, the first few of them."""
-    shown = [f"{key}={value}" for key, value in list(changes.items())[:_CHANGES_SHOWN]]
+    first = list(changes.items())[:_CHANGES_SHOWN]
+    shown = [f"{len(value)} stages" if key == "stages" and value else f"{key}={value}" for key, value in first]
     more = len(changes) - len(shown)
     return " ".join(shown) + (f" and {more} more" if more > 0 else "")
 

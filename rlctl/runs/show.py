@@ -14,6 +14,7 @@ from rlctl.errors import ArtifactError
 from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
 from rlctl.run.robustness import Robustness
+from rlctl.run.stages import format_value
 from rlctl.runs.diagnosis import diagnose, format_finding
 from rlctl.runs.diagnosis.history import History
 from rlctl.runs.listing import as_json
@@ -94,7 +95,7 @@ def show(run: RunDescription, json: str | None) -> None:
     if isinstance(source, dict):
         out.print(f"began with {source.get('policy')}, step {source.get('training_steps')}")
     for key, value in summary.changes.items():
-        out.print(f"differs from the task's recipe: {key} = {value}")
+        out.print(f"differs from the task's recipe: {key} = {format_value(key, value)}")
     for warning in run.warnings:
         out.print(f"warning: {warning}")
     for name in ("success", "return"):

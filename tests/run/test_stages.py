@@ -7,6 +7,7 @@ from rlctl.errors import RecipeError
 from rlctl.run import yaml_text
 from rlctl.run.recipe import validate
 from rlctl.run.recipe_sources import resolve
+from rlctl.run.stages import format_value
 
 RULE = {"success": 0.8, "window": 100}
 
@@ -123,3 +124,13 @@ def test_the_recipe_goes_over_the_stages_of_the_task():
     assert resolve("a.py:A", None, {"stages": []}, declared).stages == []
     with pytest.raises(RecipeError, match=r"^class of a.py:A: stages: stage 1 of 2 .* has no promotion rule"):
         resolve("a.py:A", None, {}, ({}, {}))
+
+
+def test_what_stages_change_as_text():
+    stages = [{"task": {"tolerance": 0.2}, "level": 1.0, "promote": RULE}, {"reward_weights": {"effort": 0.5}}, {}]
+    assert format_value("stages", stages) == (
+        "3 stages: tolerance 0.2; reward_weights.effort 0.5; the recipe's own task"
+    )
+    assert format_value("stages", []) == "[]"
+    assert format_value("stages", "(not set)") == "(not set)"
+    assert format_value("n_envs", 8) == "8"
