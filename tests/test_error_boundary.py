@@ -46,6 +46,17 @@ def test_stderr_is_closed(tmp_path):
     assert done.stdout.endswith(b"\n0\n")
 
 
+def test_an_interruption_is_said():
+    code = (
+        "import os, signal, threading; from rlctl.cli import run; "
+        "threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT)).start(); "
+        "print(run(['eval', 'reach', '--pretrained', '--episodes', '100000']))"
+    )
+    done = shell(f'{sys.executable} -c "{code}"')
+    assert done.stdout == b"130\n"
+    assert done.stderr.endswith(b"interrupted\n")
+
+
 @pytest.mark.parametrize(
     "error",
     [

@@ -30,6 +30,7 @@ def _root(
     pass
 
 
+_INTERRUPTED = 130
 COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "check-env": check_env.check_env,
     "train": train.train,
@@ -83,13 +84,15 @@ def run(arguments: list[str]) -> int:
         # Typer reads the options of every command it is given, which takes longer than most commands need to begin.
         app = build_app(arguments[:1] if arguments and arguments[0] in COMMANDS else COMMANDS)
         code = app(arguments, standalone_mode=False)
+        if code == _INTERRUPTED:
+            raise KeyboardInterrupt  # which Typer has caught
         error_boundary.flush()
         return code if isinstance(code, int) else 0
     except RlctlError as error:
         return error_boundary.report(error)
     except (KeyboardInterrupt, typer.Abort):  # Abort: at a question
         print("interrupted", file=sys.stderr)
-        return 130
+        return _INTERRUPTED
     except BrokenPipeError:
         error_boundary.close_stdout()
         return 141
