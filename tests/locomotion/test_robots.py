@@ -175,10 +175,7 @@ def dynamics(body):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_packaged_recipe(name):
-    packaged = recipe_sources.resolve(name, None, {})
-    assert packaged.algo == ("tqc" if name in ("ant", "half-cheetah", "hopper", "walker2d") else "ppo")
-    if packaged.algo == "ppo":
-        assert packaged.n_envs * packaged.algo_kwargs["n_steps"] % packaged.algo_kwargs["batch_size"] == 0
+    assert recipe_sources.resolve(name, None, {}).algo == "tqc"
 
 
 @pytest.mark.slow
