@@ -41,6 +41,7 @@ DROP = np.array([0.0, 0.0, 0.02])  # [m], from where the cube falls onto the tab
 NEAR = 0.05  # [m]
 HELD = 0.025  # [m], from the tool to an object that is between the fingers, and not below closed ones
 HALF_OBJECT = 0.02  # [m]
+WIDE = HALF_OBJECT + 0.002  # [m], of each finger: they go down beside the object
 OVER = 0.02  # [m], the way to the object at which fingers go down beside it
 CLEARANCE = 0.06  # [m], above an object, at which the tool goes there from beside it
 LIFTED = 0.05  # [m], above the table
@@ -68,7 +69,7 @@ class GearArm(Task):
         "joint_velocities": "rad/s",
         "opening": "m",
         "tool": "m",
-        "goal": "m",
+        "turn_to_object": "rad",
         "object_from_tool": "m",
     }
     reward_weights = {
@@ -93,14 +94,14 @@ class GearArm(Task):
         "color": Event("reset", events.set_color, body="arm", red=(0, 1), green=(0, 1), blue=(0, 1)),
         "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.005)),  # [rad]
         "velocity_noise": Event("observation", events.noise, of="joint_velocities", std=(0.0, 0.05)),  # [rad/s]
-        "goal_noise": Event("observation", events.noise, of=["goal", "object_from_tool"], std=(0.0, 0.005)),  # [m]
+        "goal_noise": Event("observation", events.noise, of="object_from_tool", std=(0.0, 0.005)),  # [m]
         "observation_delay": Event("observation", events.delay, steps=(0, 1)),  # of 20 ms
         "action_noise": Event("action", events.noise, std=(0.0, 0.05)),
         "action_delay": Event("action", events.delay, steps=(0, 1)),
         "push": Event("interval", events.push, every_s=2.0, body="arm", link="palm", force=(0.0, 5.0)),
     }
     rlctl_ignore = {
-        "RL110": "in the stage reach there is no object whose orientation could change; all stages observe the same",
+        "RL110": "in the stage reach there is no object that could turn or be touched; all stages observe the same",
         "RL611": "a goal is 5 cm in a circle of 0.4 m, and torques have to hold the arm there",
     }
 
@@ -142,9 +143,9 @@ class GearArm(Task):
         if self.head_start > 0 and self.stage != "reach":
             # Anywhere on the way, evenly, and over the object where that is beyond it: 1 begins half of them there.
             way = min(rng.uniform(0.0, 2 * self.head_start), 1.0)
-            over = find_joints_for(self.goal + np.array([0.0, 0.0, rng.uniform(0.01, 0.06)]))
+            over = find_joints_for(self.goal + np.array([0.0, 0.0, rng.uniform(0.005, 0.05)]))
             joints = (1 - way) * joints + way * (over + rng.uniform(-0.01, 0.01, 3))
-            opening = OPEN * rng.uniform(0.75, 1.0)
+            opening = OPEN * rng.uniform(0.62, 1.0)  # from 1 mm beside the object on
         self.arm.set_joints(self.pose(joints, opening))
         if self.stage != "reach":
             # One side faces the base: the gripper turns with the arm, and not by itself. A box, and let fall, because
@@ -175,16 +176,25 @@ class GearArm(Task):
         self.object = self.goal if self.stage == "reach" else self.cube.base_position
 
     def observe(self) -> dict[str, np.ndarray]:
-        """Return the arm, the gripper, where the goal is on the table, and the object, which is the goal in `reach`."""
-        upright = np.array([0.0, 0.0, 0.0, 1.0])
+        """Return the arm, the gripper, and the object, which is the goal in `reach`, in the frame of the turning arm.
+
+        There a grasp is the same all around the base: in the world's frame it had to be learned for each direction.
+        """
+        turn = float(self.arm.joint_positions[self.joints[0]])
+        out, side = np.array([math.cos(turn), math.sin(turn)]), np.array([-math.sin(turn), math.cos(turn)])
+        (x, y), away = self.object[:2], self.object - self.tool
+        yaw, touching = 0.0, set[str]()
+        if self.stage != "reach":
+            yaw, touching = yaw_of(self.cube.base_orientation) - turn, self.arm.links_touching(self.cube)
         return {
             "joint_positions": self.arm.joint_positions[self.joints],
             "joint_velocities": self.arm.joint_velocities[self.joints],
             "opening": self.arm.joint_positions[self.left_finger : self.left_finger + 1],
-            "tool": self.tool,
-            "goal": self.goal[:2],
-            "object_from_tool": self.object - self.tool,
-            "object_orientation": upright if self.stage == "reach" else self.cube.base_orientation,
+            "tool": np.array([self.tool[:2] @ out, self.tool[2]]),
+            "turn_to_object": np.array([math.atan2(y, x) - turn]),
+            "object_from_tool": np.array([away[:2] @ out, away[:2] @ side, away[2]]),
+            "object_yaw": np.array([math.sin(4 * yaw), math.cos(4 * yaw)]),  # a cube has four sides alike
+            "touching": np.array([finger in touching for finger in ("left_finger", "right_finger")], np.float64),
         }
 
     def rewards(self, action: np.ndarray) -> dict[str, float]:
@@ -217,16 +227,19 @@ class GearArm(Task):
         return min(math.hypot(aside, z + min(max(2 * (aside - 0.01), 0.0), CLEARANCE)), FARTHEST)
 
     def measure_grasp(self, way: float, held: bool) -> float:
-        """Return how far a grasp has come, in [0, 1]: half for going down with open fingers, half for closing them.
+        """Return how far a grasp has come, in [0, 1]: half for going down over the object, half for closing on it.
 
-        Closed before they are beside the object, the fingers would stand on it.
+        Closed before they are beside the object, the fingers would stand on it; pressed onto the table beside it, they
+        could not close. Wider than the object is wide enough: paid for more, fingers stay open.
         """
         if self.stage == "reach":
             return rewards.grasp(way, NEAR, held)
         opening = min(max(float(self.arm.joint_positions[self.left_finger]), 0.0), OPEN)
+        near = 0.5 * rewards.closeness(way, OVER)
         if rewards.distance(self.tool, self.object) > HELD:
-            return 0.5 * rewards.closeness(way, OVER) * opening / OPEN
-        return 0.5 + 0.25 * min((OPEN - opening) / (OPEN - HALF_OBJECT), 1.0) + 0.25 * held
+            return near * min(opening / WIDE, 1.0)
+        closed = min((OPEN - opening) / (OPEN - HALF_OBJECT), 1.0)
+        return near * (1.0 + 0.5 * closed) + 0.25 * held
 
     def is_held(self) -> bool:
         """Both fingers touch the object, which is between them."""
@@ -265,6 +278,12 @@ def find_joints_for(point: np.ndarray) -> np.ndarray:
     elbow = math.acos(min(max(cosine, math.cos(ELBOW[1])), math.cos(ELBOW[0])))
     shoulder = math.atan2(drop, away) - elbow / 2
     return np.array([math.atan2(y, x), shoulder, shoulder + elbow])
+
+
+def yaw_of(orientation: np.ndarray) -> float:
+    """Return the angle [rad] about z that a quaternion (x, y, z, w) turns the x axis by."""
+    x, y, z, w = orientation
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def stop_torque(angle: float, low: float, high: float) -> float:
