@@ -46,13 +46,22 @@ def test_stderr_is_closed(tmp_path):
     assert done.stdout.endswith(b"\n0\n")
 
 
+INTERRUPTED = """
+import os, signal, sys, threading, time
+from rlctl.cli import run
+
+def interrupt():
+    while "rlctl.eval.evaluate" not in sys.modules:  # the command has begun
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGINT)
+
+threading.Thread(target=interrupt).start()
+print(run(["eval", "reach", "--pretrained", "--episodes", "100000"]))
+"""
+
+
 def test_an_interruption_is_said():
-    code = (
-        "import os, signal, threading; from rlctl.cli import run; "
-        "threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT)).start(); "
-        "print(run(['eval', 'reach', '--pretrained', '--episodes', '100000']))"
-    )
-    done = shell(f'{sys.executable} -c "{code}"')
+    done = shell(f"{sys.executable} -c '{INTERRUPTED}'")
     assert done.stdout == b"130\n"
     assert done.stderr.endswith(b"interrupted\n")
 
