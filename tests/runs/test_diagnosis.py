@@ -212,6 +212,23 @@ def test_training_that_ends_before_the_last_stage_is_found(write_training):
     assert f"rlctl train --resume {run.path} -n STEPS" in finding.advice[0]
 
 
+def test_training_that_is_stuck_in_a_stage_is_found_while_it_goes_on(write_training):
+    """Stage 1 was over after 5,000 steps; 25,000 steps of stage 2, of 30,000, had no success."""
+    stages = [{"promote": {"success": 0.8}}, {"promote": {"success": 0.8}}, {}]
+    metrics = {"stage": [1] * 5 + [2] * 25, "success": [0.9] * 5 + [0.0] * 25}
+    run = write_training(metrics, {"success": 0.0}, {"stages": stages}, status="running")
+    (finding,) = diagnose(run)
+    assert (finding.id, finding.name, finding.grade) == ("Q1", "does not reach the last stage", Grade.WARNING)
+    assert finding.evidence == ["no episode succeeded in stage 2 of 3, which has taken 24,000 steps"]
+
+
+@pytest.mark.parametrize("metrics", [{"success": [0.9] * 5 + [0.0] * 24 + [0.02]}, {"stage": [1] * 25 + [2] * 5}])
+def test_a_stage_that_is_new_or_succeeds_now_and_then_is_not_stuck(write_training, metrics):
+    stages = [{"promote": {"success": 0.8}}, {"promote": {"success": 0.8}}, {}]
+    metrics = {"stage": [1] * 5 + [2] * 25, "success": [0.9] * 5 + [0.0] * 25, **metrics}
+    assert diagnose(write_training(metrics, {"success": 0.0}, {"stages": stages}, status="running")) == []
+
+
 def test_a_policy_that_succeeds_only_while_it_explores_is_found(write_training):
     run = write_training({"success": np.tile([0.0, 0.4], 15)}, {"success": 0.0, "return": -0.5}, {"algo": "dqn"})
     (finding,) = diagnose(run)

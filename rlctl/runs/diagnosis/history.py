@@ -100,6 +100,14 @@ class History:
         """Return a column of `evals.csv`."""
         return _curve(self.evaluations, name)
 
+    def in_last_stage(self, name: str) -> Curve:
+        """Return a column of `metrics.csv` without the stages that a curriculum begins with: evaluations are of its last."""
+        curve, reached, stages = self.curve(name), self.curve("stage"), self.recipe.get("stages")
+        if not isinstance(stages, list) or not len(reached):
+            return curve
+        kept = np.isin(curve.steps, reached.steps[reached.values == len(stages)])
+        return Curve(curve.steps[kept], curve.values[kept])
+
     @property
     def successes(self) -> tuple[Curve, Curve]:
         """The success rates of evaluations, and of training."""
