@@ -101,7 +101,7 @@ class History:
         return _curve(self.evaluations, name)
 
     def in_last_stage(self, name: str) -> Curve:
-        """Return a column of `metrics.csv` without the stages that a curriculum begins with: evaluations are of its last."""
+        """Return a column of `metrics.csv` in the last stage of a curriculum, which is the one that is evaluated."""
         curve, reached, stages = self.curve(name), self.curve("stage"), self.recipe.get("stages")
         if not isinstance(stages, list) or not len(reached):
             return curve

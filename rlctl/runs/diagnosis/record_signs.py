@@ -32,7 +32,7 @@ def environments_slow(run: History) -> str | None:
 
 @dataclasses.dataclass(frozen=True)
 class _Shares:
-    """Parts of a training's time."""
+    """Parts of the learner's time; what plays beside its updates is no part."""
 
     environments: float
     policy: float
@@ -42,8 +42,8 @@ class _Shares:
     def describe(self) -> str:
         """Return the shares as text."""
         return (
-            f"environments take {self.environments:.0%} of the time, the policy that acts in them {self.policy:.0%}, "
-            f"updates the rest; {self.steps_per_s:,.0f} steps/s"
+            f"waiting for environments takes {self.environments:.0%} of the time, for the policy that acts in them "
+            f"{self.policy:.0%}, updates the rest; {self.steps_per_s:,.0f} steps/s"
         )
 
 
