@@ -181,6 +181,8 @@ class Sim(Constraints):
             pybullet.setGravity(*self._built_gravity, physicsClientId=self.client)
             self._built_gravity = None
         pybullet.restoreState(self._saved, physicsClientId=self.client)
+        # Contacts of the last episode that the saved world does not have would take part in the first step.
+        pybullet.performCollisionDetection(physicsClientId=self.client)
         for body in self.bodies.values():
             body._cache.clear()
             body._restore_nominal()

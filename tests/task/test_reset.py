@@ -52,6 +52,17 @@ def test_reach_after_many_contacts():
     dirty.close()
 
 
+def test_contacts_of_the_last_episode_are_gone():
+    """PyBullet's restored worlds keep contacts that the saved one does not have, and let them act in the next step."""
+    env = TaskEnv(Reach())
+    env.reset(seed=0)
+    while not contacts(env):
+        env.step(np.array([0.0, 1.0, 0.0, -1.0, 0.0, 1.0, 0.0]))
+    env.reset(seed=1)
+    assert contacts(env) == 0
+    env.close()
+
+
 @pytest.mark.parametrize(
     "task",
     [
