@@ -32,7 +32,7 @@ def test_the_wheel_trains_reach_from_an_empty_folder(tmp_path):
         ("reach", "ppo", None),
         *((name, "tqc", None) for name in ("ant", "biped", "half-cheetah", "hopper", "humanoid", "walker2d")),
         *((name, "sac", None) for name in ("biped-3d", "quadruped", "reach-sparse")),
-        *((name, "sac", None) for name in ("kuka-grasp", "gear-arm", "peg-insert")),
+        *((name, "sac", None) for name in ("kuka-grasp", "gear-arm", "peg-insert", "screw-drive")),
     }
     for task in tasks:  # with its models
         call(scripts / "rlctl", "check-env", task["name"], "--select", "RL001,RL002,RL301", cwd=empty)

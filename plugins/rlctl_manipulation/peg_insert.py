@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rlctl.task import Box, Event, Joints, Sim, Task, TaskError, events, rewards
+from rlctl_manipulation.approach import find_yaw_error, measure_way
 
 MODELS = Path(__file__).parent / "models"
 SCARA, HOLE = MODELS / "scara.urdf", MODELS / "hole.urdf"
@@ -102,9 +103,7 @@ class PegInsert(Task):
         self.from_tip = self.mouth - self.arm.link_position("tip")
         shoulder, elbow, _, wrist = self.arm.joint_positions
         self.forearm_yaw = float(shoulder + elbow)
-        # A square looks the same after a quarter turn.
-        quarter = math.pi / 2
-        self.yaw_error = (self.hole_yaw - self.forearm_yaw - float(wrist) + quarter / 2) % quarter - quarter / 2
+        self.yaw_error = find_yaw_error(self.hole_yaw - self.forearm_yaw - float(wrist))
 
     def observe(self) -> dict[str, np.ndarray]:
         """Return the arm, the hole as the forearm sees it, and the force at the wrist, in the peg's axes."""
@@ -124,7 +123,7 @@ class PegInsert(Task):
         """Return the way to the hole, how deep the peg is in it, and how hard it presses."""
         self.force = self.arm.joint_reaction(SENSOR)[:3]
         self.update()
-        way = self.measure_way()
+        way = measure_way(self.from_tip, close=CLOSE, above=ABOVE)
         return {
             "distance": way,
             "near": rewards.closeness(way, NEAR),
@@ -134,12 +133,6 @@ class PegInsert(Task):
             "action": rewards.squared(action),
             "smoothness": rewards.squared(self.action_change),
         }
-
-    def measure_way(self) -> float:
-        """Return how far the tip is from where it should be [m]: above the mouth beside it, or in it on its axis."""
-        aside, height = self.aside(), -float(self.from_tip[2])
-        over = min(5 * (aside - CLOSE), ABOVE)  # straight for the hole, the peg would drag over the block
-        return math.hypot(aside, height - over if over > 0 else max(height, 0.0))
 
     def aside(self) -> float:
         """Return how far the tip is from the hole's axis [m]."""
