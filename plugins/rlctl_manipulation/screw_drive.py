@@ -80,8 +80,7 @@ class ScrewDrive(Task):
         "observation_delay": Event("observation", events.delay, steps=(0, 1)),  # of 17 ms
         "action_delay": Event("action", events.delay, steps=(0, 1)),
     }
-
-    rlctl_ignore = {"RL611": "the socket has 2 mm of play, and the block 20 cm to each side"}
+    rlctl_ignore = {"RL611": "the socket has 2 mm of play, and the block lies anywhere in 0.2 m x 0.2 m"}
 
     def build(self, sim: Sim) -> None:
         """Load gantry, block and screw, and cut the thread."""
@@ -153,7 +152,7 @@ class ScrewDrive(Task):
         self.force, self.torque = reaction[:3], float(reaction[5])
         self.update()
         way = measure_way(self.from_tip, close=CLOSE, above=ABOVE, depth=ENGAGED)
-        engaged, home = self.engaged(), self.is_success()
+        engaged, home = self.measure_engagement(), self.is_success()
         return {
             "distance": way,
             "near": rewards.closeness(way, NEAR),
@@ -168,7 +167,7 @@ class ScrewDrive(Task):
             "smoothness": rewards.squared(self.action_change),
         }
 
-    def engaged(self) -> float:
+    def measure_engagement(self) -> float:
         """Return how deep the bit is in the socket, as part of ENGAGED, at most 1."""
         x, y, depth = self.from_tip
         return min(max(float(depth) / ENGAGED, 0.0), 1.0) if math.hypot(x, y) < CLOSE else 0.0

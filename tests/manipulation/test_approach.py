@@ -21,6 +21,7 @@ def test_beside_the_hole_the_tip_should_be_over_the_rim():
 
 def test_over_the_hole_it_should_go_down():
     assert way(0.001, 0.02) == pytest.approx(math.hypot(0.001, 0.02))
+    assert way(0.001, -0.02) == pytest.approx(0.001)  # in it
     assert way(0.0, 0.02, depth=0.005) == pytest.approx(0.025)
     assert way(0.0, -0.002, depth=0.005) == pytest.approx(0.003)
     assert way(0.0015, 0.0, depth=0.005) == pytest.approx(math.hypot(0.0015, 0.0025))  # half a millimetre to the rim

@@ -7,11 +7,12 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
-from rlctl.task.events import EventSettings
 from rlctl.task.inertia import find_inertia_faults
 from rlctl_manipulation.peg_insert import HOME, TOP_SPEED, PegInsert
+from tests.manipulation.scripted import assert_episodes_repeat, play
 
 UPPER_ARM, FOREARM = 0.25, 0.2  # [m]
+STEPS = 150
 
 
 @pytest.fixture
@@ -40,18 +41,9 @@ def insert(task):
     return np.clip(action, -1, [1, 1, 0.5, 1]).astype(np.float32)
 
 
-def play(env, seed, policy, steps=150):
-    """Return all observations and rewards, shape (T + 1, size + 1), and the last info."""
-    rows, info = [np.append(env.reset(seed=seed)[0], 0.0)], {}
-    for _ in range(steps):
-        observation, reward, _, _, info = env.step(policy(env.task))
-        rows.append(np.append(observation, reward))
-    return np.array(rows), info
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_the_peg_can_be_inserted(env, seed):
-    _, info = play(env, seed, insert)
+    _, info = play(env, seed, insert, STEPS)
     assert info["is_success"]
     assert info["metrics"]["inserted"] == 1.0
     assert env.task.inserted() == pytest.approx(0.03, abs=1e-3)  # on the hole's ground
@@ -120,12 +112,7 @@ def test_where_things_start(env):
 
 @pytest.mark.parametrize("randomize", [False, True])
 def test_episodes_repeat_bit_for_bit(randomize):
-    dirty, fresh = (TaskEnv(PegInsert(), events=EventSettings(randomize)) for _ in range(2))
-    play(dirty, 100, insert)
-    for seed in range(2):
-        np.testing.assert_array_equal(play(dirty, seed, insert)[0], play(fresh, seed, insert)[0])
-    dirty.close()
-    fresh.close()
+    assert_episodes_repeat(PegInsert, insert, STEPS, randomize)
 
 
 def test_a_hole_that_is_not_so_deep():

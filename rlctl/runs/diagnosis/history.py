@@ -100,12 +100,18 @@ class History:
         """Return a column of `evals.csv`."""
         return _curve(self.evaluations, name)
 
-    def in_last_stage(self, name: str) -> Curve:
+    @property
+    def stage_count(self) -> int:
+        """The stages of the curriculum, 0 without one."""
+        stages = self.recipe.get("stages")
+        return len(stages) if isinstance(stages, list) else 0
+
+    def last_stage_curve(self, name: str) -> Curve:
         """Return a column of `metrics.csv` in the last stage of a curriculum, which is the one that is evaluated."""
-        curve, reached, stages = self.curve(name), self.curve("stage"), self.recipe.get("stages")
-        if not isinstance(stages, list) or not len(reached):
+        curve, reached = self.curve(name), self.curve("stage")
+        if not self.stage_count or not len(reached):
             return curve
-        kept = np.isin(curve.steps, reached.steps[reached.values == len(stages)])
+        kept = np.isin(curve.steps, reached.steps[reached.values == self.stage_count])
         return Curve(curve.steps[kept], curve.values[kept])
 
     @property

@@ -81,20 +81,20 @@ def model_file_missing(run: History) -> str | None:
 
 def last_stage_never_begun(run: History) -> str | None:
     """The training is over, and ended before the last stage of its curriculum."""
-    stages, reached = run.recipe.get("stages"), run.curve("stage").values
-    if run.status.get("status") != "finished" or not isinstance(stages, list) or not len(reached):
+    reached = run.curve("stage").values
+    if run.status.get("status") != "finished" or not len(reached) or reached[-1] >= run.stage_count:
         return None
-    return f"trained in stage {reached[-1]:.0f} of {len(stages)} to the end" if reached[-1] < len(stages) else None
+    return f"trained in stage {reached[-1]:.0f} of {run.stage_count} to the end"
 
 
 def stage_never_succeeds(run: History) -> str | None:
     """A large part of all steps went into a stage before the last, and no episode of it has succeeded."""
-    stages, reached, success = run.recipe.get("stages"), run.curve("stage"), run.curve("success")
-    if not isinstance(stages, list) or not len(reached) or not len(success) or reached.values[-1] >= len(stages):
+    reached, success = run.curve("stage"), run.curve("success")
+    if not len(reached) or not len(success) or reached.values[-1] >= run.stage_count:
         return None
     stage, total = reached.values[-1], run.recipe.get("total_timesteps")
     began = float(reached.steps[reached.values == stage][0])
     spent = float(reached.steps[-1]) - began
     if not isinstance(total, int | float) or spent < 0.4 * total or success.values[success.steps >= began].any():
         return None
-    return f"no episode succeeded in stage {stage:.0f} of {len(stages)}, which has taken {spent:,.0f} steps"
+    return f"no episode succeeded in stage {stage:.0f} of {run.stage_count}, which has taken {spent:,.0f} steps"

@@ -70,7 +70,7 @@ def never_succeeds(run: History) -> str | None:
 
 def succeeds_by_exploring(run: History) -> str | None:
     """Training episodes succeed, by what exploration adds, and not one evaluation does, to the end."""
-    evaluated, trained = run.evaluation_curve("success"), run.in_last_stage("success")
+    evaluated, trained = run.evaluation_curve("success"), run.last_stage_curve("success")
     if run.progress < 1 or len(evaluated) < _LEAST_EVALUATIONS or not len(trained):
         return None
     best = float(trained.values.max())
