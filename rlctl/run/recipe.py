@@ -191,6 +191,7 @@ class Source:
     """Values of a recipe, and where they are from."""
 
     name: str
+    """Empty for what was typed, or given to a function: errors need not say where that is."""
     values: Mapping[str, Any]
     file: Path | None = None
 
@@ -216,8 +217,8 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
 
         def explain(problem: Any, path: schema_text.Place) -> str:
             origins = (each if isinstance(each, str) else each.find(path) for each in sources)
-            origin = next((each for each in origins if each), "recipe")
-            return f"{origin}: {_explain(problem, path, schema, values)}"
+            origin = next((each for each in origins if each is not None), "recipe")
+            return (f"{origin}: " if origin else "") + _explain(problem, path, schema, values)
 
         raise RecipeError(schema_text.explain_all(error, schema, explain)) from None
 

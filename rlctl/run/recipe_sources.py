@@ -35,7 +35,7 @@ def resolve(
     from_config = read(config) if config else {}
     given = merge(from_config, settings)
     sources = [
-        Source("command line", settings),
+        Source("", settings),
         Source(str(config), from_config, config),
         Source(str(packaged_file), packaged, packaged_file),
     ]

@@ -100,6 +100,9 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
     if status.get("status") == "finished":  # new episodes may have decided for the last policy
         best = next((row for row in evaluations if row["steps"] == status.get("best_step")), best)
     state, reason = _state(run, status)
+    steps = int(float(last["steps"])) if last else status.get("steps")
+    if state == "stopped" and (checkpoints := run.checkpoints()):
+        steps = max(steps or 0, int(checkpoints[-1].name))  # an interrupted training saves after its last row
     return RunSummary(
         path=run.path,
         task=status["task"],
@@ -108,7 +111,7 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
         state=state,
         reason=reason,
         started=str(status.get("started", "")),
-        steps=int(float(last["steps"])) if last else status.get("steps"),
+        steps=steps,
         seconds=status.get("seconds") or (float(last["seconds"]) if last else None),
         best_step=int(best["steps"] or 0) if best else None,
         best_success=best["success"] if best else None,

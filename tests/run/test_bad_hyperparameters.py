@@ -15,7 +15,7 @@ from tests.run.test_bad_recipes import refused
 def test_every_number_is_a_finite_one(name, value):
     section = "policy_kwargs" if name == "log_std_init" else "algo_kwargs"
     message = refused(None, [f"{section}.{name}={value}"])
-    assert message.startswith(f"command line: {section}.{name}: ")
+    assert message.startswith(f"{section}.{name}: ")
     assert ": expected a number" in message
 
 
@@ -131,5 +131,5 @@ def test_hyperparameters_that_make_no_sense(algo, setting, expected):
     of_the_network = name.startswith(("net_", "log_std", "activation", "features", "n_crit", "lstm", "n_quant"))
     section = "policy_kwargs" if of_the_network else "algo_kwargs"
     message = refused(None, [f"algo={algo}", f"{section}.{setting}"])
-    assert message.startswith((f"command line: {section}.{name}", f"command line: no key '{section}.{name}"))
+    assert message.startswith((f"{section}.{name}", f"no key '{section}.{name}"))
     assert expected in message

@@ -243,11 +243,11 @@ def test_the_error_names_where_the_value_is_from(packaged, tmp_path, config):
 
     assert message(None, []).startswith(f"{tmp_path / 'my_env.yaml'}:3: algo_kwargs.gamma: expected a number in (0, 1]")
     assert message(file, ["algo_kwargs.gamma=1"]).startswith(f"{file}:3: eval.episodes: expected a whole number ")
-    assert message(file, ["algo_kwargs.gamma=8"]).startswith("command line: algo_kwargs.gamma: expected a number in ")
+    assert message(file, ["algo_kwargs.gamma=8"]).startswith("algo_kwargs.gamma: expected a number in ")
     assert message(file, ["eval.episodes=1", "algo_kwargs.gama=1"]).startswith(f"{tmp_path / 'my_env.yaml'}:3: ")
     (tmp_path / "my_env.yaml").write_text("algo: ppo\n")
     assert message(file, ["eval.episodes=1", "algo_kwargs.gama=1"]).startswith(
-        "command line: no key 'algo_kwargs.gama' for ppo. Did you mean 'gamma'?"
+        "no key 'algo_kwargs.gama' for ppo. Did you mean 'gamma'?"
     )
     stages = config("stages:\n  - {level: 0.5}\n  - {levle: 1}\n")
     assert message(stages, []).startswith(f"{stages}:3: stage 2: no key 'levle'. Did you mean 'level'? Keys here: task")
@@ -268,5 +268,5 @@ def test_every_mistake_is_named_up_to_three(packaged, tmp_path):
     assert [line.split(" expected")[0] for line in str(caught.value).splitlines()] == [
         f"{file}:5: algo_kwargs.gamma:",
         f"{file}:1: n_envs:",
-        "command line: seed:",
+        "seed:",
     ]

@@ -14,10 +14,11 @@ def test_states(write_run, hold_lock):
     hold_lock(running)
     killed = write_run("reach/2026-01-01_00-00-02_s0", "running")
     stopped = write_run("reach/2026-01-01_00-00-03_s0", "interrupted")
+    (stopped / "checkpoints" / "000001024").mkdir()
     failed = write_run("reach/2026-01-01_00-00-04_s0", "failed", error="task 'reach': it broke\nat step 3")
     texts = [summarize(path).state_text for path in (done, running, killed, stopped, failed)]
     assert texts[:2] == ["done", "running"]
-    assert texts[2:] == ["stopped at step 1,000", "stopped at step 1,000", "failed: task 'reach': it broke"]
+    assert texts[2:] == ["stopped at step 1,000", "stopped at step 1,024", "failed: task 'reach': it broke"]
 
 
 def test_best_is_by_success_then_return(write_run):
