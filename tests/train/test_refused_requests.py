@@ -1,10 +1,11 @@
-"""Requests that are refused before anything is trained: recipes, arguments that exclude each other, devices."""
+"""Requests refused or warned of before anything is trained: recipes, arguments that exclude each other, devices."""
 
 import pytest
 
 from rlctl.errors import RecipeError, UsageError
 from rlctl.run import recipe as recipes
 from rlctl.train.request import TrainRequest, run_training
+from rlctl.train.start import find_start
 
 
 @pytest.mark.parametrize(
@@ -26,6 +27,13 @@ def test_recipe_errors_name_the_key(train, small_ppo, settings, message):
     with pytest.raises(RecipeError) as caught:
         train("Line", recipes.merge(small_ppo, settings))
     assert message in str(caught.value)
+
+
+def test_a_reward_weight_of_the_other_sign_is_warned_of():
+    stages = [{"reward_weights": {"distance": 2.0}, "promote": {"return": 0.0}}, {"reward_weights": {"distance": -0.5}}]
+    assert find_start(TrainRequest("reach", settings={"stages": stages})).notes == (
+        "warning: reward_weights.distance: 2 turns the sign of the task's own, -1",
+    )
 
 
 def test_task_and_resume_exclude_each_other():
