@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
+from rlctl import registry
 from rlctl.check_env.check import Report, check
 from rlctl.check_env.families import find_rules
 from rlctl.check_env.finding import Severity
@@ -54,6 +55,8 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
         from rlctl.train.loop import TrainingLoop
 
         learner = _build_learner(start, specs, workers, display)
+        if start.run is None:
+            _warn_of_turned_weights(specs, display)
         if checked is not None:
             display.phase("checking the environment")
             _refuse_errors(checked.result(), display)
@@ -77,6 +80,16 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
 
 def _make_workers(spec: EnvSpec, n_envs: int, start: Start, display: Display) -> Workers:
     return Workers(spec, n_envs, timeout_s=start.request.env_timeout_s, on_output=display.message)
+
+
+def _warn_of_turned_weights(specs: list[EnvSpec], display: Display) -> None:
+    """Warn of weights that pay for what the task itself penalises, or the other way round; all stages can be built."""
+    own = getattr(registry.load(specs[0].task), "reward_weights", {})
+    for name, weight in dict.fromkeys(pair for spec in specs for pair in spec.reward_weights.items()):
+        if float(own.get(name, 0.0)) * weight < 0.0:
+            display.message(
+                f"warning: reward_weights.{name}: {weight:g} turns the sign of the task's own, {float(own[name]):g}"
+            )
 
 
 def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display: Display) -> Learner:

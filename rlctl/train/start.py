@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlctl import registry
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.run import directory, lookup
 from rlctl.run.directory import RunDirectory, RunLock
@@ -120,20 +119,9 @@ def _find_new(request: TrainRequest) -> Start:
     task = request.task or ""
     with preserve_process_state():
         recipe = resolve_with_stages(task, request.config, request.settings)
-    notes = [note for note in (describe_rounding(recipe), *_describe_flipped_weights(task, recipe)) if note]
+    note = describe_rounding(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
-    return Start(request, task, recipe, notes=tuple(notes), source=source)
-
-
-def _describe_flipped_weights(task: str, recipe: Recipe) -> list[str]:
-    """Warn of a recipe's reward weights that pay for what the task itself penalises, or penalise what it pays for."""
-    own: Mapping[str, float] = getattr(registry.load(task), "reward_weights", {})
-    given = [pair for spec in recipe.env_specs(task) for pair in spec.reward_weights.items()]
-    return [
-        f"warning: reward_weights.{name}: {weight:g} turns the sign of the task's own, {own[name]:g}"
-        for name, weight in dict.fromkeys(given)
-        if own.get(name, 0.0) * weight < 0.0
-    ]
+    return Start(request, task, recipe, notes=(note,) if note else (), source=source)
 
 
 def _find_checkpoint(request: TrainRequest) -> Start:

@@ -5,7 +5,6 @@ import pytest
 from rlctl.errors import RecipeError, UsageError
 from rlctl.run import recipe as recipes
 from rlctl.train.request import TrainRequest, run_training
-from rlctl.train.start import find_start
 
 
 @pytest.mark.parametrize(
@@ -29,11 +28,11 @@ def test_recipe_errors_name_the_key(train, small_ppo, settings, message):
     assert message in str(caught.value)
 
 
-def test_a_reward_weight_of_the_other_sign_is_warned_of():
+def test_a_reward_weight_of_the_other_sign_is_warned_of(train, small_ppo, capsys):
     stages = [{"reward_weights": {"distance": 2.0}, "promote": {"return": 0.0}}, {"reward_weights": {"distance": -0.5}}]
-    assert find_start(TrainRequest("reach", settings={"stages": stages})).notes == (
-        "warning: reward_weights.distance: 2 turns the sign of the task's own, -1",
-    )
+    train("reach", recipes.merge(small_ppo, {"stages": stages}))
+    warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: reward_weights")]
+    assert warnings == ["warning: reward_weights.distance: 2 turns the sign of the task's own, -1"]
 
 
 def test_task_and_resume_exclude_each_other():
