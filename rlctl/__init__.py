@@ -1,13 +1,16 @@
 """Robot learning in simulation, end to end: check an environment, train, evaluate, export, replay.
 
     cli           the command line: parse, call one function, print
-    check_env  train  eval  export  replay    the five verbs, a folder each
-    tasks  runs   what can be asked of tasks, and of runs
-    deploy        what comes after: a safety filter, a policy server, physical values of the robot
+    tuning        trainings that are compared, to find hyperparameters
+    checking  training  evaluation  exporting  replaying    the five verbs
+    runs  tasks  importing    what can be asked of runs and of tasks; models of other libraries
+    deploy        what comes after export: safety filter, policy server, physical values of the robot
     rollout       many environments in worker processes; seeds; episodes
-    run           what is on disk: recipes, run folders, policies, episodes
+    processes     one watched child process
+    run  policy  recipe       the three formats: run folder and episodes, policy file, recipe
+    environments  from what the user typed to an environment
     task          for authors of tasks: Task, Sim, Body, Event, rewards
-    env_spec      what an environment is made from; registry: from a task's name to its class
+    storage       atomic files, tables, YAML, and reading what others may have written
     errors        every error that a user can cause, with its exit code
 
 From Python: `rlctl.make`, `train`, `evaluate`, `load_policy`; `docs/architecture.md` has the whole picture.
@@ -17,34 +20,29 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from rlctl.env_spec import make
-    from rlctl.python_api import evaluate, train
-    from rlctl.run.policy import load_policy
+from rlctl.version import __version__
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from rlctl.api import evaluate, load_policy, train
+    from rlctl.environments.spec import make
+
 __all__ = ["__version__", "evaluate", "load_policy", "make", "train"]
+
+_DEFINED_IN = {
+    "evaluate": "rlctl.api",
+    "load_policy": "rlctl.api",
+    "make": "rlctl.environments.spec",
+    "train": "rlctl.api",
+}
 
 
 def __getattr__(name: str) -> Any:
     # Lazy, so that `import rlctl` and the command line load neither gymnasium nor torch.
-    if name == "make":
-        from rlctl.env_spec import make
+    if name not in _DEFINED_IN:
+        raise AttributeError(f"module 'rlctl' has no attribute {name!r}")
+    import importlib
 
-        return make
-    if name == "load_policy":
-        from rlctl.run.policy import load_policy
-
-        return load_policy
-    if name == "evaluate":
-        from rlctl.python_api import evaluate, train  # noqa: F401 (the package of that name can be called as it)
-
-        return evaluate
-    if name == "train":
-        import importlib
-
-        return importlib.import_module("rlctl.train")  # which can be called; see there
-    raise AttributeError(f"module 'rlctl' has no attribute {name!r}")
+    return getattr(importlib.import_module(_DEFINED_IN[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import gymnasium
 
-from rlctl import registry
+from rlctl.environments import registry
 
 for _entry in registry.list_installed():
     if _entry.problem is None:
         gymnasium.register(
             id=f"rlctl/{_entry.name}-v0",
-            entry_point="rlctl.env_spec:make",
+            entry_point="rlctl.environments.spec:make",
             kwargs={"task": _entry.name},
             disable_env_checker=True,
         )

@@ -172,7 +172,7 @@ def write_result_json(target: str, content: Any) -> bool:
         results().write(json.dumps(content, indent=2, allow_nan=False) + "\n")
         results().flush()
         return True
-    from rlctl.run import files
+    from rlctl.storage import files
 
     files.write_json(Path(target), content)
     return False

@@ -16,7 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from rlctl.rollout.child_process import set_start
+from rlctl.processes.child_process import set_start
 from tests import fork_server
 
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup what is started here would ignore it

@@ -24,15 +24,15 @@ import tempfile
 import threading
 from pathlib import Path
 
-from rlctl.env_spec import EnvSpec
-from rlctl.rollout.child_process import set_start
+from rlctl.environments.spec import EnvSpec
+from rlctl.processes.child_process import set_start
 from tests.forked_process import SIGNALS, become
 
 ROOT = Path(__file__).parents[1]
-FOR_WORKERS = ("rlctl.rollout.worker", "rlctl.task.env", "rlctl.run.env_info", "rlctl.check_env.child")
+FOR_WORKERS = ("rlctl.rollout.worker", "rlctl.task.env", "rlctl.environments.info", "rlctl.checking.child")
 FOR_COMMANDS = (
     *("torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
-    *("rlctl.eval.evaluate", "rlctl.eval.report", "rlctl.run.torch_policy", "rlctl.tasks.listing"),
+    *("rlctl.evaluation.evaluate", "rlctl.evaluation.report", "rlctl.policy.torch_policy", "rlctl.tasks.listing"),
     *("typer.rich_utils", "typer._adapters", "rich._emoji_codes", "yaml", "onnx"),
 )
 """What is imported when it is needed; one that is missing here costs time only."""
@@ -287,9 +287,9 @@ def main(descriptor, commands):
     for name in FOR_WORKERS + (FOR_COMMANDS if commands else ()):
         importlib.import_module(name)
     if commands:
-        import rlctl.train
+        import rlctl.training
 
-        for module in pkgutil.iter_modules(rlctl.train.__path__, "rlctl.train."):
+        for module in pkgutil.iter_modules(rlctl.training.__path__, "rlctl.training."):
             importlib.import_module(module.name)
     _read_messages()
     gc.collect()

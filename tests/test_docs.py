@@ -14,8 +14,9 @@ from xml.etree import ElementTree
 import pytest
 import typer
 
-from rlctl.env_spec import EnvSpec
-from rlctl.run import recipe, yaml_text
+from rlctl.environments.spec import EnvSpec
+from rlctl.recipe import recipe
+from rlctl.storage import yaml_text
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/**/*.md")])
@@ -135,9 +136,9 @@ def test_recipes_are_recipes(block):
 
 def test_limits_are_limits_of_reach():
     from rlctl.deploy import Limits, SafetyFilter
+    from rlctl.policy.policy import read_info
+    from rlctl.policy.shipped import PRETRAINED
     from rlctl.run.lookup import find_policy
-    from rlctl.run.policy import read_info
-    from rlctl.run.shipped import PRETRAINED
 
     info = read_info(find_policy("reach", PRETRAINED).file)
     (block,) = [each for each in find_blocks("yaml") if is_limits(each)]

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from rlctl import registry
+from rlctl.environments import registry
 from rlctl.tasks.listing import describe_entry
 
 GOOD = """
@@ -116,7 +116,7 @@ def test_the_check_of_all_tasks(rlctl, importable):
 def test_a_broken_plugin_harms_only_itself(rlctl, importable, tmp_path):
     (importable / "some_robots" / "raises.yaml").unlink()
     code = (
-        "from rlctl import env_spec, registry\n"
+        "from rlctl.environments import registry, spec as env_spec\n"
         "from rlctl.errors import RlctlError\n"
         "for name in ('raises', 'leaves', 'absent', 'good', 'reach'):\n"
         "    try: print(name, type(env_spec.make(name).unwrapped).__name__)\n"

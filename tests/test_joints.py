@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.info import EnvInfo, describe
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.export.actor import metadata
+from rlctl.exporting.actor import metadata
 from rlctl.joints import Joints
-from rlctl.run.env_info import EnvInfo, describe
-from rlctl.run.policy import PolicyInfo
+from rlctl.policy.policy import PolicyInfo
 
 
 def describe_task(task):

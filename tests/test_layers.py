@@ -9,45 +9,37 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 
-# From the top down; a module imports parts of lines below its own, and of its own part.
+# From the top down: a module imports rooms of lines below its own, and its own room. There are no exceptions.
 LAYERS = [
     {"__main__"},
     {"cli"},
-    {"error_boundary", "completion", "python_api"},
-    {"tune"},
-    {"train"},
-    {"export", "replay", "tasks", "runs"},
-    {"check_env", "eval"},
-    {"deploy"},
+    {"__init__"},  # loads `rlctl.train` and the others on their first use
+    {"api", "gym"},
+    {"tuning"},
+    {"training"},
+    {"runs"},
+    {"exporting", "replaying", "tasks", "importing"},
+    {"checking", "evaluation"},
+    {"deploy.identify"},
     {"rollout"},
+    {"deploy.server"},
+    {"deploy"},
+    {"deploy.filter"},
+    {"processes"},
     {"run"},
-    {"gym"},
-    {"env_spec"},
-    {"dict_spaces", "time_feature"},
-    {"time_limit"},
-    {"named_task"},
-    {"registry"},
-    {"plugin_code"},
+    {"policy"},
+    {"recipe"},
+    {"environments"},
     {"task"},
     {"output"},
+    {"storage"},
     {"joints"},
-    {"errors", "__init__"},
+    {"errors", "version"},
 ]
-# Beside the order above.
-ALSO = {
-    ("output", "run"),
-    ("__init__", "env_spec"),
-    ("__init__", "run"),
-    ("__init__", "python_api"),
-    ("train", "python_api"),
-    ("rollout", "deploy"),  # a worker bounds its policy's actions by the filter that robots are behind
-    ("runs", "replay"),  # a report has pictures
-}
-NOT_AMONG_VERBS = {("export", "check_env"), ("replay", "check_env"), ("replay", "export")}
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
-MAY_IMPORT_TORCH = {  # besides train/
-    "rlctl/run/torch_policy.py",
-    "rlctl/eval/evaluate.py",  # seeds torch's generator where torch is there already
+MAY_IMPORT_TORCH = {  # besides training/
+    "rlctl/policy/torch_policy.py",
+    "rlctl/evaluation/evaluate.py",  # seeds torch's generator where torch is there already
 }
 
 
@@ -71,43 +63,43 @@ def files(folder: str) -> list[Path]:
     return sorted((ROOT / folder).rglob("*.py"))
 
 
-def part_of(module: str) -> str:
-    """`rlctl.run.policy.x` -> `run`; `rlctl.__version__` -> `__init__`."""
-    part = f"{module}.".split(".")[1]
-    return part if any(part in layer for layer in LAYERS) else "__init__"
+def room_of(module: str) -> str:
+    """`rlctl.run.episode` -> `run`; `rlctl.deploy.filter.limits` -> `deploy.filter`; `rlctl.train` -> `__init__`."""
+    parts = module.split(".")[1:]
+    names = (".".join(parts[:2]), parts[0] if parts else "")
+    return next((name for name in names if any(name in layer for layer in LAYERS)), "__init__")
 
 
-def level(part: str) -> int:
-    return next(number for number, layer in enumerate(LAYERS) if part in layer)
+def level(room: str) -> int:
+    return next(number for number, layer in enumerate(LAYERS) if room in layer)
 
 
-def test_every_part_has_a_layer():
-    parts = {path.stem if path.is_file() else path.name for path in (ROOT / "rlctl").iterdir()}
-    assert {part for part in parts - {"py", "__pycache__"} if not any(part in layer for layer in LAYERS)} == set()
+def module_of(file: Path) -> str:
+    return ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-def test_imports_run_one_way():
+def test_every_room_has_a_layer():
+    names = {path.stem if path.is_file() else path.name for path in (ROOT / "rlctl").iterdir()}
+    assert {name for name in names - {"py", "__pycache__"} if not any(name in layer for layer in LAYERS)} == set()
+
+
+def test_imports_run_downwards():
     wrong = []
     for file in files("rlctl"):
-        part = file.relative_to(ROOT / "rlctl").parts[0].removesuffix(".py")
+        room = room_of(module_of(file))
         for module in imports(file):
-            package, other = module.split(".")[0], part_of(module)
-            if package.startswith("rlctl_") or (package == "rlctl" and not may_import(part, other)):
+            other = room_of(module)
+            downwards = other == room or level(other) > level(room)
+            if module.startswith("rlctl_") or (module.split(".")[0] == "rlctl" and not downwards):
                 wrong.append(f"{file.relative_to(ROOT)} imports {module}")
     assert wrong == []
-
-
-def may_import(part: str, other: str) -> bool:
-    return (
-        other == part or (level(other) > level(part) and (part, other) not in NOT_AMONG_VERBS) or (part, other) in ALSO
-    )
 
 
 def test_who_imports_torch():
     found = [
         f"{name} imports {module}"
         for file in files("rlctl")
-        if (name := str(file.relative_to(ROOT))) not in MAY_IMPORT_TORCH and not name.startswith("rlctl/train/")
+        if (name := str(file.relative_to(ROOT))) not in MAY_IMPORT_TORCH and not name.startswith("rlctl/training/")
         for module in imports(file)
         if module.split(".")[0] in TORCH
     ]
@@ -150,7 +142,7 @@ def test_what_must_start_at_once():
 def test_environments_come_without_learning_libraries():
     loaded = loaded_after(
         "import rlctl; rlctl.make('reach').close()",
-        "from rlctl.env_spec import EnvSpec; EnvSpec('Pendulum-v1').make()",
+        "from rlctl.environments.spec import EnvSpec; EnvSpec('Pendulum-v1').make()",
         "from rlctl.rollout import collect, worker, workers",
         "from rlctl.deploy import SafetyFilter",
     )

@@ -5,7 +5,7 @@ import pickle
 import sys
 
 from tests import fork_server
-from tests.train.conftest import ENVS
+from tests.training.conftest import ENVS
 
 WATCHED = """
 import json, sys

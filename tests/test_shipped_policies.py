@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 import rlctl as package
-from rlctl import registry
+from rlctl.environments import registry
+from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, RlctlError, UsageError
-from rlctl.eval.evaluate import EvalRequest
-from rlctl.eval.score import measure_score
-from rlctl.export.policy_file import export_actor
+from rlctl.evaluation.evaluate import EvalRequest
+from rlctl.evaluation.score import measure_score
+from rlctl.exporting.policy_file import export_actor
+from rlctl.policy.policy import PolicyInfo, read_info, read_policy, save_policy
+from rlctl.policy.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
+from rlctl.recipe.sources import resolve_packaged
 from rlctl.run.directory import RunDirectory
-from rlctl.run.env_info import EnvInfo
 from rlctl.run.lookup import find_policy
-from rlctl.run.policy import PolicyInfo, read_info, read_policy, save_policy
-from rlctl.run.recipe_sources import resolve_packaged
-from rlctl.run.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
 
 OURS = [name for name in list_shipped() if registry.find(name).distribution == "rlctl"]
 
@@ -148,9 +148,9 @@ PUSH = """
 def write_push_policy(path, size):
     from gymnasium.spaces import Box
 
-    from rlctl.env_spec import EnvSpec
-    from rlctl.run.env_info import space_to_json
-    from rlctl.run.torch_policy import build_network
+    from rlctl.environments.info import space_to_json
+    from rlctl.environments.spec import EnvSpec
+    from rlctl.policy.torch_policy import build_network
 
     spaces = {"observation_space": Box(-1, 1, (size,)), "action_space": Box(-1, 1, (1,))}
     env = EnvInfo(**{name: space_to_json(space) for name, space in spaces.items()})

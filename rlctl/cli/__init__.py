@@ -11,9 +11,9 @@ from typing import Annotated
 
 import typer
 
-from rlctl import __version__, error_boundary
-from rlctl.cli import check_env, eval, export, identify, replay, runs, serve, tasks, train, tune
+from rlctl.cli import check_env, error_boundary, eval, export, identify, replay, runs, serve, tasks, train, tune
 from rlctl.errors import RlctlError
+from rlctl.version import __version__
 
 
 def _print_version(wanted: bool) -> None:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rlctl import completion
+from rlctl.cli import completion
 
 if TYPE_CHECKING:
-    from rlctl.env_spec import EnvChanges
+    from rlctl.environments.spec import EnvChanges
 
 TASK_FORMS = "Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id."
 OptionalTask = Annotated[
@@ -52,7 +52,7 @@ def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:
     if not pretrained:
         return checkpoint
     from rlctl.errors import UsageError
-    from rlctl.run.shipped import PRETRAINED
+    from rlctl.policy.shipped import PRETRAINED
 
     if checkpoint not in ("best", PRETRAINED):
         raise UsageError(f"--pretrained is the policy that ships with a task: leave out --checkpoint {checkpoint}")
@@ -68,10 +68,10 @@ def claim_stdout() -> None:
 
 def parse_changes(settings: list[str]) -> EnvChanges:
     """Read the `--set` options of a command that changes an environment."""
-    from rlctl.env_spec import UNCHANGED
+    from rlctl.environments.spec import UNCHANGED
 
     if not settings:
         return UNCHANGED
-    from rlctl.run.recipe_sources import parse_changes  # takes a quarter of a second
+    from rlctl.recipe.sources import parse_changes  # takes a quarter of a second
 
     return parse_changes(settings)

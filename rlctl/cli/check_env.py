@@ -32,11 +32,11 @@ def check_env(
 ) -> None:
     """Find what is wrong with an environment before hours of training do."""
     claim_stdout()
-    from rlctl.check_env import formats
-    from rlctl.check_env.check import check
-    from rlctl.check_env.finding import choose_rules
-    from rlctl.check_env.formats import rules
-    from rlctl.env_spec import EnvSpec
+    from rlctl.checking import formats
+    from rlctl.checking.check import check
+    from rlctl.checking.finding import choose_rules
+    from rlctl.checking.formats import rules
+    from rlctl.environments.spec import EnvSpec
 
     if list_rules or explain is not None:
         rules.show_list() if explain is None else rules.explain(explain)

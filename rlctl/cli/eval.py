@@ -74,8 +74,8 @@ def evaluate(
 ) -> None:
     """Say how good a policy is: success rate with its interval, returns, reward terms."""
     claim_stdout()
-    from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
-    from rlctl.eval.report import show
+    from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+    from rlctl.evaluation.report import show
     from rlctl.run.directory import is_group
     from rlctl.run.group import read_group
 
@@ -98,14 +98,14 @@ def evaluate(
         if policy is not None or limits is not None:
             given = "--limits" if policy is None else "--policy"
             raise UsageError(f"{given} plays a task as it is: leave out --vary and --push")
-        from rlctl.eval import robustness_report
-        from rlctl.eval.vary import check_gates, measure_robustness
+        from rlctl.evaluation import robustness_report
+        from rlctl.evaluation.vary import check_gates, measure_robustness
 
         robustness = measure_robustness(request, vary, push=push, yes=yes, gates=gates)
         robustness_report.show(robustness, json)
         return check_gates(robustness, gates)
     if run is not None and policy is None and is_group(Path(run)):
-        from rlctl.eval import group
+        from rlctl.evaluation import group
 
         scores = group.evaluate_group(read_group(Path(run)), request)
         group.show(scores, json)

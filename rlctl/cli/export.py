@@ -35,12 +35,12 @@ def export(
     if policy is not None:
         if output is not None or onnx or c:
             raise UsageError("--policy FILE writes that file and no other: leave out --output, --onnx and --c")
-        from rlctl.export import policy_file
+        from rlctl.exporting import policy_file
 
         policy_file.show(policy_file.export_actor(run, checkpoint=checkpoint, target=policy), json)
         return
-    from rlctl.export.export import Format, export_policy
-    from rlctl.export.report import show
+    from rlctl.exporting.export import Format, export_policy
+    from rlctl.exporting.report import show
 
     wanted: dict[Format, bool] = {"onnx": onnx or not c, "c": c}
     formats = [name for name, is_wanted in wanted.items() if is_wanted]

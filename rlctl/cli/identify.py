@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl import completion
+from rlctl.cli import completion
 from rlctl.cli.arguments import TASK_FORMS, Json, Set, claim_stdout, parse_changes
 
 
@@ -38,7 +38,7 @@ def identify(
     from rlctl.deploy.identify import report
     from rlctl.deploy.identify.excite import write_excitation
     from rlctl.deploy.identify.identify import identify
-    from rlctl.env_spec import EnvSpec
+    from rlctl.environments.spec import EnvSpec
     from rlctl.errors import UsageError
 
     spec = parse_changes(settings).apply(EnvSpec(task))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from rlctl import completion
+from rlctl.cli import completion
 from rlctl.cli.arguments import (
     Checkpoint,
     EpisodeSeed,
@@ -24,7 +24,7 @@ from rlctl.cli.arguments import (
 )
 
 if TYPE_CHECKING:
-    from rlctl.replay.replay import Choice
+    from rlctl.replaying.replay import Choice
 
 _BY_OUTCOME = ("--worst", "--best", "--failures")
 
@@ -85,8 +85,8 @@ def replay(
 ) -> None:
     """Show what a policy does: rollouts as Rerun recordings, without a display."""
     claim_stdout()
-    from rlctl.replay.replay import ReplayRequest, run_replay
-    from rlctl.replay.report import show
+    from rlctl.replaying.replay import ReplayRequest, run_replay
+    from rlctl.replaying.report import show
 
     result = run_replay(
         ReplayRequest(
@@ -109,7 +109,7 @@ def replay(
 
 def _read_choice(**counts: int | None) -> Choice | None:
     from rlctl.errors import UsageError
-    from rlctl.replay.replay import Choice
+    from rlctl.replaying.replay import Choice
 
     given = [Choice(kind, count) for kind, count in counts.items() if count is not None]  # type: ignore[arg-type]
     if len(given) > 1:

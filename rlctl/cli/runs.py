@@ -85,7 +85,7 @@ def compare_runs(
 ) -> None:
     """Say whether a policy, or a recipe trained with several seeds, is better than another."""
     claim_stdout()
-    from rlctl.eval.evaluate import EvalRequest
+    from rlctl.evaluation.evaluate import EvalRequest
     from rlctl.runs.comparison import compare
     from rlctl.runs.comparison_report import show
 
@@ -113,7 +113,7 @@ def import_run(
 ) -> None:
     """Turn a model of Stable-Baselines3 into a policy file. Nothing in the model is unpickled."""
     claim_stdout()
-    from rlctl.runs.import_model import import_model, show
+    from rlctl.importing.import_model import import_model, show
 
     changes = parse_changes(settings)
     show(import_model(model, task, normalization=vecnormalize, algo=algo, output=output, changes=changes), json)

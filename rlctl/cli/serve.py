@@ -37,7 +37,7 @@ def serve(
     """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""
     claim_stdout()
     from rlctl import output
-    from rlctl.deploy.serve import ServerSettings, make_server, run_server
+    from rlctl.deploy.server.serve import ServerSettings, make_server, run_server
     from rlctl.run.lookup import find_policy
 
     chosen = choose_checkpoint(checkpoint, pretrained)
@@ -55,9 +55,9 @@ def serve(
     )
     server = make_server(found.file, settings)
     if self_test:
-        from rlctl.eval.evaluate import EvalRequest
-        from rlctl.eval.self_test import run_self_test
-        from rlctl.eval.self_test import show as show_test
+        from rlctl.evaluation.evaluate import EvalRequest
+        from rlctl.evaluation.self_test import run_self_test
+        from rlctl.evaluation.self_test import show as show_test
 
         result = run_self_test(server, EvalRequest(str(found.file), episodes=episodes, limits=limits))
         show_test(result, json)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl import completion
+from rlctl.cli import completion
 from rlctl.cli.arguments import TASK_FORMS, Json, claim_stdout
 from rlctl.errors import UsageError
 

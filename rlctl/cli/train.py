@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl import completion
+from rlctl.cli import completion
 from rlctl.cli.arguments import Algo, Config, EnvTimeout, Json, NEnvs, OptionalTask, RunsFolder, Set, claim_stdout
 from rlctl.errors import UsageError
 
@@ -58,10 +58,10 @@ def train(
 ) -> None:
     """Train a policy, evaluate as it goes, and keep the best and the last."""
     claim_stdout()
+    from rlctl.recipe.sources import merge_flags
     from rlctl.run.group import find_group
-    from rlctl.run.recipe_sources import merge_flags
-    from rlctl.train.request import TrainRequest, run_training
-    from rlctl.train.summary import show
+    from rlctl.training.request import TrainRequest, run_training
+    from rlctl.training.summary import show
 
     group_folder = find_group(resume, output) if resume is not None else None
     request = TrainRequest(
@@ -80,8 +80,8 @@ def train(
         initial_policy=initial_policy,
     )
     if seeds is not None or group_folder is not None:
-        from rlctl.eval import group
-        from rlctl.train.seeds import train_seeds
+        from rlctl.evaluation import group
+        from rlctl.training.seeds import train_seeds
 
         result = train_seeds(request, seeds, jobs=jobs)
         group.show(result.score, json)

@@ -46,11 +46,11 @@ def tune(
         raise UsageError("give a task to tune, or --resume FOLDER")
     if metric not in ("return", "success"):
         raise UsageError(f"--metric {metric}: give return or success")
-    from rlctl.run.recipe_sources import merge_flags
-    from rlctl.tune import report
-    from rlctl.tune.tune import TuneRequest
-    from rlctl.tune.tune import resume as go_on
-    from rlctl.tune.tune import tune as begin
+    from rlctl.recipe.sources import merge_flags
+    from rlctl.tuning import report
+    from rlctl.tuning.tune import TuneRequest
+    from rlctl.tuning.tune import resume as go_on
+    from rlctl.tuning.tune import tune as begin
 
     if resume is not None:
         return report.show(go_on(resume, jobs=jobs), json)

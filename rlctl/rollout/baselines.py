@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rlctl import registry
-from rlctl.dict_spaces import map_parts
+from rlctl.environments import registry
+from rlctl.environments.dict_spaces import map_parts
 from rlctl.errors import (
     NoSuchClassError,
     PolicyError,
@@ -21,7 +21,7 @@ from rlctl.errors import (
     format_plugin_traceback,
     short_repr,
 )
-from rlctl.run.acting import ExportedPlayer, Player, make_generator
+from rlctl.policy.acting import ExportedPlayer, Player, make_generator
 
 BASELINES = ("zero", "random")
 SERVER = ("ws://", "wss://")
@@ -31,7 +31,7 @@ SERVER = ("ws://", "wss://")
 def make_player(name: str, space: spaces.Space[Any], observation_space: spaces.Space[Any]) -> Player:
     """Return what plays `zero`, `random`, an exported file, a server (`ws://`), or a function for `load_function`."""
     if name.startswith(SERVER):
-        from rlctl.deploy.client import RemotePlayer  # only here: it imports aiohttp
+        from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp
 
         return RemotePlayer(name, observation_space, space)
     if name == "zero":

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import Observations, join, split
+from rlctl.environments.dict_spaces import Observations, join, split
 from rlctl.errors import EpisodeFailed, TaskError
+from rlctl.policy.acting import Exploration
 from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.workers import Workers
-from rlctl.run.acting import Exploration
 
 _CONTACTS_MEASURED = 10
 """Of recorded episodes, the first ones; it takes about 3 % of a step."""

@@ -11,10 +11,10 @@ from typing import Any, get_args
 
 import pydantic
 
-from rlctl.env_spec import EnvSpec
-from rlctl.run.acting import Exploration
-from rlctl.run.env_info import EnvInfo
-from rlctl.run.policy import PolicyInfo
+from rlctl.environments.info import EnvInfo
+from rlctl.environments.spec import EnvSpec
+from rlctl.policy.acting import Exploration
+from rlctl.policy.policy import PolicyInfo
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Iterable
 from multiprocessing.connection import wait
 
+from rlctl.processes.child_process import MAX_LINE_BYTES, ChildProcess, LineFilter, LineReader
 from rlctl.rollout import messages
-from rlctl.rollout.child_process import MAX_LINE_BYTES, ChildProcess, LineFilter, LineReader
 from rlctl.rollout.messages import Answer, Job, Message
 
 _CHECK_EVERY_S = 0.2

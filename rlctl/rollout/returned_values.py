@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import SINGLE, split, split_space
+from rlctl.environments.dict_spaces import SINGLE, split, split_space
 from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
 from rlctl.output import format_count
 from rlctl.rollout.shared_arrays import observation_fields

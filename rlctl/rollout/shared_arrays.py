@@ -12,11 +12,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import split_space
+from rlctl.environments.dict_spaces import split_space
+from rlctl.environments.info import EnvInfo
+from rlctl.policy.network import select_actor_tensors
+from rlctl.policy.policy import PolicyInfo
 from rlctl.rollout.messages import EpisodeResult
-from rlctl.run.env_info import EnvInfo
-from rlctl.run.network import select_actor_tensors
-from rlctl.run.policy import PolicyInfo
 
 Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
 """Shape and dtype per name."""
@@ -27,7 +27,7 @@ _ROWS = ("stored", "action", "reward", "terminated", "truncated", "terms")
 
 
 def observation_fields(space: spaces.Space[Any]) -> Layout:
-    """Return shape and dtype per observation key; see `rlctl.dict_spaces`."""
+    """Return shape and dtype per observation key; see `rlctl.environments.dict_spaces`."""
     return {key: _leaf(part) for key, part in split_space(space).items()}
 
 

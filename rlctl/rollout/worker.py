@@ -20,20 +20,20 @@ import safetensors.numpy
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import SINGLE
-from rlctl.env_spec import EnvSpec, make_several
+from rlctl.environments.dict_spaces import SINGLE
+from rlctl.environments.info import EnvInfo, describe
+from rlctl.environments.spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
+from rlctl.policy.acting import Player, PolicyPlayer
+from rlctl.processes.child_process import write_stderr
 from rlctl.rollout import messages
 from rlctl.rollout.baselines import make_player
-from rlctl.rollout.child_process import write_stderr
 from rlctl.rollout.failures import FailedInEpisode, describe_failure
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
 from rlctl.rollout.returned_values import ObservationWriter, compute_rewards
 from rlctl.rollout.running_episode import RunningEpisode
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
-from rlctl.run.acting import Player, PolicyPlayer
-from rlctl.run.env_info import EnvInfo, describe
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import Event, EventSettings, push
 
@@ -116,8 +116,8 @@ class Worker:
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
         """Let the policy act within limits from now on."""
-        from rlctl.deploy.limited_player import LimitedPlayer  # few evaluations need it
-        from rlctl.deploy.limits import Limits
+        from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
+        from rlctl.deploy.filter.limits import Limits
 
         self._player = LimitedPlayer(self._loaded_player, self._info, Limits.model_validate(message.limits))
 

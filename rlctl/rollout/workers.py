@@ -16,17 +16,17 @@ import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import Observations, join
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.dict_spaces import Observations, join
+from rlctl.environments.info import EnvInfo
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
+from rlctl.policy.policy import PolicyInfo
+from rlctl.processes.child_process import anonymous_file, write_stderr
 from rlctl.rollout import messages
-from rlctl.rollout.child_process import anonymous_file, write_stderr
 from rlctl.rollout.failures import format_hint, make_error
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
 from rlctl.rollout.process_pool import ProcessPool, WorkerFault
 from rlctl.rollout.shared_arrays import PolicyNumbers, SharedArrays
-from rlctl.run.env_info import EnvInfo
-from rlctl.run.policy import PolicyInfo
 
 BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0

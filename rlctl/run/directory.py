@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlctl import registry
+from rlctl.environments import registry
 from rlctl.errors import ArtifactError, UsageError, short_repr
-from rlctl.run import files
+from rlctl.storage import files
 
 if TYPE_CHECKING:
-    from rlctl.run.recipe import Recipe
+    from rlctl.recipe.recipe import Recipe
 
 ROOT = Path("runs")
 GROUP_FILE = "group.json"
@@ -91,8 +91,8 @@ class RunDirectory:
 
     def recipe(self) -> Recipe:
         """Read the resolved recipe; raises `ArtifactError` if it is not the one that the training began with."""
-        from rlctl.run.recipe import validate
-        from rlctl.run.recipe_sources import read
+        from rlctl.recipe.recipe import validate
+        from rlctl.recipe.sources import read
 
         content = read(self.recipe_file)
         if not files.is_as_sealed(self.recipe_file):

@@ -11,10 +11,10 @@ import pydantic
 from numpy.typing import NDArray
 from pydantic import Field
 
-from rlctl.dict_spaces import Observations, split
+from rlctl.environments.dict_spaces import Observations, split
+from rlctl.environments.named_spec import EpisodeSpec
 from rlctl.errors import ArtifactError
-from rlctl.run import files, untrusted
-from rlctl.run.named_spec import EpisodeSpec
+from rlctl.storage import files, untrusted
 
 FORMAT = 1
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.run import files
 from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, create_group_folder, is_group
 from rlctl.run.lookup import find_run, refuse_tuning
+from rlctl.storage import files
 
 _MOST_SEEDS = 1000
 _RANGE = re.compile(r"(\d{1,9})-(\d{1,9})")

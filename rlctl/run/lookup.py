@@ -11,14 +11,14 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rlctl import registry
-from rlctl.env_spec import EnvSpec
+from rlctl.environments import registry
+from rlctl.environments.spec import EnvSpec
+from rlctl.environments.task_version import describe_task_changes
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 from rlctl.output import format_duration
+from rlctl.policy.policy import PolicyInfo, read_info
+from rlctl.policy.shipped import PRETRAINED, find_shipped_policy
 from rlctl.run.directory import ROOT, TUNE_FILE, RunDirectory, is_group
-from rlctl.run.policy import PolicyInfo, read_info
-from rlctl.run.shipped import PRETRAINED, find_shipped_policy
-from rlctl.run.task_version import describe_task_changes
 
 _MOST_COMPARED = 50  # older runs whose scores are looked at
 _IN_TASK = ("*/run.json", "*_seeds/*/run.json")

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import pydantic
 
-from rlctl.run import files, untrusted
-from rlctl.run.shipped import Interval
+from rlctl.policy.shipped import Interval
+from rlctl.storage import files, untrusted
 
 FORMAT = 1
 

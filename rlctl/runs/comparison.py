@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.eval.evaluate import EvalRequest, Evaluation, run_evaluation
+from rlctl.evaluation.evaluate import EvalRequest, Evaluation, run_evaluation
+from rlctl.recipe.recipe import find_difference, find_mixed
 from rlctl.run.directory import RunDirectory, is_group
 from rlctl.run.group import find_group, read_group
 from rlctl.run.lookup import find_run
-from rlctl.run.recipe import find_difference, find_mixed
 from rlctl.runs.statistics import (
     Difference,
     Verdict,

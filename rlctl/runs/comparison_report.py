@@ -8,8 +8,8 @@ from typing import Any
 from rich.text import Text
 
 from rlctl import output
-from rlctl.eval.statistics import Spread
-from rlctl.run.stages import format_value
+from rlctl.evaluation.statistics import Spread
+from rlctl.recipe.stages import format_value
 from rlctl.runs.comparison import Candidate, Comparison, EvaluatedRun, Quantity, Side
 from rlctl.runs.statistics import ALPHA, Difference, SeedDifference, Verdict, interquartile_mean_interval
 

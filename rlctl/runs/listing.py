@@ -7,7 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rlctl import output, registry
+from rlctl import output
+from rlctl.environments import registry
 from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.run.directory import ROOT
 from rlctl.runs.summary import RunSummary, find_runs, summarize

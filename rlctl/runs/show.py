@@ -11,10 +11,10 @@ from rich.text import Text
 
 from rlctl import output
 from rlctl.errors import ArtifactError
+from rlctl.recipe.stages import format_value
 from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
 from rlctl.run.robustness import Robustness
-from rlctl.run.stages import format_value
 from rlctl.runs.diagnosis import diagnose, format_finding
 from rlctl.runs.diagnosis.history import History
 from rlctl.runs.listing import as_json

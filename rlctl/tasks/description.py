@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic_core import to_jsonable_python
 
-from rlctl import registry
-from rlctl.check_env.leaves import Leaf, find_leaves
+from rlctl.checking.leaves import Leaf, find_leaves
+from rlctl.environments import registry
+from rlctl.environments.plugin_code import call_plugin
 from rlctl.errors import TaskError
-from rlctl.plugin_code import call_plugin
-from rlctl.run import recipe as recipes
-from rlctl.run import recipe_sources
-from rlctl.run.policy import PolicyInfo, read_info
+from rlctl.policy.policy import PolicyInfo, read_info
+from rlctl.recipe import recipe as recipes
+from rlctl.recipe import sources
 
 if TYPE_CHECKING:
     import gymnasium
@@ -46,7 +46,7 @@ def describe(task: str) -> Description:
     Raises `UsageError` for an unknown name, `TaskError` for a task that cannot be built.
     """
     constructor: Any = registry.load(task)
-    recipe = recipe_sources.resolve_packaged(task)
+    recipe = sources.resolve_packaged(task)
     # The last stage is what is wanted. The parts of stacked observations have no names.
     spec = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1, time_feature=False)
     env = spec.make()
@@ -77,8 +77,8 @@ def _convert(value: Any) -> Any:
 
 
 def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    from rlctl.environments.time_limit import find_time_limit
     from rlctl.task.env import TaskEnv
-    from rlctl.time_limit import find_time_limit
 
     built = env.unwrapped
     task_env = built if isinstance(built, TaskEnv) else None

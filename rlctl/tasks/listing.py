@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from rlctl import registry
+from rlctl.environments import registry
 from rlctl.errors import RecipeError
 
 
@@ -45,7 +45,7 @@ def _read_algorithm(entry: registry.TaskEntry) -> str | None:
     file = entry.recipe_file
     if file is None:
         return None
-    from rlctl.run import yaml_text
+    from rlctl.storage import yaml_text
 
     content = yaml_text.load(file.read_text(encoding="utf-8"), str(file))
     algo = content.get("algo", "ppo") if isinstance(content, dict) else "ppo"

@@ -11,7 +11,7 @@ import shutil
 import string
 from pathlib import Path
 
-from rlctl import registry
+from rlctl.environments import registry
 from rlctl.errors import ArtifactError, UsageError
 
 TEMPLATE = Path(__file__).with_name("template")

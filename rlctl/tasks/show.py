@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rlctl import output
-from rlctl.eval.score import describe_score
-from rlctl.run.policy import PolicyInfo
-from rlctl.run.stages import Stage
+from rlctl.evaluation.score import describe_score
+from rlctl.policy.policy import PolicyInfo
+from rlctl.recipe.stages import Stage
 from rlctl.tasks.description import Description
 
 Row = tuple[str, ...]

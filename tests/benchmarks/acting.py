@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.spec import EnvSpec
+from rlctl.policy.acting import Exploration
+from rlctl.policy.policy import PolicyInfo
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import Play
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.workers import Workers, available_cores
-from rlctl.run.acting import Exploration
-from rlctl.run.policy import PolicyInfo
 from tests.benchmarks.row import Row, side_by_side
 
 MANY = 64

@@ -51,8 +51,8 @@ def beside_training(repeat: int) -> Row:
 
 def _train_as_shipped(seed: int) -> tuple[float, float, float, float]:
     """Return the parts of the time at boundaries, in evaluations and in checkpoints, and the time [s]."""
-    from rlctl.train.loop import TrainingLoop
-    from rlctl.train.saving import Saver
+    from rlctl.training.loop import TrainingLoop
+    from rlctl.training.saving import Saver
 
     with (
         _timed_calls(TrainingLoop, "boundary") as boundaries,
@@ -82,8 +82,8 @@ def _while_training(name: str, settings: dict, repeat: int) -> Row:
 
 def _train(settings: dict) -> tuple[float, int, float, float, float]:
     """Return the part of the time, how many, when the first two were there [s], and the median of their times [ms]."""
-    from rlctl.train.loop import TrainingLoop
-    from rlctl.train.saving import Saver
+    from rlctl.training.loop import TrainingLoop
+    from rlctl.training.saving import Saver
 
     with (
         _timed_calls(Saver, "checkpoint") as saves,
@@ -98,7 +98,7 @@ def _train(settings: dict) -> tuple[float, int, float, float, float]:
 
 
 def _run(settings: dict) -> None:
-    from rlctl.train.request import TrainRequest, run_training
+    from rlctl.training.request import TrainRequest, run_training
 
     with tempfile.TemporaryDirectory() as folder:
         run_training(TrainRequest("reach", settings=settings, root=Path(folder)))
@@ -150,7 +150,7 @@ def _saved() -> tuple[float, float, float]:
     from gymnasium import spaces
     from stable_baselines3.common.buffers import ReplayBuffer
 
-    from rlctl.train.replay_segments import ReplaySegments
+    from rlctl.training.replay_segments import ReplaySegments
 
     box = spaces.Box(-1, 1, (_SIZE,), np.float32)
     buffer = ReplayBuffer(_TRANSITIONS, box, spaces.Box(-1, 1, (8,), np.float32))

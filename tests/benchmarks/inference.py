@@ -48,9 +48,9 @@ def onnx_runtime(repeat: int) -> Row:
 
 def c_function(repeat: int) -> Row:
     """Time C for one observation, called through ctypes, beside onnxruntime's own `session.run`; both from Python."""
-    from rlctl.export.c_source import build_library, find_compiler, write_c
-    from rlctl.run.c_policy import CPolicy
-    from rlctl.run.policy import read_policy
+    from rlctl.exporting.c_source import build_library, find_compiler, write_c
+    from rlctl.policy.c_policy import CPolicy
+    from rlctl.policy.policy import read_policy
 
     run = short_run()
     rlctl_command("export", str(run), "--onnx")
@@ -82,7 +82,7 @@ def c_function(repeat: int) -> Row:
 
 
 def _torch_policy(run: Path) -> Any:
-    from rlctl.run.torch_policy import TorchPolicy, pin_threads
+    from rlctl.policy.torch_policy import TorchPolicy, pin_threads
 
     # The best case for so small a network.
     pin_threads()

@@ -15,11 +15,11 @@ from collections.abc import Iterator
 import aiohttp
 import numpy as np
 
-from rlctl.deploy import messages
-from rlctl.deploy.limits import Limits
-from rlctl.deploy.safety_filter import SafetyFilter
-from rlctl.run.env_info import EnvInfo
-from rlctl.run.shipped import find_shipped_policy
+from rlctl.deploy.filter.limits import Limits
+from rlctl.deploy.filter.safety_filter import SafetyFilter
+from rlctl.deploy.server import messages
+from rlctl.environments.info import EnvInfo
+from rlctl.policy.shipped import find_shipped_policy
 from tests.benchmarks.row import Row
 
 _SIZE = 20  # of reach's observation

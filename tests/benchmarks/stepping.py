@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import rlctl
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.spec import EnvSpec
+from rlctl.policy.acting import Exploration
 from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers, available_cores
-from rlctl.run.acting import Exploration
 from rlctl.task.bullet import pybullet, pybullet_data
 from tests.benchmarks.acting import make_policy
 from tests.benchmarks.row import Row, side_by_side

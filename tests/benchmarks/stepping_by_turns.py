@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.spec import EnvSpec
 from rlctl.rollout.workers import Workers
 
 

@@ -18,12 +18,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rlctl import registry
-from rlctl.eval.evaluate import EvalRequest
-from rlctl.eval.group import as_json, evaluate_group
-from rlctl.run import files
+from rlctl.environments import registry
+from rlctl.evaluation.evaluate import EvalRequest
+from rlctl.evaluation.group import as_json, evaluate_group
 from rlctl.run.directory import GROUP_FILE
 from rlctl.run.group import Group, parse_seeds, read_group
+from rlctl.storage import files
 
 BEGIN, END = "<!-- scores: make train-all -->\n", "<!-- end of scores -->\n"
 _SEED = re.compile(r"_s(\d+)(_\d+)?$")  # of a run folder's name

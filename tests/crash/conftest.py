@@ -8,7 +8,7 @@ import pytest
 
 from tests.crash.trials import ARGUMENTS, Trials
 
-pytest.register_assert_rewrite("tests.crash.contract", "tests.train.comparing")
+pytest.register_assert_rewrite("tests.crash.contract", "tests.training.comparing")
 
 PARTS = 101
 """A test that repeats itself is in so many parts; of some the first runs with all other tests."""

@@ -3,10 +3,10 @@
 import csv
 from pathlib import Path
 
+from rlctl.policy.policy import read_policy
 from rlctl.run.directory import RunDirectory
-from rlctl.run.policy import read_policy
 from tests.crash.trials import Ended, Trials, only_run, resume
-from tests.train.comparing import assert_same_run
+from tests.training.comparing import assert_same_run
 
 
 def assert_nothing_lost(trials: Trials, arguments, ended: Ended, whole: RunDirectory, announced=0) -> None:

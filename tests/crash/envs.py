@@ -4,7 +4,7 @@ import re
 import time
 from pathlib import Path
 
-from tests.train.envs import Line
+from tests.training.envs import Line
 
 FILE = Path(__file__)
 

@@ -1,4 +1,4 @@
-"""A disk that fails: a stand-in for the module `os` in `rlctl.run.files`, which counts operations."""
+"""A disk that fails: a stand-in for the module `os` in `rlctl.storage.files`, which counts operations."""
 
 import errno
 import os

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from rlctl.rollout.child_process import set_start
+from rlctl.processes.child_process import set_start
 from tests.crash import outside_changes
 from tests.crash.faulty_os import FaultyOs, FaultyShutil
 
@@ -20,8 +20,8 @@ def run(arguments, plan):
         os.sched_setaffinity(0, {plan["core"]})
     if plan.get("real_workers"):
         set_start(subprocess.Popen)
-    from rlctl.run import files
-    from rlctl.train import saving
+    from rlctl.storage import files
+    from rlctl.training import saving
 
     saving.CHECKPOINT_TIME_SHARE = plan.get("time_for_checkpoints", 1e9)  # at every boundary
     _announce(saving.Saver, log)

@@ -15,7 +15,7 @@ def begin(what, after=0, until=None):
     if what in CLOCKS:
         CLOCKS[what]()
         return
-    from rlctl.train import saving
+    from rlctl.training import saving
 
     original = saving.Saver.checkpoint
 
@@ -50,7 +50,7 @@ def broken(number):
     """Let no operation on the disk succeed that changes it."""
 
     def begin(_):
-        from rlctl.run import files
+        from rlctl.storage import files
 
         if not isinstance(files.os, _Unwilling):
             files.os = _Unwilling(files.os)

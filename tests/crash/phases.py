@@ -7,27 +7,27 @@ import signal
 import psutil
 
 import rlctl.rollout.workers
-import rlctl.run.files
-import rlctl.train.evaluation
-import rlctl.train.loop
-import rlctl.train.status
-import rlctl.train.vec_env
-from rlctl.rollout import child_process
+import rlctl.storage.files
+import rlctl.training.evaluation
+import rlctl.training.loop
+import rlctl.training.status
+import rlctl.training.vec_env
+from rlctl.processes import child_process
 
 PHASES = {
     "workers start": (child_process, "start_process", 1),
     "workers build": (rlctl.rollout.workers.Workers, "info", 1),
-    "run folder": (rlctl.train.status, "write_start", 1),
-    "first rollout": (rlctl.train.vec_env.WorkerVecEnv, "finish", 1),
-    "boundary": (rlctl.train.loop.TrainingLoop, "boundary", 2),
-    "evaluation": (rlctl.train.evaluation.Evaluator, "run", 1),
-    "first checkpoint": (rlctl.run.files, "os.rename", 1),
-    "checkpoint": (rlctl.run.files, "os.rename", 2),
-    "evaluated checkpoint": (rlctl.run.files, "os.rename", 4),
-    "final evaluation": (rlctl.train.evaluation.Evaluator, "run", 2),
-    "the end": (rlctl.train.loop.TrainingLoop, "boundary", 4),
-    "last checkpoint": (rlctl.run.files, "os.rename", 6),
-    "done": (rlctl.train.status, "write_end", 1),
+    "run folder": (rlctl.training.status, "write_start", 1),
+    "first rollout": (rlctl.training.vec_env.WorkerVecEnv, "finish", 1),
+    "boundary": (rlctl.training.loop.TrainingLoop, "boundary", 2),
+    "evaluation": (rlctl.training.evaluation.Evaluator, "run", 1),
+    "first checkpoint": (rlctl.storage.files, "os.rename", 1),
+    "checkpoint": (rlctl.storage.files, "os.rename", 2),
+    "evaluated checkpoint": (rlctl.storage.files, "os.rename", 4),
+    "final evaluation": (rlctl.training.evaluation.Evaluator, "run", 2),
+    "the end": (rlctl.training.loop.TrainingLoop, "boundary", 4),
+    "last checkpoint": (rlctl.storage.files, "os.rename", 6),
+    "done": (rlctl.training.status, "write_end", 1),
 }
 """Phase -> the function that is in it, and which call of it.
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from rlctl.errors import ArtifactError
+from rlctl.policy.policy import read_policy
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
-from rlctl.run.policy import read_policy
 from tests.crash.conftest import PARTS, parts
 from tests.crash.contract import assert_quiet, assert_same_end
 from tests.crash.damage import Damage, all_damage
 from tests.crash.trials import ARGUMENTS, copied, only_run, operation_after, resume
-from tests.train.comparing import rows
+from tests.training.comparing import rows
 
 COUNT = 150
 """Of each of two runs."""

@@ -66,7 +66,7 @@ def test_killed_before_its_first_checkpoint(trials, whole, folders):
 
 
 MENDABLE = f"""
-from tests.train import envs
+from tests.training import envs
 class Line(envs.Line):
     broken = True
     def step(self, action):

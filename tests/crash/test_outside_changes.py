@@ -4,11 +4,11 @@ import shutil
 
 import pytest
 
-from rlctl.train import checkpoint
+from rlctl.training import checkpoint
 from tests.crash.contract import assert_quiet, assert_same_end
 from tests.crash.outside_changes import CLOCKS
 from tests.crash.trials import ARGUMENTS, only_run, resume
-from tests.train.comparing import rows
+from tests.training.comparing import rows
 
 pytestmark = pytest.mark.crash
 

@@ -14,7 +14,7 @@ import psutil
 
 from rlctl.run.directory import RunDirectory
 from tests import fork_server
-from tests.train.conftest import ENVS
+from tests.training.conftest import ENVS
 
 
 def _line(*settings, algo, steps, evaluate):

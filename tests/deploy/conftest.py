@@ -6,7 +6,7 @@ from gymnasium import spaces
 from hypothesis import HealthCheck, Phase, settings
 
 from rlctl.deploy import Limits, SafetyFilter
-from rlctl.run.env_info import EnvInfo, space_to_json
+from rlctl.environments.info import EnvInfo, space_to_json
 
 JOINTS = ["shoulder", "elbow"]
 # Without the phase of targets, for which hypothesis loads a module amid a test: Python 3.11 can fail to compile one

@@ -11,14 +11,14 @@ import pytest
 from aiohttp import web
 from gymnasium import spaces
 
-from rlctl.deploy import messages
-from rlctl.deploy.client import PolicyClient, RemotePlayer
+from rlctl.deploy.server import messages
+from rlctl.deploy.server.client import PolicyClient, RemotePlayer
 from rlctl.errors import PolicyError, RecipeError, UsageError
-from rlctl.eval.evaluate import EvalRequest, Gates, run_evaluation
-from rlctl.eval.report import as_json, count_interventions
-from rlctl.eval.self_test import run_self_test
-from rlctl.run.shipped import PRETRAINED
-from tests.deploy.serving import RunningServer
+from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.report import as_json, count_interventions
+from rlctl.evaluation.self_test import run_self_test
+from rlctl.policy.shipped import PRETRAINED
+from tests.deploy.server.serving import RunningServer
 
 STEP = "command: step\nscale: 0.03\nmeasured: {position: joint_positions}\n"
 
@@ -133,7 +133,7 @@ def serve_answer(metadata, answer):
 
 
 def test_self_test(tmp_path):
-    from rlctl.deploy.serve import ServerSettings, make_server
+    from rlctl.deploy.server.serve import ServerSettings, make_server
     from rlctl.run.lookup import find_policy
 
     server = make_server(find_policy("reach", PRETRAINED).file, ServerSettings(port=0, watchdog=False))

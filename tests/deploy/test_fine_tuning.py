@@ -7,11 +7,11 @@ from rlctl.deploy.identify.excite import write_excitation
 from rlctl.deploy.identify.follow import describe_expected, open_world
 from rlctl.deploy.identify.identify import identify
 from rlctl.deploy.identify.log import Log, read_log, write_log
-from rlctl.env_spec import EnvChanges, EnvSpec
-from rlctl.eval.evaluate import EvalRequest
-from rlctl.eval.score import measure_score
-from rlctl.train.request import TrainRequest, run_training
-from tests.train.comparing import rows
+from rlctl.environments.spec import EnvChanges, EnvSpec
+from rlctl.evaluation.evaluate import EvalRequest
+from rlctl.evaluation.score import measure_score
+from rlctl.training.request import TrainRequest, run_training
+from tests.training.comparing import rows
 
 DELAY = 4  # control steps, 67 ms; the policy was trained without any
 STEPS = 38_400

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rlctl.run import recipe_sources
+from rlctl.recipe import sources
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
@@ -175,7 +175,7 @@ def dynamics(body):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_packaged_recipe(name):
-    assert recipe_sources.resolve(name, None, {}).algo == "tqc"
+    assert sources.resolve(name, None, {}).algo == "tqc"
 
 
 @pytest.mark.slow

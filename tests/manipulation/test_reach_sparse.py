@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.errors import TaskError
-from rlctl.run import recipe_sources
+from rlctl.recipe import sources
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
 from rlctl_manipulation.reach import HOME
@@ -69,7 +69,7 @@ def test_all_events_act():
 
 
 def test_the_recipe():
-    packaged = recipe_sources.resolve("reach-sparse", None, {})
+    packaged = sources.resolve("reach-sparse", None, {})
     assert packaged.algo == "sac"
     assert packaged.her is not None
 

@@ -4,8 +4,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from rlctl.env_spec import EnvSpec
-from rlctl.rollout.child_process import set_start
+from rlctl.environments.spec import EnvSpec
+from rlctl.processes.child_process import set_start
 from rlctl.rollout.workers import Workers
 from tests import fork_server
 

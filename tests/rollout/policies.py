@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from rlctl.env_spec import EnvSpec
-from rlctl.run.policy import PolicyInfo
+from rlctl.environments.spec import EnvSpec
+from rlctl.policy.policy import PolicyInfo
 
 
 def linear(info, weight, log_std=None, bias=0.0):

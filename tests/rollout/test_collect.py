@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import DivergedError, EpisodeFailed, TaskError
+from rlctl.policy.acting import Exploration
 from rlctl.rollout import collect
 from rlctl.rollout.collect import play_episodes
-from rlctl.run.acting import Exploration
 from tests.rollout.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")

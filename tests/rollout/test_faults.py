@@ -97,7 +97,7 @@ def test_a_reset_that_fails_is_step_zero(spec, start):
 PARENT = textwrap.dedent(
     """
     import sys
-    from rlctl.env_spec import EnvSpec
+    from rlctl.environments.spec import EnvSpec
     from rlctl.rollout.messages import Play
     from rlctl.rollout.workers import Workers
     workers = Workers(EnvSpec(sys.argv[1], {"fault": "hang"}), 4, n_workers=2)

@@ -4,11 +4,11 @@ import math
 
 import pytest
 
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.info import EnvInfo
+from rlctl.environments.spec import EnvSpec
+from rlctl.policy.acting import Exploration
+from rlctl.policy.policy import PolicyInfo
 from rlctl.rollout import messages
-from rlctl.run.acting import Exploration
-from rlctl.run.env_info import EnvInfo
-from rlctl.run.policy import PolicyInfo
 
 ENV = EnvInfo(observation_space={"type": "Discrete", "n": 2}, action_space={}, control_dt=math.inf)
 SPEC = EnvSpec("reach", {"limit": math.inf, "name": "x"}, named_by="run")

@@ -4,8 +4,8 @@ import os
 
 import pytest
 
-from rlctl.env_spec import EnvSpec
-from rlctl.rollout.child_process import (
+from rlctl.environments.spec import EnvSpec
+from rlctl.processes.child_process import (
     MAX_LINE_BYTES,
     MAX_LINES_PER_S,
     LineFilter,
@@ -16,7 +16,7 @@ from rlctl.rollout.child_process import (
 from rlctl.rollout.failures import FailedInEpisode, describe_failure, format_hint
 from rlctl.rollout.messages import Attach, Build, Failure, Job, LoadPolicy, Play
 from rlctl.rollout.worker import Worker
-from tests.train import faulty_envs
+from tests.training import faulty_envs
 
 ENVS = faulty_envs.__file__
 

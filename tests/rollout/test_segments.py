@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rlctl.errors import EpisodeFailed
+from rlctl.policy.acting import Exploration, PolicyPlayer
 from rlctl.rollout.messages import Play
 from rlctl.rollout.seeds import Stream, episode_seed
-from rlctl.run.acting import Exploration, PolicyPlayer
 from tests.rollout.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")

@@ -10,12 +10,12 @@ import numpy as np
 import psutil
 import pytest
 
-from rlctl.dict_spaces import join
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.dict_spaces import join
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError
 from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers
-from rlctl.train.measurements import evaluation_row, training_row
+from rlctl.training.measurements import evaluation_row, training_row
 from tests.rollout.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")

@@ -11,8 +11,8 @@ import sys
 import pytest
 
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.recipe.recipe import Recipe
 from rlctl.run import directory
-from rlctl.run.recipe import Recipe
 
 
 def error(kind, call, *arguments):

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.named_task import EPISODE
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.named_task import EPISODE
-from rlctl.run import files
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
+from rlctl.storage import files
 
 INFO = EpisodeInfo(
     spec=EnvSpec("reach", {"tolerance": 0.02}, randomize=True, events={"mass": {"factor": [0.9, 1.1]}}, frame_stack=2),

@@ -7,14 +7,14 @@ import shutil
 import numpy as np
 import pytest
 
-from rlctl import registry
-from rlctl.env_spec import EnvSpec
+from rlctl.environments import registry
+from rlctl.environments.info import EnvInfo
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.policy.policy import PolicyInfo, Score, save_policy
 from rlctl.run import directory, lookup
 from rlctl.run.directory import RunDirectory
-from rlctl.run.env_info import EnvInfo
 from rlctl.run.lookup import find_policy, find_run
-from rlctl.run.policy import PolicyInfo, Score, save_policy
 
 
 def error(kind, call, *arguments):

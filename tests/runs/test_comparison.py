@@ -5,14 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from rlctl.env_spec import EnvSpec, merge
+from rlctl.environments.spec import EnvSpec, merge
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.eval.evaluate import EvalRequest, choose_spec, load_player
+from rlctl.evaluation.evaluate import EvalRequest, choose_spec, load_player
 from rlctl.runs.comparison import Candidate, Comparison, Side, compare, find_runs_of
 from rlctl.runs.comparison_report import as_json, format_needed
 from rlctl.runs.statistics import Verdict
-from rlctl.train.request import TrainRequest, run_training
-from tests.train.conftest import ENVS, TINY
+from rlctl.training.request import TrainRequest, run_training
+from tests.training.conftest import ENVS, TINY
 
 
 @pytest.fixture(scope="module")

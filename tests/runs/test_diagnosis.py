@@ -8,11 +8,11 @@ import pytest
 import yaml
 from gymnasium import spaces
 
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.info import EnvInfo, space_to_json
+from rlctl.environments.spec import EnvSpec
+from rlctl.policy.policy import PolicyInfo, save_policy
 from rlctl.run.directory import RunDirectory
-from rlctl.run.env_info import EnvInfo, space_to_json
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
-from rlctl.run.policy import PolicyInfo, save_policy
 from rlctl.runs.diagnosis import Grade, diagnose, format_end
 from rlctl.runs.diagnosis.findings import list_signs
 

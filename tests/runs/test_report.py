@@ -10,12 +10,12 @@ import subprocess
 import pytest
 
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.recipe.sources import parse_settings, resolve
 from rlctl.run import robustness
-from rlctl.run.recipe_sources import parse_settings, resolve
 from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.runs.report import content
 from rlctl.runs.report.write import write_report
-from rlctl.train.status import find_recipe_changes
+from rlctl.training.status import find_recipe_changes
 
 LARGEST = 2_000_000  # [bytes]
 HEADER = "steps,seconds,return,success,term/alive\n"

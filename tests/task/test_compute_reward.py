@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from rlctl.check_env.check import check
-from rlctl.env_spec import EnvSpec
-from rlctl.run.env_info import describe
+from rlctl.checking.check import check
+from rlctl.environments.info import describe
+from rlctl.environments.spec import EnvSpec
 from tests.task import tasks
 from tests.task.tasks import ByName, Place
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.joints import Joints
 from rlctl.task import Box, Task

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rlctl import registry
+from rlctl.environments import registry
 from rlctl.task.env import TaskEnv
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rlctl.deploy.identify.follow import describe_expected, find_joints, open_world
 from rlctl.deploy.identify.log import LEAST_ROWS, Array, Log, write_log
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings

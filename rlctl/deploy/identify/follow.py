@@ -8,7 +8,7 @@ import numpy as np
 
 from rlctl.deploy.identify.log import Array, Expected, Log
 from rlctl.deploy.identify.parameters import Unknowns
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings

@@ -13,7 +13,7 @@ from rlctl.deploy.identify.follow import Follower, describe_expected, open_world
 from rlctl.deploy.identify.log import Array, Log, check_actions, read_log
 from rlctl.deploy.identify.parameters import Parameter, Unknowns, find_unknowns
 from rlctl.deploy.identify.search import Fit, SearchWorkers, search
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.rollout.workers import available_cores
 

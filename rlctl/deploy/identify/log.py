@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, UsageError, check_name
-from rlctl.run import files, untrusted
+from rlctl.storage import files, untrusted
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from rlctl import errors
 from rlctl.deploy.identify.follow import Follower, open_world
 from rlctl.deploy.identify.log import Array, Log
 from rlctl.deploy.identify.parameters import Parameter, Unknowns
-from rlctl.env_spec import EnvSpec
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError, TaskError
-from rlctl.rollout.child_process import ChildProcess
+from rlctl.processes.child_process import ChildProcess
 
 _TRIALS = 12  # per unknown, and as many again
 _STARTS = 3

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.dict_spaces import split_names
+from rlctl.environments.dict_spaces import split_names
 from rlctl.run.episode import RecordedEpisode
 from rlctl.runs.diagnosis.history import History
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import yaml
 
+from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.run.directory import RunDirectory
-from rlctl.run.hyperparameters import ON_POLICY
 from rlctl.runs.diagnosis import episode_signs, record_signs, signs, update_signs
 from rlctl.runs.diagnosis.history import History
 

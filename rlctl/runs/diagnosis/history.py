@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.environments.info import EnvInfo
 from rlctl.errors import RlctlError
-from rlctl.run import recipe_sources
+from rlctl.policy.policy import read_policy
+from rlctl.recipe import sources
+from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.run.directory import RunDirectory
-from rlctl.run.env_info import EnvInfo
 from rlctl.run.episode import RecordedEpisode, load_episode
-from rlctl.run.hyperparameters import ALGORITHM_PARAMETERS
-from rlctl.run.policy import read_policy
 from rlctl.runs.summary import Rows, list_points, read_table
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ class History:
     @functools.cached_property
     def recipe(self) -> Mapping[str, Any]:
         try:
-            return recipe_sources.read(self.run.recipe_file)
+            return sources.read(self.run.recipe_file)
         except (RlctlError, OSError):
             return {}
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from rlctl.errors import ArtifactError, RlctlError, UsageError
+from rlctl.recipe.recipe import NOT_SET, find_mixed
 from rlctl.run.episode import RecordedEpisode
-from rlctl.run.recipe import NOT_SET, find_mixed
 from rlctl.runs.comparison import find_runs_of
 from rlctl.runs.diagnosis import Finding
 from rlctl.runs.show import RunDescription

@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 from rlctl import output
 from rlctl.errors import RlctlError
-from rlctl.run import files
 from rlctl.runs.report import content
 from rlctl.runs.report.content import Report
 from rlctl.runs.show import describe_robustness, tabulate
+from rlctl.storage import files
 
 DEFAULT_FILE = Path("report.html")
 
@@ -83,7 +83,7 @@ def _drawings(report: Report, pictures: bool) -> dict[str, Any]:
 
 
 def _take_pictures(report: Report) -> Iterator[tuple[str, list[tuple[int, str]]]]:
-    from rlctl.replay.view import take_pictures
+    from rlctl.replaying.view import take_pictures
 
     for name, episode in content.choose_episodes(report):
         try:

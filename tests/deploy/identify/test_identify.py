@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rlctl import registry
 from rlctl.deploy.identify.excite import write_excitation
 from rlctl.deploy.identify.follow import Follower, open_world
 from rlctl.deploy.identify.identify import _judge, identify
@@ -14,9 +13,10 @@ from rlctl.deploy.identify.log import Expected, Log, read_log, write_log
 from rlctl.deploy.identify.parameters import Parameter, Unknowns
 from rlctl.deploy.identify.report import show, write_fragment
 from rlctl.deploy.identify.search import Fit, _choose_starts, _make_trials
-from rlctl.env_spec import EnvSpec
+from rlctl.environments import registry
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.run import yaml_text
+from rlctl.storage import yaml_text
 from rlctl.task import Box
 from rlctl.task.events import EventSettings
 

@@ -1,0 +1,97 @@
+"""`rlctl.train` and `rlctl.evaluate`: the verbs from Python, with the keys of a recipe."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rlctl.evaluation.evaluate import Evaluation
+    from rlctl.policy.policy import Policy
+    from rlctl.training.request import TrainResult
+
+
+def train(
+    task: str,
+    /,
+    *,
+    config: str | Path | None = None,
+    device: str = "cpu",
+    root: str | Path = "runs",
+    check: bool = True,
+    initial_policy: str | os.PathLike[str] | None = None,
+    **recipe: Any,
+) -> TrainResult:
+    """Train as `rlctl train` does, and return what was reached; `load_policy` and `evaluate` take its `run`.
+
+    Keywords are the keys of a recipe, `docs/recipe.md`: `train("reach", seed=1, algo_kwargs={"gamma": 0.97})`. They go
+    over `config`, a recipe file. `initial_policy` is a run, a policy file or a task's name, as `--from` takes it. Call
+    it from a script's `if __name__ == "__main__":`, which processes may import. Raises what `rlctl.errors` has.
+    """
+    from rlctl.training.request import TrainRequest, run_training
+
+    request = TrainRequest(
+        task=task,
+        config=None if config is None else Path(config),
+        settings=recipe,
+        device=device,
+        root=Path(root),
+        check=check,
+        initial_policy=None if initial_policy is None else os.fspath(initial_policy),
+    )
+    return run_training(request)
+
+
+def evaluate(
+    run: str | os.PathLike[str] | None = None,
+    /,
+    *,
+    other_task: str | None = None,
+    checkpoint: str = "best",
+    episodes: int = 100,
+    seed: int = 0,
+    deterministic: bool = True,
+    **recipe: Any,
+) -> Evaluation:
+    """Evaluate as `rlctl eval` does, and return the numbers with every episode.
+
+    `run` is a run's folder, a policy file, a task's name or None for the latest run; `other_task` a task to evaluate
+    on instead of the one it was trained on. Further keywords are those keys of a recipe that are about the environment:
+    `task` (its parameters), `reward_weights`, `randomize`, `events`.
+    """
+    from rlctl.errors import UsageError
+    from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+    from rlctl.recipe.sources import check_changes
+
+    if episodes < 1 or seed < 0:
+        raise UsageError(f"evaluate: episodes={episodes}, seed={seed}: one episode or more, and a seed from 0 on")
+    request = EvalRequest(
+        run=None if run is None else os.fspath(run),
+        task=other_task,
+        checkpoint=checkpoint,
+        episodes=episodes,
+        seed=seed,
+        changes=check_changes(recipe, "evaluate"),
+        deterministic=deterministic,
+    )
+    return run_evaluation(request, Gates())
+
+
+def load_policy(path: str | os.PathLike[str], /) -> Policy:
+    """Load a `.safetensors` file, an exported `.onnx` file, or the best policy of a run's folder; without torch.
+
+    `load_policy(path).predict(observation)` returns the action. The name of an installed task, `load_policy("ant")`,
+    is the policy that ships with it, never that of a run. Raises `ArtifactError` for a file that is not one.
+    """
+    from rlctl.environments import registry
+    from rlctl.policy import policy
+    from rlctl.policy.shipped import find_shipped_policy
+    from rlctl.run.directory import RunDirectory
+
+    name, file = os.fspath(path), Path(path)
+    if not file.suffix and registry.find(name) is not None:
+        file = find_shipped_policy(name)
+    if RunDirectory(file).status_file.is_file():
+        file = RunDirectory(file).policy_file()
+    return policy.load_policy(file)

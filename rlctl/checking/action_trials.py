@@ -1,0 +1,173 @@
+"""Plays one episode again with some of its actions changed, and compares what comes back bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.episode import Episode, Moment, build_action, draw_actions
+from rlctl.checking.finding import NotJudged
+from rlctl.checking.instance import Context, Instance
+from rlctl.checking.leaves import Leaf, flatten_action, flatten_numbers, name_element, pick
+from rlctl.checking.messages import FIRST_SEED
+
+Frame = NDArray[np.float64]
+"""What one call of reset or step returned: the observation's numbers, flat, the reward, and the two flags."""
+
+REPEATED_STEPS = 20
+REWARD = -3
+"""Where the reward is in a frame."""
+
+
+class OutOfTime(Exception):
+    """Raised where an experiment's time is over in the middle of a comparison."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Dimension:
+    """One number of the action."""
+
+    leaf: Leaf
+    index: int
+    """Flat, in the leaf."""
+    column: int
+    """Flat, in the whole action."""
+
+    @property
+    def name(self) -> str:
+        """How to write it: `action[2]`."""
+        return name_element(self.leaf, self.index, "action")
+
+    @property
+    def bounds(self) -> tuple[Any, Any]:
+        """Lowest and highest value, of the action's type; infinite where there is none."""
+        low, high = np.ravel(np.asarray(self.leaf.low)), np.ravel(np.asarray(self.leaf.high))
+        return low[self.index].item(), high[self.index].item()
+
+    @property
+    def ends(self) -> tuple[Any, Any]:
+        """Two values that are far apart and inside the bounds."""
+        low, high = self.bounds
+        return (low if np.isfinite(low) else min(-1.0, high)), (high if np.isfinite(high) else max(1.0, low))
+
+
+def find_dimensions(leaves: list[Leaf]) -> list[Dimension]:
+    """Return the numbers of an action that can be varied."""
+    flat = [(leaf, i) for leaf in leaves if leaf.supported for i in range(int(np.prod(leaf.shape)))]
+    found = [Dimension(leaf, index, column) for column, (leaf, index) in enumerate(flat)]
+    return [each for each in found if each.bounds[0] < each.bounds[1]]
+
+
+class Trials:
+    """Plays episodes of one instance, each with a seed and with changed actions; equal ones are played once."""
+
+    def __init__(self, context: Context, instance: Instance) -> None:
+        self.instance = instance
+        self.deadline = context.budget.deadline
+        self._plain: dict[tuple[int, int], list[Frame]] = {}
+
+    def require_repeatable(self) -> None:
+        """Raise `NotJudged` unless an episode is the same when it is played again."""
+        if not self.instance.accepts_seed:
+            raise NotJudged("reset takes no seed (RL202)")
+        try:
+            for _ in range(2):  # an instance's first episode may differ from all others
+                before = self.plain(FIRST_SEED, REPEATED_STEPS)
+                again = self.play(FIRST_SEED, self.actions(FIRST_SEED, REPEATED_STEPS))
+                if not find_differences(before, again):
+                    return
+                self._plain[FIRST_SEED, REPEATED_STEPS] = again
+        except OutOfTime:
+            raise NotJudged("playing one episode twice took all the time there is for it") from None
+        raise NotJudged("equal seeds and actions give unequal episodes (RL3)")
+
+    def actions(self, seed: int, steps: int) -> list[Any]:
+        """Return the actions of an episode before they are changed."""
+        chosen = draw_actions(self.instance.env.action_space, "random", seed)
+        return self.instance.call("sample", lambda: list(itertools.islice(chosen, steps)))  # type: ignore[no-any-return]
+
+    def plain(self, seed: int, steps: int) -> list[Frame]:
+        """Return an episode with unchanged actions."""
+        for (known_seed, known_steps), frames in self._plain.items():
+            if known_seed == seed and known_steps >= steps:
+                return frames[: steps + 1]
+        frames = self._plain[seed, steps] = self.play(seed, self.actions(seed, steps))
+        return frames
+
+    def with_value(self, seed: int, steps: int, dimension: Dimension, value: Any, at: int | None = None) -> list[Frame]:
+        """Play an episode with one number of the action set to a value, in one step or in all."""
+
+        def change(action: Any, leaf: Leaf) -> Any:
+            part = pick(action, leaf.path)
+            if leaf.path == dimension.leaf.path:
+                part = np.array(part)
+                part.flat[dimension.index] = value
+            return part
+
+        space, chosen = self.instance.env.action_space, self.actions(seed, steps)
+        for step in range(len(chosen)) if at is None else [at]:
+            chosen[step] = build_action(space, functools.partial(change, chosen[step]))
+        return self.play(seed, chosen)
+
+    def play(self, seed: int, chosen: Sequence[Any]) -> list[Frame]:
+        """Play an episode with given actions, to its end at most; the first frame is that of reset."""
+        episode = Episode(self.instance, seed, given=chosen, max_steps=len(chosen), deadline=self.deadline)
+        frames = [to_frame(moment) for moment in episode]
+        if episode.ended == "time":
+            raise OutOfTime
+        if episode.ended == "raised":
+            raise NotJudged("step returns no observation, reward and flags (RL201)")
+        return frames
+
+    def copies(self, dimension: Dimension, seed: int, steps: int, longest_delay: int) -> list[int]:
+        """Return the columns of a frame that only repeat this number of an earlier action."""
+        rows = [frame[:REWARD] for frame in self.plain(seed, steps)[1:]]
+        given = [flatten_action(self.instance.action_leaves, each) for each in self.actions(seed, len(rows))]
+        values = np.array([each[dimension.column] for each in given])
+        if not rows or len({row.shape for row in rows}) > 1:
+            return []
+        returned = np.stack(rows)
+        is_copy = np.zeros(returned.shape[1], np.bool_)
+        for delay in range(min(longest_delay + 1, len(values) // 2)):
+            late = values[: len(values) - delay, None]
+            is_copy |= ((returned[delay:] == late) | (returned[delay:] == late.astype(np.float32))).all(axis=0)
+        return (np.flatnonzero(is_copy) + REWARD - len(is_copy)).tolist()
+
+
+def to_frame(moment: Moment) -> Frame:
+    """Return the numbers of what a call returned."""
+    try:
+        reward = float(moment.reward)
+    except Exception:  # its type is another rule's matter
+        reward = float("nan")
+    return np.concatenate([flatten_numbers(moment.observation).astype(np.float64), [reward, *moment.flags]])
+
+
+def find_differences(one: Sequence[Frame], two: Sequence[Frame]) -> dict[int, NDArray[np.intp]]:
+    """Return the columns that differ per step, as far as both go, for steps where any does; NaN equals NaN.
+
+    Columns are counted from the end: `REWARD`, -2 and -1 for the flags, the observation's elements before them.
+    """
+    found = {}
+    for step, (a, b) in enumerate(zip(one, two, strict=False)):
+        if a.shape != b.shape:
+            found[step] = np.arange(REWARD, 0)
+        elif (differ := (a != b) & ~(np.isnan(a) & np.isnan(b))).any():
+            found[step] = np.flatnonzero(differ) - len(a)
+    return found
+
+
+def observations_differ(one: Sequence[Frame], two: Sequence[Frame], besides: Sequence[int] = ()) -> bool:
+    """Say whether observations or flags differ, with some columns left out."""
+    return any(not {REWARD, *besides}.issuperset(each.tolist()) for each in find_differences(one, two).values())
+
+
+def find_other_rewards(one: Sequence[Frame], two: Sequence[Frame]) -> list[int]:
+    """Return the steps at which the rewards differ."""
+    return [step for step, columns in find_differences(one, two).items() if REWARD in columns]

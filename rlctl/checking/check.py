@@ -1,0 +1,207 @@
+"""`check`: from a description of an environment to a report. The environment runs in child processes only."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+import traceback
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from rlctl.checking import families
+from rlctl.checking.finding import RULES, Experiment, Finding, NotApplicable, NotJudged, Severity
+from rlctl.checking.leaves import name_leaf
+from rlctl.checking.messages import Message, Mistake
+from rlctl.checking.progress import Position
+from rlctl.checking.records import Records
+from rlctl.checking.supervisor import Supervisor
+from rlctl.environments import registry
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import UsageError, did_you_mean
+from rlctl.recipe import sources
+
+LOADING = ("RL0", "RL216")
+"""What is judged even where no instance could be built: loading, and windows that end it."""
+
+
+@dataclasses.dataclass
+class Verdict:
+    """What the rules say."""
+
+    findings: list[Finding] = dataclasses.field(default_factory=list)
+    waived: list[Finding] = dataclasses.field(default_factory=list)
+    """What the environment's class says is meant."""
+    judged: list[str] = dataclasses.field(default_factory=list)
+    not_judged: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Rule id, or the part of the environment that no rule could look into, and why."""
+    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Rule id, and what this kind of environment does not have."""
+    crashed: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Rule id or name of an experiment, and traceback."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What was found, and what it was found by."""
+
+    task: str
+    verdict: Verdict
+    records: Records
+    seconds: float
+    """How long the check took."""
+    budget_s: float
+    """How long the experiments of one process might take."""
+    strict: bool = False
+    """Whether warnings count as errors."""
+
+    @property
+    def exit_code(self) -> int:
+        """70 if a rule crashed, 3 if no instance could be built, 1 for errors, 0 otherwise."""
+        if self.verdict.crashed:
+            return 70
+        if self.records.built is None:
+            return 3
+        bad = (Severity.ERROR, Severity.WARNING) if self.strict else (Severity.ERROR,)
+        return int(any(finding.severity in bad for finding in self.verdict.findings))
+
+    @property
+    def place(self) -> tuple[Path, int] | None:
+        """File and line of the environment's class; line 1 where only the file is known."""
+        built = self.records.built
+        if built is not None and built.file is not None:
+            return Path(built.file), built.line or 1
+        file = registry.find_source_file(self.task)
+        return (file, 1) if file else None
+
+
+def check(
+    spec: EnvSpec,
+    *,
+    env_timeout_s: float,
+    rules: Sequence[str] = tuple(RULES),
+    strict: bool = False,
+    only: Collection[str] | None = None,
+    budget_s: float = families.PROCESS_S,
+    show_progress: bool = True,
+) -> Report:
+    """Check an environment with some rules, given by id, or with what these can say from some experiments `only`.
+
+    Raises `UsageError` for a task or a parameter that does not exist. Whatever the environment itself does, a crash
+    or a hang of more than `env_timeout_s` seconds in a call included, is in the report.
+    """
+    started = time.monotonic()
+    records = Records(spec.task, normalizes_rewards=lambda: _normalizes_rewards(spec.task))
+    mistakes: list[UsageError] = []
+
+    def receive(message: Message) -> None:
+        if isinstance(message, Mistake):
+            mistakes.append(UsageError(message.message))
+        else:
+            records.add(message)
+
+    needed = {"build"} | {name for name in families.find_needs(rules) if only is None or name in only}
+    experiments = {
+        name: [each.name for each in process.experiments if each.name in needed]
+        for name, process in families.PROCESSES.items()
+    }
+    supervisor = Supervisor(spec, budget_s, env_timeout_s, receive)
+    try:
+        with _status(spec.task, show_progress) as say:
+            supervisor.run({name: names for name, names in experiments.items() if names}, say)
+    finally:
+        supervisor.close()
+    if mistakes:
+        raise mistakes[0]
+    records.printed_lines, records.printed_first = supervisor.children[0].printed, supervisor.children[0].first_line
+    return Report(spec.task, judge(records, rules), records, time.monotonic() - started, budget_s, strict)
+
+
+def _normalizes_rewards(task: str) -> bool:
+    if registry.find_recipe_file(task) is None:
+        return False
+
+    normalize = sources.resolve(task, None, {}).normalize
+    return normalize is not None and normalize.reward
+
+
+@contextlib.contextmanager
+def _status(task: str, wanted: bool) -> Iterator[Callable[[Position], None]]:
+    """Show a line about what is going on, on a terminal only."""
+    from rlctl import output
+
+    console = output.err()
+    if not wanted or not console.is_terminal:
+        yield lambda position: None
+        return
+    with console.status(f"checking {task}") as status:
+        yield lambda position: status.update(f"checking {task}: {position.phase}")
+
+
+def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> Verdict:
+    """Apply the rules; the findings come worst first. Raises `UsageError` for a waiver that cannot be used."""
+    verdict = Verdict(crashed={name: each.crash for name, each in records.finished.items() if each.crash})
+    for rule in rules:
+        _apply(rule, records, verdict)
+    if records.built is not None:
+        _waive(verdict, records.built.waivers)
+        for leaf in records.built.leaves:
+            if not leaf.supported:
+                verdict.not_judged[name_leaf(leaf)] = f"no rule can look into a {leaf.kind} space"
+    verdict.findings.sort(key=lambda each: (each.severity.rank, each.rule))
+    return verdict
+
+
+def _apply(rule: str, records: Records, verdict: Verdict) -> None:
+    try:
+        found = _findings(rule, records)
+    except NotJudged as reason:
+        verdict.not_judged[rule] = str(reason)
+    except NotApplicable as reason:
+        verdict.not_applicable[rule] = str(reason)
+    except UsageError:  # the recipe that comes with the task
+        raise
+    except Exception:  # a rule's bug must not hide what the other rules found, and must not look like a pass
+        verdict.crashed[rule] = traceback.format_exc()
+    else:
+        verdict.judged.append(rule)
+        verdict.findings += found
+
+
+def _findings(rule: str, records: Records) -> list[Finding]:
+    """Return what the experiment that decides a rule and the rule's check have found."""
+    check, experiment = families.CHECKS.get(rule), families.DECIDED_BY.get(rule)
+    found = [each for each in records.findings if each.rule == rule]
+    if found and records.built is None:
+        return found
+    if records.built is None and not rule.startswith(LOADING):
+        raise NotJudged("no instance could be built")
+    if check is not None and not found:
+        found += check.run(records)
+    if experiment is not None and not found:
+        _require_complete(records, experiment, rule)
+    return found
+
+
+def _require_complete(records: Records, experiment: Experiment, rule: str) -> None:
+    if rule in records.skipped:
+        raise NotJudged(records.skipped[rule])
+    if rule in records.not_applicable:
+        raise NotApplicable(records.not_applicable[rule])
+    finished = records.finished.get(experiment.name)
+    is_complete = finished is not None and finished.is_complete
+    if not is_complete and not (records.built is None and experiment.name == "build"):
+        raise NotJudged(records.why_missing(experiment.name))
+
+
+def _waive(verdict: Verdict, waivers: Mapping[str, str]) -> None:
+    for rule, reason in waivers.items():
+        if rule not in RULES:
+            raise UsageError(
+                f"rlctl_ignore: no rule {rule!r}.{did_you_mean(rule, RULES)} "
+                'Write rlctl_ignore = {"RL604": "why this is meant"}.'
+            )
+        if not reason.strip():
+            raise UsageError(f"rlctl_ignore: {rule} is waived without a reason. Say why this is meant.")
+    verdict.waived = [each for each in verdict.findings if each.rule in waivers]
+    verdict.findings = [each for each in verdict.findings if each.rule not in waivers]

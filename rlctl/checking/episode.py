@@ -1,0 +1,212 @@
+"""Plays one episode of an environment that is not trusted: the only place that resets and steps in a loop.
+
+Its actions are a function of the action space, a kind and a seed.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.clock import read_clock
+from rlctl.checking.failures import EnvironmentRaised
+from rlctl.checking.instance import Instance
+from rlctl.checking.leaves import Leaf, Path, find_leaves, name_type, read_flag
+
+if TYPE_CHECKING:
+    from gymnasium import spaces
+
+HOLD_STEPS = 10
+"""How long an extreme action is held."""
+RARE = 0.1
+"""How often a rare action is not zero."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """What one call of reset or step was given and returned."""
+
+    step: int
+    """0 is the reset."""
+    action: Any
+    observation: Any
+    reward: Any = 0.0
+    terminated: Any = False
+    truncated: Any = False
+    info: Any = dataclasses.field(default_factory=dict)
+    form: str = ""
+    """What was returned where it is not what Gymnasium's interface says: `tuple of 4`, `NoneType`."""
+    is_readable: bool = True
+    """False where step returned something that cannot be taken apart: nothing above it is known."""
+
+    @property
+    def flags(self) -> tuple[bool, bool]:
+        """What `terminated` and `truncated` mean, whatever their types."""
+        return read_flag(self.terminated), read_flag(self.truncated)
+
+
+class Episode:
+    """One episode. Iterating over it resets, and steps until it ends or must end; each call is a `Moment`.
+
+    Where the environment raises, iterating raises `EnvironmentRaised`. `reset` and `step` may be called directly too.
+    """
+
+    def __init__(
+        self,
+        instance: Instance,
+        seed: int,
+        actions: str = "random",
+        *,
+        number: int = 0,
+        action_seed: int | None = None,
+        max_steps: int = 10_000,
+        deadline: float = float("inf"),
+        given: Iterable[Any] | None = None,
+    ) -> None:
+        """`actions` is a kind (see `draw_actions`), drawn with `action_seed`, else with `seed`; or the name of
+        those that are `given`. `deadline` is on `read_clock`'s clock [s]."""
+        self.instance = instance
+        self.seed = seed
+        self.number = number
+        self.max_steps = max_steps
+        self.deadline = deadline
+        self.steps = 0
+        self.ended = ""
+        """`terminated`, `truncated`, `both`, `raised`, or what cut it: `steps`, `time`; empty while it goes on."""
+        self.actions = actions
+        self._given = given
+        self._action_seed = seed if action_seed is None else action_seed
+        self._next = iter(self._choose_actions())
+
+    def __iter__(self) -> Iterator[Moment]:
+        yield self.reset()
+        while not self.ended:
+            yield self.step()
+
+    def reset(self) -> Moment:
+        """Begin the episode."""
+        self.steps, self.ended = 0, "" if self.max_steps else "steps"
+        self._next = self._choose_actions()
+        try:
+            returned = self.instance.reset(self.seed, self.number)
+        except EnvironmentRaised:
+            self.ended = "raised"
+            raise
+        if isinstance(returned, tuple) and len(returned) == 2:
+            return Moment(0, None, returned[0], info=returned[1])
+        return Moment(0, None, returned, form=_form(returned))
+
+    def _choose_actions(self) -> Iterator[Any]:
+        if self._given is not None:
+            return iter(self._given)
+        return draw_actions(self.instance.env.action_space, self.actions, self._action_seed)
+
+    def step(self) -> Moment:
+        """Take one step."""
+        self.steps += 1
+        call, env = self.instance.call, self.instance.env
+        try:
+            action = call("sample", next, self._next, step=self.steps)
+            returned = call("step", env.step, action, step=self.steps)
+        except EnvironmentRaised:
+            self.ended = "raised"
+            raise
+        moment = self._read(action, returned)
+        terminated, truncated = moment.flags
+        if not moment.is_readable:
+            self.ended = "raised"
+        elif terminated or truncated:
+            self.ended = "both" if terminated and truncated else "terminated" if terminated else "truncated"
+        elif self.steps >= self.max_steps:
+            self.ended = "steps"
+        elif read_clock() > self.deadline:
+            self.ended = "time"
+        return moment
+
+    def _read(self, action: Any, returned: Any) -> Moment:
+        if isinstance(returned, tuple) and len(returned) == 5:
+            return Moment(self.steps, action, *returned)
+        form = _form(returned)
+        if isinstance(returned, tuple) and len(returned) == 4:
+            observation, reward, done, info = returned
+            return Moment(self.steps, action, observation, reward, done, False, info, form)
+        return Moment(self.steps, action, None, form=form, is_readable=False)
+
+
+def _form(returned: Any) -> str:
+    return name_type(returned) + (f" of {len(returned)}" if isinstance(returned, tuple) else "")
+
+
+def draw_actions(space: spaces.Space[Any], kind: str, seed: int) -> Iterator[Any]:
+    """Yield actions without end: `random`, `zero`, `repeated` (a random one, always the same), `rare` (zero but now and
+    then), or `extreme` (corners of the space, each held for a while)."""
+    # A copy: the environment's own space has a generator that it may use, or share with other instances.
+    space = copy.deepcopy(space)
+    space.seed(seed)
+    rng = np.random.default_rng(seed)
+    while kind == "rare":
+        yield space.sample() if rng.random() < RARE else zero_action(space)
+    repeated = space.sample() if kind == "repeated" else None
+    while True:
+        if kind == "random":
+            yield space.sample()
+        elif kind == "zero":
+            yield zero_action(space)
+        elif kind == "repeated":
+            yield copy.deepcopy(repeated)
+        else:
+            corner = build_action(space, lambda leaf: _corner(leaf, rng))
+            for _ in range(HOLD_STEPS):
+                yield copy.deepcopy(corner)
+
+
+def build_action(space: spaces.Space[Any], value_of: Callable[[Leaf], Any], path: Path = ()) -> Any:
+    """Return an action with what a function gives for each leaf of the space; a sample where that is None."""
+    from gymnasium import spaces
+
+    if isinstance(space, spaces.Dict):
+        return {key: build_action(each, value_of, (*path, key)) for key, each in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(build_action(each, value_of, (*path, i)) for i, each in enumerate(space.spaces))
+    (leaf,) = find_leaves(space, path)
+    value = value_of(leaf)
+    if value is None:
+        return space.sample()
+    if not leaf.supported:
+        return value
+    return int(value) if leaf.kind == "Discrete" else np.asarray(value).astype(leaf.dtype)
+
+
+def zero_action(space: spaces.Space[Any]) -> Any:
+    """Return the action that is nearest to doing nothing: zeros, or what is nearest to them."""
+    return build_action(space, lambda leaf: np.clip(0, leaf.low, leaf.high) if leaf.supported else None)
+
+
+def action_at(space: spaces.Space[Any], numbers: NDArray[np.float64]) -> Any:
+    """Return the action at a point of the unit cube, of one number for each of the flat action.
+
+    The numbers are spread over the bounds; where there are none, over [-1, 1].
+    """
+    rest = iter(numbers)
+
+    def value_of(leaf: Leaf) -> NDArray[Any]:
+        point = np.array([next(rest) for _ in range(int(np.prod(leaf.shape)))]).reshape(leaf.shape)
+        low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
+        if np.dtype(leaf.dtype).kind in "iub":
+            return np.minimum(np.floor(low + point * (high - low + 1)), high)
+        low, high = np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
+        return low + point * (high - low)
+
+    return build_action(space, value_of)
+
+
+def _corner(leaf: Leaf, rng: np.random.Generator) -> NDArray[Any] | None:
+    if leaf.low is None or leaf.high is None:
+        return None
+    corner = np.where(rng.random(leaf.shape) < 0.5, leaf.low, leaf.high)
+    return np.where(np.isfinite(corner), corner, np.clip(rng.standard_normal(leaf.shape), leaf.low, leaf.high))

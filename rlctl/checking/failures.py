@@ -1,0 +1,110 @@
+"""What a call into an environment raised, as plain data: when, where, and which file it could not find."""
+
+from __future__ import annotations
+
+import inspect
+import linecache
+import re
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rlctl.checking.messages import Failure
+from rlctl.checking.progress import Progress
+from rlctl.errors import RlctlError
+
+_HERE = Path(__file__).parent
+NO_DISPLAY = re.compile(
+    r"cannot connect to x server|could ?n.t connect to display|could not connect to display|no \$DISPLAY|"
+    r"DISPLAY environment variable is missing|no available video device|cannot open display|"
+    r"could not load the qt platform plugin|NoSuchDisplayException|failed to open display",
+    re.IGNORECASE,
+)
+"""What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
+_MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
+
+
+class EnvironmentRaised(Exception):
+    """A call into the environment raised; `__cause__` is what."""
+
+    def __init__(self, call: str) -> None:
+        super().__init__(call)
+        self.call = call
+
+
+def describe_failure(error: EnvironmentRaised, progress: Progress) -> Failure:
+    """Describe what a call into the environment raised, and when."""
+    where = progress.read()
+    cause = error.__cause__ or error
+    return Failure(
+        kind="raised",
+        call=error.call,
+        phase=where.phase,
+        episode=where.episode,
+        seed=where.seed,
+        step=where.step,
+        error=describe(cause),
+        details="".join(traceback.format_exception(cause)),
+        file=find_missing_file(cause),
+    )
+
+
+def describe(error: BaseException) -> str:
+    """Return an exception in a line, with the place in the environment's code."""
+    if isinstance(error, RlctlError):  # of the task layer, which names the task and the step itself
+        return f"{type(error).__name__}: {error}"
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _HERE not in Path(frame.filename).parents]
+    own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
+    place = f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
+    text = " ".join(str(error).split()) or "no message"
+    return f"{type(error).__name__}: {text}{place}"
+
+
+def lacks_display(failure: Failure) -> bool:
+    """Say whether a process ended because it has no display."""
+    return failure.kind == "died" and NO_DISPLAY.search(failure.details or "") is not None
+
+
+def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
+    """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
+    for each in iterate_causes(error):
+        if isinstance(each, FileNotFoundError):
+            return _describe(str(each.filename or each), [])
+        if type(each).__module__ == "pybullet" and "load" in str(each).lower():
+            name, data = _find_model(each.__traceback__), sys.modules.get("pybullet_data")
+            return None if name is None else _describe(name, [Path(data.getDataPath())] if data else [])
+    return None
+
+
+def iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an exception and those behind it."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _describe(name: str, more: list[Path]) -> dict[str, Any]:
+    searched = [] if Path(name).is_absolute() else [Path.cwd(), *more]
+    return {"file": name, "searched": [str(folder) for folder in searched]}
+
+
+def _find_model(trace: TracebackType | None) -> str | None:
+    """Return the model that the failing call was given: a text in its source, or the value of a name there."""
+    calls = list(zip(traceback.walk_tb(trace), traceback.extract_tb(trace), strict=True))
+    calls = [pair for pair in calls if _HERE not in Path(pair[1].filename).parents]
+    if not calls:
+        return None
+    (frame, _), summary = calls[-1]
+    lines = linecache.getlines(summary.filename)[(summary.lineno or 1) - 1 : summary.end_lineno]
+    source = "".join(lines)
+    texts = re.findall(r"[\"']([^\"']+)[\"']", source)
+    for name in re.findall(r"[a-zA-Z_][\w.]*", source):
+        root, *attributes = name.split(".")
+        value = frame.f_locals.get(root, frame.f_globals.get(root))
+        for attribute in attributes:
+            value = inspect.getattr_static(value, attribute, None)  # runs no code of the environment
+        texts += [str(value)] if isinstance(value, (str, Path)) else []
+    return next((text for text in texts if _MODEL.fullmatch(text) and not Path(text).is_file()), None)

@@ -1,0 +1,108 @@
+"""RL7: the actions do something."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Literal
+
+from rlctl.checking.action_trials import (
+    REPEATED_STEPS,
+    Dimension,
+    OutOfTime,
+    Trials,
+    find_dimensions,
+    find_other_rewards,
+    observations_differ,
+)
+from rlctl.checking.finding import Finding, NotJudged, Severity, experiment, list_names
+from rlctl.checking.instance import Context
+from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, Message
+
+MOST_DIMENSIONS = 64
+STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))
+"""Seeds and steps that are compared until a difference shows: most show at once, some need time or another start."""
+LONGEST_DELAY = 4
+"""Observations may hold so many earlier actions; a penalty on changes of the action reaches as far [steps]."""
+MOST_NAMES = 8
+"""So many dimensions are named in a message."""
+Effect = Literal["lasting", "cost", "copy", "none"]
+"""What a number of the action does; `cost`: in the reward of its own step only; `copy`: beside that, only as a copy of
+itself in the observation."""
+
+
+@experiment("action effects", "RL701", share=4.0)
+def compare_actions(context: Context) -> Iterator[Message]:
+    """Play the same episode with each number of the action at other values."""
+    with context.fresh() as instance:
+        every = find_dimensions(instance.action_leaves)
+        if not every:
+            raise NotJudged("no number of the action can be varied")
+        trials = Trials(context, instance)
+        trials.require_repeatable()
+        effects: dict[str, Effect] = {}
+        why = f"only {MOST_DIMENSIONS} are compared" if len(every) > MOST_DIMENSIONS else ""
+        try:
+            for dimension in every[:MOST_DIMENSIONS]:
+                effects[dimension.name] = _find_effect(trials, dimension)
+        except OutOfTime:
+            why = "there was no time for more"
+        if not effects:
+            raise NotJudged("there was no time to compare a single action")
+    left_out = f" ({len(effects)} of {len(every)} dimensions: {why})" if why else ""
+    yield from _without_effect(effects, len(every), left_out)
+
+
+def _find_effect(trials: Trials, dimension: Dimension) -> Effect:
+    copies = trials.copies(dimension, FIRST_SEED, REPEATED_STEPS, LONGEST_DELAY)
+    effect: Effect = "none"
+    for seed, steps in STAGES:
+        plain = trials.plain(seed, steps)
+        for end in dimension.ends:
+            played = trials.with_value(seed, steps, dimension, end)
+            if observations_differ(plain, played, copies):
+                return "lasting"
+            if find_other_rewards(plain, played):
+                effect = "cost"
+            elif effect == "none" and observations_differ(plain, played):
+                effect = "copy"
+    return "lasting" if effect == "cost" and _lasts(trials, dimension) else effect
+
+
+def _lasts(trials: Trials, dimension: Dimension) -> bool:
+    """Say whether a single changed action changes rewards long after it: by a state that is not observed."""
+    for seed, steps in STAGES[1:]:
+        plain = trials.plain(seed, steps)
+        at = (len(plain) - 1) // 4
+        for end in dimension.ends:
+            played = trials.with_value(seed, steps, dimension, end, at)
+            # The action of index `at` gives frame `at + 1`.
+            if any(step > at + 1 + LONGEST_DELAY for step in find_other_rewards(plain, played)):
+                return True
+    return False
+
+
+def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) -> Iterator[Finding]:
+    dead, costly, copied = (
+        [name for name, effect in effects.items() if effect == kind] for kind in ("none", "cost", "copy")
+    )
+    if dead:
+        what = (
+            "no action has any effect" if len(dead) == total else f"{list_names(dead, MOST_NAMES)} without any effect"
+        )
+        how = f"at its lowest and highest value, over {STAGES[-1][1]} steps from two seeds"
+        message = f"{what}: {how}, no observation, reward or end changes{left_out}"
+        yield _finding(dead, message, Severity.ERROR if len(dead) == total else Severity.WARNING)
+    if costly:
+        # If no action moves anything, it is a bandit, or a series that is only watched.
+        others_last = "lasting" in effects.values()
+        what = f"its own step's reward{', a cost for doing nothing' if others_last else ''}"
+        message = f"{list_names(costly, MOST_NAMES)} changes nothing but {what}{left_out}"
+        yield _finding(costly, message, Severity.WARNING if others_last else Severity.INFO)
+    if copied:
+        message = f"{list_names(copied, MOST_NAMES)} changes nothing but its own copy in the observation{left_out}"
+        yield _finding(copied, message, Severity.INFO)
+
+
+def _finding(names: list[str], message: str, severity: Severity) -> Finding:
+    evidence = {"value": names, "seed": FIRST_SEED, "seeds": [FIRST_SEED, SECOND_SEED], "steps": STAGES[-1][1]}
+    return Finding("RL701", message, evidence, severity)

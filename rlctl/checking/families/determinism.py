@@ -1,0 +1,212 @@
+"""RL3: equal seeds and equal actions give equal episodes.
+
+Without it no result can be repeated, no failed episode reproduced, and no run resumed exactly. The rules go from the
+simplest cause to the farthest; where a nearer one explains a difference, the farther ones are not judged.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.episode import Episode
+from rlctl.checking.finding import Finding, NotJudged, Severity, check, experiment
+from rlctl.checking.instance import Context
+from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, Built, Message, Skipped, Trajectory
+from rlctl.checking.recording import Recording
+from rlctl.checking.records import Records
+
+COMPARED_STEPS = 300
+"""How far comparisons go."""
+DIRTY_STEPS = 37
+"""How far the other episode goes, at most, that is left unfinished before a repetition."""
+LATE = 20
+"""What an unfinished episode changes only after so many steps is a residue, not the episode's start [steps]."""
+NEARLY = 1e-5
+"""Up to this a first difference is a numerical residue, such as a simulation's that was not reset in full; chaos may
+make it large later. Relative to the larger value or to 1; it is also what Gymnasium's checker tolerates."""
+
+
+@experiment("comparisons", share=6.0)
+def compare_repetitions(context: Context) -> Iterator[Message]:
+    """Play the first episode again: at once, after an unfinished other one, and with another seed."""
+    instance, budget = context.instance, context.budget
+    longest_s = budget.seconds_left / 4
+    steps = COMPARED_STEPS
+    for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
+        instance.progress.phase(role)
+        if role == "dirty":
+            unfinished = min(DIRTY_STEPS, max(1, steps // 2))
+            other = Episode(instance, SECOND_SEED, "extreme", max_steps=unfinished, deadline=budget.end_within(1.0))
+            Recording(role, other, budget).run()
+        if budget.seconds_left < 0:
+            yield Skipped(role, "the first comparisons took all the time there is for them")
+            continue
+        seed = SECOND_SEED if role == "seeds" else FIRST_SEED
+        episode = Episode(instance, seed, number=number, action_seed=FIRST_SEED, max_steps=COMPARED_STEPS)
+        episode.deadline = budget.end_within(longest_s)
+        recording = Recording(role, episode, budget)
+        yield from recording.run()
+        steps = min(steps, recording.steps)
+
+
+def compare(records: Records, first: str, second: str) -> tuple[Trajectory, Difference | None]:
+    """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
+    built = records.require_built()
+    if not built.accepts_seed:
+        raise NotJudged("reset takes no seed (RL202)")
+    a, b = records.require_role(first), records.require_role(second)
+    if "raised" in (a.ended, b.ended):
+        raise NotJudged("the episode broke off (RL201, RL207)")
+    if not any(series.values.size for series in a.observations.values()):
+        raise NotJudged("no observation could be compared")
+    return a, find_difference(built, a, b)
+
+
+def require_repeatable(records: Records) -> None:
+    """Raise `NotJudged` if an instance's own repetition of an episode differs."""
+    if compare(records, "alone", "reused")[1] is not None:
+        raise NotJudged("the same instance already differs from itself (RL301, RL302)")
+
+
+def require_independent(records: Records) -> None:
+    """Raise `NotJudged` if an episode depends on the one before it."""
+    if compare(records, "alone", "reused")[1] is not None or compare(records, "alone", "dirty")[1] is not None:
+        raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
+
+
+def report(
+    rule: str, records: Records, trajectory: Trajectory, difference: Difference, what: str, *, is_mild: bool = False
+) -> Finding:
+    """Return the finding that two recordings differ; an info where the environment's registration says they may."""
+    severity = Severity.WARNING if difference.is_small or is_mild else None
+    if records.require_built().nondeterministic:
+        severity = Severity.INFO
+    return Finding(rule, f"{what}: {difference.text()}", difference.evidence(trajectory), severity)
+
+
+@check("RL301", "comparisons")
+def compare_starts(records: Records) -> Iterator[Finding]:
+    """Compare the resets of an episode and its repetition."""
+    trajectory, difference = compare(records, "alone", "reused")
+    if difference is not None and difference.step == 0:
+        yield report("RL301", records, trajectory, difference, "reset twice with one seed")
+
+
+@check("RL302", "comparisons")
+def compare_trajectories(records: Records) -> Iterator[Finding]:
+    """Compare the steps of an episode and its repetition."""
+    trajectory, difference = compare(records, "alone", "reused")
+    if difference is not None and difference.step > 0:
+        yield report("RL302", records, trajectory, difference, "played twice by one instance")
+
+
+@check("RL303", "comparisons")
+def compare_after_other_episode(records: Records) -> Iterator[Finding]:
+    """Compare an episode with its repetition after an unfinished other one."""
+    require_repeatable(records)
+    trajectory, difference = compare(records, "alone", "dirty")
+    if difference is not None:
+        what = "played again after an unfinished other episode"
+        yield report("RL303", records, trajectory, difference, what, is_mild=difference.step > LATE)
+
+
+@check("RL304", "comparisons", "instances")
+def compare_instances(records: Records) -> Iterator[Finding]:
+    """Compare the first and a second instance of one process."""
+    trajectory, difference = compare(records, "fresh process", "fresh instance")
+    if difference is not None:
+        require_repeatable(records)
+        yield report("RL304", records, trajectory, difference, "played by a second instance in one process")
+
+
+@check("RL305", "comparisons", "instances")
+def compare_processes(records: Records) -> Iterator[Finding]:
+    """Compare two processes."""
+    trajectory, difference = compare(records, "alone", "fresh process")
+    if difference is not None:
+        require_repeatable(records)
+        yield report("RL305", records, trajectory, difference, "played by a new process")
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """Where two trajectories begin to differ."""
+
+    step: int
+    """0 is the observation of reset."""
+    element: str
+    """What differs most at that step: an element of the observation, the reward, a flag, or the length."""
+    first: float
+    second: float
+    size: float
+    """The largest difference at that step, relative to the larger value or to 1."""
+    largest: float
+    """The same over all steps that were compared."""
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the two differ by a numerical residue only."""
+        return self.size <= NEARLY
+
+    def text(self) -> str:
+        """Return it as a message."""
+        size = f" (a residue of {self.size:.0e}, later up to {self.largest:.0e})" if self.is_small else ""
+        at = "at reset" if self.step == 0 else f"at step {self.step}"
+        return f"first difference {at}: {self.element} is {self.first:.9g}, then {self.second:.9g}{size}"
+
+    def evidence(self, trajectory: Trajectory) -> dict[str, Any]:
+        """Return it with the trajectory's seed, as a finding's evidence."""
+        return {
+            "seed": trajectory.seed,
+            "step": self.step,
+            "element": self.element,
+            "value": _plain(self.second),
+            "expected": _plain(self.first),
+            "relative_difference": _plain(self.size),
+            "largest_relative_difference": _plain(self.largest),
+        }
+
+
+def _plain(value: float) -> float | str:
+    return value if np.isfinite(value) else str(value)
+
+
+def find_difference(built: Built, one: Trajectory, two: Trajectory) -> Difference | None:
+    """Compare two trajectories bit for bit as far as both go; NaN equals NaN."""
+    found: list[Difference] = []
+    for index in sorted(one.observations.keys() & two.observations.keys()):
+        a, b = one.observations[index], two.observations[index]
+        found += _compare(a.values, b.values, a.steps, functools.partial(built.element, index))
+    after = np.arange(1, one.steps + 1)
+    found += _compare(one.rewards, two.rewards, after, lambda _: "reward")
+    found += _compare(one.terminated, two.terminated, after, lambda _: "terminated")
+    found += _compare(one.truncated, two.truncated, after, lambda _: "truncated")
+    if one.has_ended and two.has_ended and one.steps != two.steps:
+        found.append(Difference(min(one.steps, two.steps), "length", one.steps, two.steps, 1.0, 1.0))
+    if not found:
+        return None
+    earliest = min(found, key=lambda each: (each.step, -each.size))
+    return dataclasses.replace(earliest, largest=max(each.largest for each in found))
+
+
+def _compare(
+    a: NDArray[Any], b: NDArray[Any], steps: NDArray[np.int64], name_of: Callable[[int], str]
+) -> Iterator[Difference]:
+    rows = min(len(a), len(b))
+    a, b = (each[:rows].reshape(rows, math.prod(each.shape[1:])).astype(np.float64) for each in (a, b))
+    unequal = (a != b) & ~(np.isnan(a) & np.isnan(b))
+    if unequal.any():
+        row = int(unequal.any(axis=1).argmax())
+        with np.errstate(invalid="ignore", over="ignore"):
+            relative = np.where(unequal, np.abs(a - b), 0.0) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 1.0)
+        relative = np.nan_to_num(relative, nan=np.inf, posinf=np.inf)
+        flat = int(np.where(unequal[row], relative[row], -1.0).argmax())
+        values, largest = (float(a[row, flat]), float(b[row, flat])), float(relative.max())
+        yield Difference(int(steps[row]), name_of(flat), *values, float(relative[row, flat]), largest)

@@ -1,0 +1,196 @@
+"""RL2, the interface: what reset, step and render take and return, that they come back, and unasked windows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from rlctl.checking.failures import (
+    NO_DISPLAY,
+    EnvironmentRaised,
+    describe,
+    find_missing_file,
+    iterate_causes,
+    lacks_display,
+)
+from rlctl.checking.finding import RECORDING, Finding, NotApplicable, NotJudged, Severity, check, experiment
+from rlctl.checking.instance import Context
+from rlctl.checking.messages import FIRST_SEED, Failure, Form, Message, Trajectory
+from rlctl.checking.records import Records
+from rlctl.errors import RecipeError
+
+NUMBERS = ("float", "int", "numpy.float64")
+"""Reward types that both libraries accept."""
+MANY_LINES = 0.5
+"""Lines printed per step from which printing is slow: about one each, and not a few per reset."""
+FEWEST_STEPS = 20
+"""With fewer, what is printed belongs to the start."""
+MOST_FAILURES = 3
+RENDERING = "rendering"
+"""The experiment that renders."""
+OF_OTHER_RULES = ("interleaved", "after close", RENDERING)
+"""Where a failure is the matter of RL401, RL402 and RL215."""
+PICTURE = "a uint8 array of shape (height, width, 3)"
+"""What `render` returns in the mode rgb_array."""
+NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)
+"""What is raised where this machine has no graphics: whether it works elsewhere is not known."""
+
+
+@check("RL201")
+def _find_other_number_of_values(records: Records) -> Iterator[Finding]:
+    for trajectory, form in _first_forms(records, "reset"):
+        yield _of_form("RL201", f"reset returns {form.type}", trajectory, form, "tuple of 2")
+    for trajectory, form in _first_forms(records, "step"):
+        yield _of_form("RL201", f"step returns a {form.type}", trajectory, form, "tuple of 5")
+
+
+@check("RL202", "build")
+def _find_reset_without_seed(records: Records) -> Iterator[Finding]:
+    if not records.require_built().accepts_seed:
+        yield Finding("RL202", "reset has no parameter `seed`")
+
+
+@check("RL203", "build")
+def _find_reset_without_options(records: Records) -> Iterator[Finding]:
+    built = records.require_built()
+    if built.accepts_seed and not built.accepts_options:  # without `seed`, RL202 says what reset has to look like
+        yield Finding("RL203", "reset has no parameter `options`")
+
+
+@check("RL204")
+def _find_wrong_types(records: Records) -> Iterator[Finding]:
+    for what in ("terminated", "truncated"):
+        for trajectory, form in _first_forms(records, what, "bool"):
+            message = f"{what} is {_a(form.type)} at step {form.step}"
+            severity = Severity.INFO if form.type in ("numpy.bool", "numpy.bool_") else None
+            yield _of_form("RL204", message, trajectory, form, "bool", severity)
+    for trajectory, form in _first_forms(records, "reward", *NUMBERS):
+        is_number = form.type.startswith(("numpy.float", "numpy.int", "numpy.uint"))
+        message = f"the reward is {_a(form.type)} at step {form.step}"
+        yield _of_form("RL204", message, trajectory, form, "float", Severity.INFO if is_number else None)
+    for trajectory, form in _first_forms(records, "info", "dict"):
+        yield _of_form("RL204", f"info is {_a(form.type)} at step {form.step}", trajectory, form, "dict")
+
+
+def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[Trajectory, Form]]:
+    """Yield the first place of each type of something, without those that are fine."""
+    types = set(fine)
+    for trajectory, form in records.forms(what):
+        if form.type not in types:
+            types.add(form.type)
+            yield trajectory, form
+
+
+def _of_form(
+    rule: str, message: str, trajectory: Trajectory, form: Form, expected: str, severity: Severity | None = None
+) -> Finding:
+    return Finding(rule, message, trajectory.at(form.step, type=form.type, expected=expected), severity)
+
+
+def _a(type_name: str) -> str:
+    return type_name if type_name == "NoneType" else f"a {type_name}"
+
+
+def select_failures(records: Records, kind: str) -> Iterator[Failure]:
+    """Yield the calls that raised, died or hung on an instance that was alone and used properly, each error once."""
+    errors: set[tuple[str, str]] = set()
+    for failure in records.failures:
+        if failure.kind != kind or failure.call in ("load", "build") or failure.phase in OF_OTHER_RULES:
+            continue
+        if (failure.call, failure.error) not in errors:
+            errors.add((failure.call, failure.error))
+            yield failure
+
+
+@check("RL207")
+def _find_exceptions(records: Records) -> Iterator[Finding]:
+    raised = [each for each in select_failures(records, "raised") if each.file is None]  # the others are RL007's
+    for failure in raised[:MOST_FAILURES]:
+        yield Finding("RL207", failure.message, failure.place)
+
+
+@check("RL208")
+def _find_ends_of_process(records: Records) -> Iterator[Finding]:
+    for failure in select_failures(records, "died"):
+        if not lacks_display(failure):  # RL216 says why
+            yield Finding("RL208", failure.message, failure.place)
+
+
+@check("RL209")
+def _find_hangs(records: Records) -> Iterator[Finding]:
+    for failure in list(select_failures(records, "hung"))[:1]:
+        yield Finding("RL209", failure.message, failure.place)
+
+
+@check("RL211", *RECORDING)
+def _find_prints(records: Records) -> Iterator[Finding]:
+    lines = records.printed_lines
+    if lines:
+        steps = max(1, sum(each.steps for each in records.trajectories))
+        message = f"{lines} lines on stdout in {steps} steps, the first: {records.printed_first[:80]!r}"
+        severity = Severity.WARNING if steps >= FEWEST_STEPS and lines > max(20, MANY_LINES * steps) else None
+        yield Finding("RL211", message, {"value": lines, "expected": 0}, severity)
+
+
+@experiment(RENDERING, "RL215")
+def render(context: Context) -> Iterator[Message]:
+    """Try the mode rgb_array, which opens no window, on an instance of its own, where it is promised."""
+    with context.fresh() as instance:
+        metadata = getattr(instance.env, "metadata", None)
+    modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
+    if not isinstance(modes, (list, tuple, set)) or "rgb_array" not in modes:
+        raise NotApplicable(f"metadata does not promise the render mode rgb_array (render_modes: {modes})")
+    try:
+        with context.fresh("rgb_array") as instance:
+            instance.reset(FIRST_SEED)
+            picture = instance.call("render", instance.env.render)
+    except EnvironmentRaised as error:
+        cause = error.__cause__ or error
+        if find_missing_file(cause) is not None:
+            raise NotJudged("a file that the environment loads is missing (RL007)") from None
+        if _lacks_library(cause):
+            raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
+        call = "the constructor" if error.call == "build" else error.call
+        message = f"with render_mode='rgb_array' {call} raises {describe(cause)}"
+        if isinstance(cause, RecipeError):  # the constructor was not even called
+            message = f"metadata promises the render mode rgb_array, but {cause}"
+        severity = Severity.INFO if NO_GRAPHICS.search(describe(cause)) else None
+        yield Finding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity)
+        return
+    if wrong := _describe_wrong_picture(picture):
+        message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"
+        yield Finding("RL215", message, {"value": wrong, "expected": PICTURE})
+
+
+def _lacks_library(error: BaseException) -> bool:
+    """Say whether a library is missing: that is this machine's fault, not the environment's."""
+    return any(
+        isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in iterate_causes(error)
+    )
+
+
+def _describe_wrong_picture(picture: Any) -> str:
+    if not isinstance(picture, np.ndarray):
+        return f"a {type(picture).__name__}"
+    fine = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
+    return "" if fine else f"an array of {picture.dtype} and shape {picture.shape}"
+
+
+@check("RL215", RENDERING)
+def _find_end_in_rendering(records: Records) -> Iterator[Finding]:
+    for failure in records.failures:
+        if failure.phase == RENDERING and failure.kind in ("died", "hung"):
+            yield Finding("RL215", f"rendering without a window: {failure.message}", failure.place, Severity.ERROR)
+
+
+@check("RL216", *RECORDING)
+def _find_lost_display(records: Records) -> Iterator[Finding]:
+    for failure in records.failures:
+        if lacks_display(failure):
+            line = next(line for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)).strip()
+            yield Finding("RL216", f"{failure.message}, because there is no display: {line!r}", failure.place)
+            return
+    records.require_built()

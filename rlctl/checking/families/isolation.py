@@ -1,0 +1,264 @@
+"""RL4: instances do not influence each other, and release what they acquire."""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import gc
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rlctl.checking.bullet_worlds import find_clients
+from rlctl.checking.episode import Episode
+from rlctl.checking.failures import EnvironmentRaised, describe_failure
+from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
+from rlctl.checking.families.interface import select_failures
+from rlctl.checking.finding import Finding, NotJudged, Severity, check, experiment
+from rlctl.checking.instance import Context, Instance
+from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, Message, Skipped
+from rlctl.checking.recording import Recording
+from rlctl.checking.records import Records
+
+IN_TURNS, AFTER_CLOSE = "two instances stepped in turns", "after another instance was closed"
+MOST_RESETS = 100
+MEASURED_RESETS = 10
+"""Memory is measured after every so many resets; after the first of them caches and allocators are filled."""
+FEWEST_RESETS = 8
+"""With fewer, growth cannot be distinguished from a slow start."""
+SETTLING_RESETS = 2
+"""The first resets load what later ones keep."""
+LEAST_GROWTH = 3
+"""In each half of the resets, so that one late object is not a leak."""
+FEWEST_MEASUREMENTS = 3
+MEMORY_GROWTH = 8 * 2**20
+"""Over the resets after the warm-up [bytes]. Allocators of clean environments move by 1 to 2 MiB; 0.1 MB per reset
+fills the memory of 16 workers in a day."""
+LATER_SHARE = 0.4
+"""Of the growth, so much must be in the second half: what fills once slows down, a leak does not."""
+LEAKS = {
+    "PyBullet clients": Severity.ERROR,
+    "bodies in the PyBullet world": Severity.ERROR,
+    "open file descriptors": Severity.WARNING,
+    "threads": Severity.WARNING,
+}
+"""What is counted; a client brings its own bodies, files, threads and memory."""
+_PROCESS = Path("/proc/self")
+
+
+@experiment("instances", "RL404", share=10.0)
+def compare_instances(context: Context) -> Iterator[Message]:
+    """Play on three instances: one alone, one after it, and two side by side of which one is closed."""
+    progress, budget = context.progress, context.budget
+    longest_s = budget.seconds_left / 5
+
+    def begin(instance: Instance, role: str, seed: int) -> Recording:
+        progress.phase(role)
+        deadline = budget.end_within(longest_s)
+        episode = Episode(instance, seed, number=seed - FIRST_SEED, max_steps=COMPARED_STEPS, deadline=deadline)
+        return Recording(role, episode, budget)
+
+    progress.phase("alone")
+    first = context.build()
+    yield from begin(first, "fresh process", FIRST_SEED).run()
+    yield from begin(first, "second alone", SECOND_SEED).run()
+    yield from context.close(first)
+
+    progress.phase("fresh instance")
+    neighbour = context.build()
+    yield from begin(neighbour, "fresh instance", FIRST_SEED).run()
+    if budget.seconds_left < 0:
+        for left_out in ("interleaved", "interleaved second", "after close", "RL404"):
+            yield Skipped(left_out, "building and stepping the first two instances took all the time there is for them")
+        yield from context.close(neighbour)
+        return
+
+    # From here on each instance has played the same episodes, in the same order, as `first` had.
+    progress.phase("interleaved")
+    survivor = context.build()
+    if survivor.is_env:
+        yield from _shared_spaces(survivor.env, neighbour.env)
+    else:
+        yield Skipped("RL404", "it is not a gymnasium.Env (RL003)")
+    pair = begin(survivor, "interleaved", FIRST_SEED), begin(neighbour, "interleaved second", SECOND_SEED)
+    progress.phase("interleaved")
+    while any(recording.running for recording in pair):
+        for recording in pair:
+            if recording.running:
+                recording.advance()
+    for recording in pair:
+        yield from recording.messages()
+    yield from _close_in_between(context, begin(survivor, "after close", SECOND_SEED), neighbour)
+    yield from context.close(survivor)
+
+
+def _close_in_between(context: Context, recording: Recording, neighbour: Instance) -> Iterator[Message]:
+    """Play an episode, after whose first step another instance is closed."""
+    recording.advance()
+    if recording.running:
+        recording.advance()
+    context.progress.phase("close")
+    yield from context.close(neighbour)
+    context.progress.phase("after close")
+    while recording.running:
+        recording.advance()
+    yield from recording.messages()
+
+
+def _require_same_alone(records: Records) -> None:
+    """Raise `NotJudged` unless instances, and episodes, that follow each other do the same."""
+    if compare(records, "fresh process", "fresh instance")[1] is not None:
+        raise NotJudged("two instances differ already when they are alone (RL301 to RL304)")
+    require_independent(records)
+
+
+def _failure(records: Records, rule: str, phase: str, doing: str) -> Finding | None:
+    """Return the first failure of a phase that does not happen to an instance alone."""
+    alone = {(failure.call, failure.error) for failure in select_failures(records, "raised")}
+    for failure in records.failures:
+        is_here = failure.process == "instances" and failure.phase == phase and failure.call != "build"
+        if is_here and (failure.call, failure.error) not in alone:
+            return Finding(rule, f"{doing}, {failure.message}", failure.place)
+    return None
+
+
+@check("RL401", "comparisons", "instances")
+def find_shared_world(records: Records) -> Iterator[Finding]:
+    """Compare instances that were stepped in turns with such that were alone."""
+    _require_same_alone(records)
+    if found := _failure(records, "RL401", "interleaved", IN_TURNS):
+        yield found
+        return
+    for alone, beside in (("fresh process", "interleaved"), ("second alone", "interleaved second")):
+        trajectory, difference = compare(records, alone, beside)
+        if difference is not None:
+            yield report("RL401", records, trajectory, difference, f"{IN_TURNS}, against one alone")
+            return
+
+
+@check("RL402", "comparisons", "instances")
+def find_effect_of_closing(records: Records) -> Iterator[Finding]:
+    """Compare an instance beside which another one was closed with one that was alone."""
+    _require_same_alone(records)
+    if found := _failure(records, "RL402", "after close", AFTER_CLOSE):
+        yield found
+        return
+    if list(find_shared_world.run(records)):
+        raise NotJudged("the instances already disturb each other while both are open (RL401)")
+    trajectory, difference = compare(records, "second alone", "after close")
+    if difference is not None:
+        yield report("RL402", records, trajectory, difference, f"{AFTER_CLOSE}, against one alone")
+
+
+@check("RL403", "instances")
+def _find_single_instance(records: Records) -> Iterator[Finding]:
+    for failure in records.failures:
+        if failure.call in ("load", "build") and failure.process != "probe":
+            where = "in one process" if failure.phase in ("fresh instance", "interleaved") else "in a second process"
+            yield Finding("RL403", f"a second instance {where} cannot be built: {failure.error}", failure.place)
+            return
+
+
+def _shared_spaces(one: Any, other: Any) -> Iterator[Finding]:
+    shared = []
+    for name in ("action_space", "observation_space"):
+        first, again, others = (getattr(each, name, None) for each in (one, one, other))
+        if first is not again:
+            yield _of_spaces([name], f"{name} is a new object each time it is read, so that seeding it has no effect")
+        elif first is others is not None:
+            shared.append(name)
+    if shared:
+        yield _of_spaces(shared, f"two instances have one object as {' and '.join(shared)}")
+
+
+def _of_spaces(names: list[str], message: str) -> Finding:
+    # Nobody samples observations.
+    severity = Severity.WARNING if "action_space" in names else Severity.INFO
+    return Finding("RL404", message, {"value": names, "expected": []}, severity)
+
+
+@dataclasses.dataclass
+class Counts:
+    """What an instance holds after each of many resets."""
+
+    resets: int = 0
+    series: dict[str, list[int]] = dataclasses.field(default_factory=dict)
+    """Per key of `LEAKS` that can be counted here, how many there are after each reset."""
+    memory: list[int] = dataclasses.field(default_factory=list)
+    """Resident memory [bytes] after each `MEASURED_RESETS` resets; empty where it is not known."""
+
+    def count(self) -> None:
+        """Count what is there now."""
+        clients, pybullet = find_clients(), sys.modules.get("pybullet")
+        bodies = [pybullet.getNumBodies(physicsClientId=each) for each in clients] if pybullet else []
+        numbers = [len(clients), sum(bodies)]
+        if _PROCESS.exists():
+            numbers += [len(os.listdir(_PROCESS / "fd")), len(os.listdir(_PROCESS / "task"))]
+        for what, number in zip(LEAKS, numbers, strict=False):
+            self.series.setdefault(what, []).append(number)
+        self.resets += 1
+
+    def measure_memory(self) -> None:
+        """Note the resident memory, without what only waits to be collected."""
+        if not _PROCESS.exists():
+            return
+        gc.collect()
+        # What was freed before would otherwise be used again, and hide what is kept.
+        if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+            trim(0)
+        pages = int((_PROCESS / "statm").read_text().split()[1])
+        self.memory.append(pages * os.sysconf("SC_PAGE_SIZE"))
+
+
+@experiment("leaks", "RL405", share=3.0)
+def count_after_resets(context: Context) -> Iterator[Message]:
+    """Reset the process's instance many times, with one step each, and count what it holds."""
+    counts = Counts()
+    instance, budget = context.instance, context.budget
+    gc.freeze()  # what there is already need not be looked through again and again
+    try:
+        while counts.resets < MOST_RESETS and budget.seconds_left > 0:
+            for _ in Episode(instance, FIRST_SEED + counts.resets, number=counts.resets, max_steps=1):
+                pass
+            counts.count()
+            if counts.resets % MEASURED_RESETS == 0:
+                counts.measure_memory()
+    except EnvironmentRaised as error:
+        yield describe_failure(error, context.progress)
+    finally:
+        gc.unfreeze()
+    yield from find_growth(counts)
+
+
+def find_growth(counts: Counts) -> Iterator[Finding]:
+    """Yield what grows with every reset; raises `NotJudged` where there were too few of them."""
+    resets = counts.resets
+    if resets < FEWEST_RESETS:
+        raise NotJudged(f"there was time for only {resets} resets")
+    for what, series in counts.series.items():
+        if growth := _growth(series):
+            first, after = series[SETTLING_RESETS], resets - SETTLING_RESETS - 1
+            message = f"{what} grow with every reset: from {first} to {series[-1]} in {after} resets"
+            evidence = {"element": what, "value": series[-1], "expected": first, "resets": after}
+            yield Finding("RL405", message, {**evidence, "per_reset": growth / after}, LEAKS[what])
+            return  # a client brings its own bodies, files, threads and memory
+    if len(counts.memory) >= FEWEST_MEASUREMENTS:
+        start, middle, end = (counts.memory[i] for i in (0, (len(counts.memory) - 1) // 2, -1))
+        resets = MEASURED_RESETS * (len(counts.memory) - 1)
+        if end - start > MEMORY_GROWTH and end - middle > LATER_SHARE * (end - start):
+            message = (
+                f"memory grows with every reset: by {(end - start) / 2**20:.1f} MiB in {resets} resets, of which "
+                f"{(end - middle) / 2**20:.1f} MiB in the second half"
+            )
+            evidence = {"element": "memory", "value": end, "expected": start, "resets": resets}
+            yield Finding("RL405", message, {**evidence, "per_reset": (end - start) / resets})
+
+
+def _growth(series: list[int]) -> int:
+    """Return by how much a count grows, if it does so all the time; else 0."""
+    series = series[SETTLING_RESETS:]
+    first, second = series[: len(series) // 2], series[len(series) // 2 :]
+    grows = all(half[-1] - half[0] >= LEAST_GROWTH for half in (first, second)) and min(second) >= max(first)
+    return series[-1] - series[0] if grows else 0

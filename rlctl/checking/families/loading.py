@@ -1,0 +1,203 @@
+"""RL0: from the name on the command line to an environment."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import inspect
+import re
+import sys
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rlctl.checking.bullet_worlds import find_clients
+from rlctl.checking.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
+from rlctl.checking.finding import RECORDING, Finding, check, experiment
+from rlctl.checking.instance import Context, Instance, find_author, find_longest_episode, is_task
+from rlctl.checking.messages import Built, Message
+from rlctl.checking.records import Records
+from rlctl.environments import registry
+from rlctl.environments.dict_spaces import format_space
+from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
+
+WAIVERS = "rlctl_ignore"
+"""The class attribute that waives rules: rule id -> reason."""
+
+
+@experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL013", "RL216", share=0.0)
+def build(context: Context) -> Iterator[Message]:
+    """Build the first instance, which the process keeps. Raises `UsageError` for a name that does not exist."""
+    try:
+        instance = context.instance
+    except EnvironmentRaised as raised:
+        error = raised.__cause__ or raised
+        is_mistake = isinstance(error, UsageError) and not isinstance(error, NoSuchClassError | OldGymError)
+        if is_mistake or not isinstance(error, RlctlError):
+            raise error from None  # a name that does not exist, or a bug
+        yield _explain(context, error)
+        return
+    yield describe_built(instance)
+    yield from _base_class(instance)
+    if is_task(instance.env):
+        yield from _find_misspelled(type(find_author(instance.env)))
+    if _count_windows():
+        yield Finding("RL216", "PyBullet was connected with a window (p.GUI)", {"value": "GUI", "expected": "DIRECT"})
+
+
+def _explain(context: Context, error: RlctlError) -> Finding:
+    """Return the finding for an exception of the import or the constructor."""
+    cause = error.__cause__
+    details = {"traceback": error.details} if error.details else {}
+    if isinstance(error, NoSuchClassError):
+        return Finding("RL005", str(error), details)
+    if isinstance(error, OldGymError) or _imports_old_gym(cause):
+        return Finding("RL008", str(error), details)
+    if (file := find_missing_file(cause)) is not None:
+        return _not_found("the constructor", file, error.details)
+    if context.progress.read().call == "load":
+        return Finding("RL001", str(error), details)
+    if isinstance(cause, TypeError) and (missing := _missing_arguments(str(cause))):
+        settings = " ".join(f"--set task.{name}=..." for name in missing)
+        fix = f"Give them ({settings}), or give them default values."
+        return Finding("RL006", str(error), details, fix=fix)
+    if isinstance(error, TaskError) and error.details is None and not _is_task(context.spec.task):
+        return Finding("RL003", str(error))  # the registry's; what a constructor raises comes with its traceback
+    return Finding("RL002", str(error), details)
+
+
+def _imports_old_gym(error: BaseException | None) -> bool:
+    missing = [str(each.name) for each in iterate_causes(error) if isinstance(each, ModuleNotFoundError)]
+    return any(name.partition(".")[0] == "gym" for name in missing)
+
+
+def _is_task(name: str) -> bool:
+    return inspect.isclass(loaded := registry.load(name)) and registry.is_task(loaded)
+
+
+def _missing_arguments(message: str) -> list[str]:
+    found = re.search(r"missing \d+ required .*?arguments?: (.*)", message)
+    return re.findall(r"'(\w+)'", found.group(1)) if found else []
+
+
+def _base_class(instance: Instance) -> Iterator[Finding]:
+    bases = type(getattr(instance.env, "unwrapped", instance.env)).__mro__
+    if any(base.__module__.partition(".")[0] == "gym" for base in bases):
+        yield Finding("RL008", "the class inherits from gym.Env, not from gymnasium.Env")
+    elif not instance.is_env:
+        yield Finding("RL003", "the class does not inherit from gymnasium.Env")
+    for name, leaves in (("observation", instance.leaves), ("action", instance.action_leaves)):
+        if "NoneType" in {leaf.kind for leaf in leaves}:
+            yield Finding("RL003", f"there is no {name}_space")
+
+
+def _find_misspelled(author: type) -> Iterator[Finding]:
+    """Find names that a task's class defines and nothing uses, close to one that means something to rlctl."""
+    from rlctl.task import Task  # PyBullet comes with it
+
+    meant = {name for name in {*vars(Task), *Task.__annotations__} if not name.startswith("_")}
+    for cls in author.__mro__[: author.__mro__.index(Task)]:
+        try:
+            words = Counter(re.findall(r"\w+", inspect.getsource(inspect.getmodule(cls) or cls)))
+        except (OSError, TypeError):
+            continue  # typed in somewhere: there is no file to look for uses in
+        for name in vars(cls).keys() - meant:
+            close = difflib.get_close_matches(name, meant - vars(cls).keys(), n=1, cutoff=0.7)
+            if close and words[name] == 1:
+                evidence = {"value": name, "expected": close[0]}
+                yield Finding(
+                    "RL013", f"{cls.__name__}.{name} is used by nothing. Did you mean {close[0]!r}?", evidence
+                )
+
+
+def _count_windows() -> int:
+    pybullet = sys.modules.get("pybullet")
+    if pybullet is None:
+        return 0
+    methods = [pybullet.getConnectionInfo(physicsClientId=each)["connectionMethod"] for each in find_clients()]
+    return methods.count(pybullet.GUI)
+
+
+@check("RL004", "build")
+def _find_end_while_loading(records: Records) -> Iterator[Finding]:
+    if records.built is None:
+        for failure in records.failures:
+            if failure.process == "probe" and failure.call in ("load", "build") and not lacks_display(failure):
+                evidence = {"last_output": failure.details} if failure.details else {}
+                yield Finding("RL004", failure.message, evidence)
+
+
+@check("RL007", "build", *RECORDING)
+def _find_missing_files(records: Records) -> Iterator[Finding]:
+    files = set()
+    for failure in records.failures if records.built is not None else ():
+        if failure.file is not None and failure.file["file"] not in files:
+            files.add(failure.file["file"])
+            yield _not_found(failure.call, failure.file, failure.details)
+
+
+def _not_found(call: str, file: Mapping[str, Any], details: str | None) -> Finding:
+    where = f", looked for in {' and '.join(file['searched'])}" if file["searched"] else ""
+    evidence = {**file, "traceback": details} if details else dict(file)
+    return Finding("RL007", f"{call} does not find {file['file']!r}{where}", evidence)
+
+
+def describe_built(instance: Instance) -> Built:
+    """Return what is known of an environment before it is used."""
+    env = instance.env
+    inner = getattr(env, "unwrapped", env)
+    spec = getattr(env, "spec", None)
+    author = type(find_author(env))
+    file, line = _place(author)
+    return Built(
+        leaves=instance.leaves,
+        action_leaves=instance.action_leaves,
+        observation_space=format_space(getattr(env, "observation_space", None)),
+        action_space=format_space(env.action_space),
+        names=dict(inner.observation_sizes) if is_task(env) else {},
+        events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
+        max_steps=find_longest_episode(env),
+        nondeterministic=bool(getattr(spec, "nondeterministic", False)),
+        truncation=_read_truncation(inner),
+        accepts_seed=instance.accepts_seed,
+        accepts_options=instance.accepts_options,
+        uses_pybullet=bool(find_clients()),
+        waivers=_waivers(author),
+        file=file,
+        line=line,
+    )
+
+
+def _waivers(author: type) -> Any:
+    """Return the waivers as they are written; whether they are good is judged where they are used."""
+    waivers = getattr(author, WAIVERS, {})
+    if isinstance(waivers, dict):
+        return {str(rule): reason if isinstance(reason, str) else "" for rule, reason in waivers.items()}
+    return {repr(waivers)[:40]: ""}
+
+
+def _place(author: type) -> tuple[str | None, int | None]:
+    """Return file and line of the class that somebody wrote."""
+    try:
+        return inspect.getsourcefile(author), inspect.getsourcelines(author)[1]
+    except (OSError, TypeError):
+        return None, None
+
+
+def _read_truncation(env: Any) -> str:
+    """Return what the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
+    try:
+        nodes = list(ast.walk(ast.parse(textwrap.dedent(inspect.getsource(type(env).step)))))
+    except (AttributeError, OSError, TypeError, SyntaxError):
+        return "unknown"
+    returned = [node.value for node in nodes if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple)]
+    flags = [ast.unparse(each.elts[3]) for each in returned if len(each.elts) == 5]
+    assigned: dict[str, set[str]] = {}
+    for node in nodes:
+        if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign) and node.value is not None:
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                assigned.setdefault(ast.unparse(target), set()).add(ast.unparse(node.value))
+    if not flags:
+        return "unknown"
+    return "never" if all(assigned.get(flag, {flag}) == {"False"} for flag in flags) else "computed"

@@ -1,0 +1,229 @@
+"""RL8: the physics, as PyBullet has it while the environment runs."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.bullet_calls import BulletCall, record_calls
+from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Body, Joint, Jump, Pair, find_clients
+from rlctl.checking.failures import EnvironmentRaised, describe_failure
+from rlctl.checking.finding import Finding, NotApplicable, NotJudged, experiment, list_names
+from rlctl.checking.instance import Context, is_task
+from rlctl.checking.messages import FIRST_SEED, Message, Skipped
+from rlctl.checking.world_logs import Log, LoggedWorld, Place, WorldLogger
+
+EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))
+"""The actions of each episode, and how many of its steps are logged."""
+LASTING_STEPS = 3
+"""What lasts for fewer steps is a blow that the solver has not answered yet."""
+PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
+"""How far outside its limits a joint may be: part of the range, and at least so much [rad], [m]."""
+FASTEST_BASE = 50.0
+"""[m/s]; PyBullet itself stops at 100 along each axis, and no robot or thing that it handles is faster than a car."""
+FASTEST_JOINT = 90.0
+"""[rad/s]; PyBullet itself stops at 100. Arms and legs stay below 30, also when they fall or are thrown about."""
+FASTEST_SLIDE = 50.0  # [m/s]
+FASTEST_MEANT = 100.5
+"""Beyond its own limit of 100 somebody has raised it, as for propellers and wheels; then only nonsense counts."""
+NONSENSE = 5_000.0
+FASTEST_JUMP = 1.0
+"""So much faster than by falling a body may be a tenth of a second after a reset [m/s]: ten times gravity."""
+MOST_NAMES = 3
+MOST_CALLS = 20
+"""Calls that a finding's evidence has."""
+
+
+@experiment("worlds", *(f"RL80{i}" for i in (1, 3, 4, 5, 7, 8, 9)), share=4.0)
+def watch_worlds(context: Context) -> Iterator[Message]:
+    """Log the worlds of an instance through a few episodes; let them fall alone, which changes them, after that."""
+    if "pybullet" not in sys.modules:
+        with context.fresh():
+            pass  # what it imports is imported now
+    if "pybullet" not in sys.modules:
+        raise NotApplicable("no PyBullet world")
+    older = set(find_clients())
+    with record_calls() as calls, context.fresh() as instance:
+        with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
+            instance.reset(FIRST_SEED)
+        yield from _model_faults(instance.env)
+        logger = WorldLogger(instance, older)
+        for number, (kind, steps) in enumerate(EPISODES):
+            if number and (context.budget.seconds_left < 0 or not logger.worlds):
+                break
+            try:
+                logger.play(number, kind, steps, context.budget.deadline)
+            except EnvironmentRaised as error:
+                yield describe_failure(error, context.progress)
+        if logger.worlds and context.budget.seconds_left > 0:
+            with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
+                logger.simulate_alone(len(EPISODES), context.budget.deadline)
+    if not logger.resets:
+        raise NotJudged("no episode could be logged")
+    if not logger.worlds:
+        raise NotApplicable("no PyBullet world")
+    yield from _left_out_clients(sorted(calls.without_client))
+    for world in logger.worlds:
+        yield from _judge(world)
+
+
+def _left_out_clients(calls: Sequence[BulletCall]) -> Iterator[Finding]:
+    if calls:
+        count = f"{len(calls)} calls" if len(calls) > 1 else "a call"
+        shown = list_names([f"{each.place} {each.name}" for each in calls], MOST_NAMES)
+        evidence = {"file": calls[0].file, "line": calls[0].line, "places": [each.place for each in calls[:MOST_CALLS]]}
+        yield Finding("RL808", f"{count} of PyBullet without physicsClientId: {shown}", evidence)
+
+
+def _model_faults(env: Any) -> Iterator[Message]:
+    if not is_task(env):
+        yield Skipped("RL809", "model files are known of tasks of rlctl only", applies=False)
+        return
+    from rlctl.task.inertia import find_inertia_faults
+
+    for body in env.unwrapped.sim.bodies.values():
+        for fault in find_inertia_faults(body):
+            yield Finding("RL809", fault.rstrip("."))
+
+
+def _judge(world: LoggedWorld) -> Iterator[Message]:
+    yield from _gravity(world)
+    explosions = list(_explosion(world))
+    yield from explosions
+    if explosions:
+        for rule in ("RL803", "RL804"):
+            yield Skipped(rule, "the simulation explodes (RL805)")  # which explains what else is odd
+    else:
+        yield from _penetration(world)
+        yield from _joint_limits(world)
+    yield from _unrest(world)
+
+
+def _when(place: Place) -> str:
+    return f"at step {place['step']}" if place["step"] else "at reset"
+
+
+def _gravity(world: LoggedWorld) -> Iterator[Finding]:
+    heavy = [body.name for body in world.world.bodies if body.is_free or body.has_heavy_links]
+    if heavy and not any(world.gravity) and world.weight_matters is not False:
+        evidence = {"value": world.gravity, "expected": [0.0, 0.0, -9.81], "bodies": heavy}
+        yield Finding("RL801", f"gravity is (0, 0, 0), and {list_names(heavy, MOST_NAMES)} can move", evidence)
+
+
+def _penetration(world: LoggedWorld) -> Iterator[Finding]:
+    """Yield what is deep inside something else for several steps in a row with ordinary actions, the deepest only."""
+    thrown = _thrown(world)
+    worst: dict[Pair, tuple[float, Log, list[int]]] = {}
+    for log in world.logs:
+        for pair in {pair for deep in log.deep for pair in deep} if log.actions != "extreme" else ():
+            row = _longest_row([pair in deep for deep in log.deep])
+            depth = max(log.deep[i][pair][0] for i in row)
+            names = [log.world.link_name(link) for link in pair]
+            # What is inside each other since the reset and is thrown out is RL807.
+            is_thrown = log.places[row[0]]["step"] <= 1 and any(body in name for body in thrown for name in names)
+            if len(row) >= LASTING_STEPS and not is_thrown and depth > worst.get(pair, (0.0,))[0]:
+                worst[pair] = depth, log, row
+    for pair, (depth, log, row) in sorted(worst.items(), key=lambda each: -each[1][0])[:1]:
+        at = max(row, key=lambda i: log.deep[i][pair][0])
+        limit, place = log.deep[at][pair][1], log.places[at]
+        names = [log.world.link_name(link) for link in pair]
+        more = f"; so are {len(worst) - 1} other pairs of links" if len(worst) > 1 else ""
+        yield Finding(
+            "RL803",
+            f"{names[0]} is {100 * depth:.1f} cm inside {names[1]} {_when(place)}, and deeper than "
+            f"{100 * limit:.1f} cm for {len(row)} steps in a row{more}",
+            {**place, "value": depth, "expected": limit, "links": names},
+        )
+
+
+def _longest_row(is_deep: Sequence[bool]) -> list[int]:
+    groups = itertools.groupby(range(len(is_deep)), key=is_deep.__getitem__)
+    return max((list(row) for deep, row in groups if deep), key=len, default=[])
+
+
+def _joint_limits(world: LoggedWorld) -> Iterator[Finding]:
+    """Yield the joint that is farthest outside its limits."""
+    found: list[tuple[float, str, Joint, int, Place, float]] = []
+    for log in world.logs:
+        for body, states in log.bodies:
+            for j, joint in enumerate(body.joints):
+                positions = states[:, JOINTS + j]
+                outside = _outside(joint, positions)
+                steps, row = int((outside > 0).sum()), int(outside.argmax())
+                if steps >= LASTING_STEPS:
+                    name, place = f"{joint.name} of {body.name}", log.places[row]
+                    found.append((float(outside[row]), name, joint, steps, place, float(positions[row])))
+    found.sort(key=lambda each: -each[0])
+    names = list(dict.fromkeys(each[1] for each in found))
+    for _, name, joint, steps, place, value in found[:1]:
+        unit = "rad" if joint.is_angle else "m"
+        more = f"; outside of theirs are {list_names(names[1:], MOST_NAMES)}" if names[1:] else ""
+        yield Finding(
+            "RL804",
+            f"{name} is at {value:.3g} {unit} {_when(place)}; its limits are [{joint.low:.3g}, {joint.high:.3g}] "
+            f"{unit}; it is outside by much in {steps} steps{more}",
+            {**place, "joint": name, "value": value, "expected": [joint.low, joint.high], "other_joints": names[1:]},
+        )
+
+
+def _outside(joint: Joint, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far a joint is outside its limits, in parts of their width; 0 where that is little."""
+    if not joint.has_limits:
+        return np.zeros(len(values))
+    width = joint.high - joint.low
+    allowed = max(PART_OF_RANGE * width, LEAST_ANGLE if joint.is_angle else LEAST_LENGTH)
+    outside = np.maximum(joint.low - values, values - joint.high)
+    return np.where(np.isfinite(outside) & (outside > allowed), outside / width, 0.0)
+
+
+def _explosion(world: LoggedWorld) -> Iterator[Finding]:
+    """Yield the worst of what is faster than any robot, or is not a number."""
+    found = [each for log in world.logs for body, states in log.bodies for each in _fast(log, body, states)]
+    found.sort(key=lambda each: -each[0])
+    parts = {part for _, part, *_ in found}
+    for _, _, message, evidence in found[:1]:
+        more = f", and {len(parts) - 1} more" if len(parts) > 1 else ""  # its consequences
+        yield Finding("RL805", message + more, evidence)
+
+
+def _fast(log: Log, body: Body, states: NDArray[np.float64]) -> Iterator[tuple[float, str, str, Place]]:
+    """Yield what of a body is too fast for several looks: speed, what it is, message, evidence."""
+    for row, column in np.argwhere(~np.isfinite(states))[:1].tolist():
+        value, place = str(states[row, column]), log.places[row]
+        message = f"the state of {body.name} is {value} {_when(place)}"
+        yield math.inf, body.name, message, {**place, "value": value, "expected": "finite"}
+        return
+    linear, angular = (np.linalg.norm(states[:, part], axis=1) for part in (VELOCITY, ANGULAR))
+    fastest = FASTEST_BASE + float(linear[0])  # a rocket may begin with 100
+    parts = [(body.name, "m/s", fastest, linear), (body.name, "rad/s", FASTEST_JOINT, angular)]
+    for joint, speeds in zip(body.joints, np.abs(states[:, JOINTS + len(body.joints) :]).T, strict=True):
+        unit, limit = ("rad/s", FASTEST_JOINT) if joint.is_angle else ("m/s", FASTEST_SLIDE)
+        parts.append((f"{joint.name} of {body.name}", unit, limit, speeds))
+    for part, unit, limit, speeds in parts if log.actions != "extreme" else ():
+        row = int(np.argsort(speeds)[-min(LASTING_STEPS, len(speeds))])
+        speed, place = float(speeds[row]), log.places[row]
+        if speed > limit and not (unit == "rad/s" and FASTEST_MEANT < speed < NONSENSE):
+            message = f"{part} moves at {speed:.4g} {unit} {_when(place)}"
+            yield speed, f"{part} {unit}", message, {**place, "value": speed, "expected": f"up to {limit:g}"}
+
+
+def _thrown(world: LoggedWorld) -> dict[str, Jump]:
+    """Return the bodies that are thrown away right after a reset."""
+    return {jump.body: jump for jump in reversed(world.jumps) if jump.speed > jump.explained + FASTEST_JUMP}
+
+
+def _unrest(world: LoggedWorld) -> Iterator[Finding]:
+    for jump in _thrown(world).values():
+        yield Finding(
+            "RL807",
+            f"{jump.body} moves at {jump.speed:.2f} m/s {jump.after_s:.2g} s after reset, with nothing done to it; "
+            f"falling explains {jump.explained:.2f} m/s",
+            {"seed": jump.seed, "body": jump.body, "value": jump.speed, "expected": jump.explained},
+        )

@@ -1,0 +1,231 @@
+"""RL6: the reward as a number, its terms in `info["reward_terms"]`, and for other goals (RL601-603, 612, 614)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.episode import Episode
+from rlctl.checking.failures import EnvironmentRaised, describe
+from rlctl.checking.finding import Finding, NotApplicable, NotJudged, Severity, check, experiment
+from rlctl.checking.instance import Context
+from rlctl.checking.messages import FIRST_SEED, Message, Trajectory
+from rlctl.checking.records import Records
+
+WITH_SEARCH = ("comparisons", "episodes", "starts", "search")
+"""The experiments that record episodes of the first process's instance: nearly all there are."""
+DISCOUNT = 0.99
+"""The usual discount per step: what is more than a few hundred steps away hardly counts."""
+TERMS, SUCCESS = "reward_terms/", "is_success"
+ENOUGH_STEPS = 50
+"""With fewer steps nothing is said about what never happens."""
+LARGE = 10.0
+"""Root mean square per step from which a reward is large. With the usual discount a return is up to a hundred times
+as much, and value networks begin near 0. Pendulum's rewards, down to -16, are below it."""
+HUGE = 1_000.0
+"""A single reward beyond this, ten times the usual bonus for finishing, spoils the value estimate of all before it."""
+MEANT_CONSTANT = re.compile(
+    r"(^|_)(alive|aliveness|surviv\w*|time|steps?|living|life|exist\w*|constant|bias)(_|$)", re.I
+)
+"""Names of terms that are meant to be the same at every step."""
+STEPS = 50
+TOLERANCE = 1e-4
+"""Difference between two rewards, relative to the environment's or to 1, up to which it is rounding to float32."""
+GOALS = ("achieved_goal", "desired_goal")
+
+
+def require_readable(records: Records) -> list[Trajectory]:
+    """Return the episodes of a step at least, if flags and infos can be read; raises `NotJudged` otherwise."""
+    records.require_built()
+    if records.forms("step"):
+        raise NotJudged("step does not return five values (RL201)")
+    if any(form.type != "dict" for _, form in records.forms("info")):
+        raise NotJudged("info is not a dict (RL204)")
+    episodes = [each for each in records.require_alone() if each.steps]
+    _require_enough(episodes)
+    return episodes
+
+
+def require_rewarded(records: Records) -> list[Trajectory]:
+    """Return the same, if every reward is a finite number."""
+    episodes = require_readable(records)
+    if not all(each.reward_is_number.all() for each in episodes):
+        raise NotJudged("the reward is not a number (RL204)")
+    if not all(np.isfinite(each.rewards).all() for each in episodes):
+        raise NotJudged("the reward is not finite (RL601)")
+    return episodes
+
+
+def _require_enough(episodes: list[Trajectory]) -> None:
+    if sum(each.steps for each in episodes) < ENOUGH_STEPS:
+        raise NotJudged(f"fewer than {ENOUGH_STEPS} steps were recorded")
+
+
+def has_terms(episode: Trajectory) -> bool:
+    """Say whether there are reward terms in info."""
+    return any(name.startswith(TERMS) for name in episode.infos)
+
+
+def find_terms(episode: Trajectory) -> dict[str, NDArray[np.float64]]:
+    """Return the reward terms of an episode by name; NaN where one is not in info. Shape (T,) each."""
+    terms = {}
+    for name, series in episode.infos.items():
+        if name.startswith(TERMS):
+            values = np.full(episode.steps, np.nan)
+            inside = (series.steps >= 1) & (series.steps <= episode.steps)
+            values[series.steps[inside] - 1] = series.values[inside]
+            terms[name.removeprefix(TERMS)] = values
+    return terms
+
+
+def find_constant_terms(episodes: Sequence[Trajectory]) -> dict[str, float]:
+    """Return the terms that have one value at all steps of all episodes."""
+    by_name: dict[str, list[NDArray[np.float64]]] = {}
+    for episode in episodes:
+        for name, values in find_terms(episode).items():
+            by_name.setdefault(name, []).append(values)
+    return {
+        name: float(parts[0][0])
+        for name, parts in by_name.items()
+        if len(parts) == len(episodes) and all((part == parts[0][0]).all() for part in parts)
+    }
+
+
+def reports_success(episodes: Sequence[Trajectory]) -> bool:
+    """Say whether `is_success` is in info, at least sometimes."""
+    return any(SUCCESS in each.infos for each in episodes)
+
+
+def has_succeeded(episode: Trajectory) -> bool:
+    """Say whether `is_success` was true at any step."""
+    return SUCCESS in episode.infos and bool((episode.infos[SUCCESS].values > 0).any())
+
+
+def ends_in_success(episode: Trajectory) -> bool:
+    """Say whether `is_success` was true at the last step."""
+    series = episode.infos.get(SUCCESS)
+    return series is not None and int(series.steps[-1]) == episode.steps and bool(series.values[-1] > 0)
+
+
+def discounted_sum(rewards: NDArray[np.float64]) -> float:
+    """Return the discounted sum of rewards, from the first of them on."""
+    return float(rewards @ DISCOUNT ** np.arange(len(rewards)))
+
+
+def discounted_steps(reward: float, steps: int) -> float:
+    """Return the discounted sum of the same reward for so many steps."""
+    return float(reward * (1 - DISCOUNT**steps) / (1 - DISCOUNT))
+
+
+def longest_episode(records: Records, episodes: Sequence[Trajectory]) -> int:
+    """Return how long an episode may last: the declared limit, or the longest that was recorded [steps]."""
+    return records.require_built().max_steps or max(each.steps for each in episodes)
+
+
+def summarize(episodes: Sequence[Trajectory]) -> str:
+    """Return how much was recorded: `80 episodes with random, zero and searched actions (6,100 steps)`."""
+    kinds = list(dict.fromkeys(each.actions for each in episodes))
+    kinds_text = " and ".join([", ".join(kinds[:-1]), kinds[-1]]) if len(kinds) > 1 else kinds[0]
+    return f"{len(episodes)} episodes with {kinds_text} actions ({sum(each.steps for each in episodes):,} steps)"
+
+
+@check("RL601")
+def find_not_finite(records: Records) -> Iterator[Finding]:
+    """Find the first reward that is NaN or infinite."""
+    for episode in records.require_alone():
+        wrong = np.flatnonzero(~np.isfinite(episode.rewards) & episode.reward_is_number)
+        if wrong.size:
+            step, value = int(wrong[0]) + 1, str(episode.rewards[wrong[0]])
+            evidence = episode.at(step, value=value, expected="finite")
+            yield Finding("RL601", f"the reward is {value} at step {step}", evidence)
+            return
+
+
+@check("RL602", *WITH_SEARCH)
+def _find_constant_reward(records: Records) -> Iterator[Finding]:
+    episodes = require_rewarded(records)
+    constant = float(episodes[0].rewards[0])
+    if any((each.rewards != constant).any() or each.terminated.any() for each in episodes):
+        return
+    at_success = any(has_succeeded(each) for each in episodes)
+    also = ", also where is_success is true" if at_success else ""
+    yield Finding(
+        "RL602",
+        f"the reward is {constant:g} at every step of {summarize(episodes)}{also}, and nothing ends an episode early",
+        {"value": constant, "episodes": len(episodes), "steps": sum(each.steps for each in episodes)},
+        Severity.WARNING if constant > 0 or at_success else Severity.INFO,
+    )
+
+
+@check("RL603")
+def _find_badly_scaled(records: Records) -> Iterator[Finding]:
+    require_rewarded(records)
+    episodes = [each for each in records.episodes if each.steps]
+    if not episodes:
+        return
+    inner = np.concatenate([each.rewards[: each.steps - each.has_ended] for each in episodes])
+    size = float(np.sqrt(np.mean(inner**2))) if inner.size else 0.0
+    largest = max(episodes, key=lambda each: float(np.abs(each.rewards).max()))
+    step = int(np.abs(largest.rewards).argmax())
+    value = float(largest.rewards[step])
+    if size > LARGE:
+        message = f"the reward per step is {size:.3g} (root mean square), up to {value:.3g}"
+    elif abs(value) > HUGE:
+        message = f"the reward is {value:.3g} at step {step + 1}; usual is {size:.2g}"
+    else:
+        return
+    evidence = largest.at(step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
+    yield Finding("RL603", message, evidence, Severity.INFO if records.normalizes_rewards() else Severity.WARNING)
+
+
+@check("RL612", *WITH_SEARCH)
+def _find_constant_penalty(records: Records) -> Iterator[Finding]:
+    episodes = [each for each in require_rewarded(records) if has_terms(each)]
+    if not episodes:
+        raise NotApplicable("no reward_terms in info")
+    _require_enough(episodes)
+    for name, value in find_constant_terms(episodes).items():
+        if value < 0 and not MEANT_CONSTANT.search(name):
+            message = f"reward term {name!r} is {value:.6g} at every step of {summarize(episodes)}"
+            yield Finding("RL612", message, {"term": name, "value": value, "episodes": len(episodes)})
+
+
+@experiment("hindsight", "RL614", share=0.3)
+def recompute_rewards(context: Context) -> Iterator[Message]:
+    """Ask for the rewards of steps that have just been rewarded, all at once, as hindsight replay does."""
+    instance = context.instance
+    compute = getattr(getattr(instance.env, "unwrapped", instance.env), "compute_reward", None)
+    leaves = {leaf.path for leaf in instance.leaves}
+    if not callable(compute) or not leaves >= {(name,) for name in GOALS}:
+        raise NotApplicable("no compute_reward, or no goals in the observation that are arrays")
+    episode = Episode(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
+    taken = [each for each in episode if each.step and each.is_readable]
+    if not taken:
+        raise NotJudged("no step could be taken")
+    try:
+        goals = [np.stack([np.asarray(each.observation[name]) for each in taken]) for name in GOALS]
+        given = np.array([float(each.reward) for each in taken])
+        infos = np.array([each.info for each in taken])
+    except (LookupError, TypeError, ValueError):
+        raise NotJudged("goals are missing or change their shape (RL101), or types are wrong (RL204)") from None
+    try:
+        computed = instance.call("compute_reward", lambda: np.asarray(compute(*goals, infos), np.float64))
+    except EnvironmentRaised as error:
+        raised = describe(error.__cause__ or error)
+        yield Finding("RL614", f"compute_reward, of many goals at once, raises {raised}", {"steps": len(taken)})
+        return
+    if computed.shape != given.shape:
+        shapes = f"of {len(taken)} goals at once it returns shape {computed.shape}, not {given.shape}"
+        yield Finding("RL614", f"compute_reward: {shapes}", {"steps": len(taken)})
+        return
+    off = np.abs(computed - given)
+    # Written so that NaN is another reward; where the environment itself gives one, RL601 says so.
+    is_other = np.isfinite(given) & ~(off <= TOLERANCE * np.maximum(1.0, np.abs(given)))
+    if is_other.any():
+        step = int(np.where(is_other, off, 0.0).argmax())
+        message = f"the reward of step {step + 1} is {given[step]:.6g}, and compute_reward says {computed[step]:.6g}"
+        evidence = {"step": step + 1, "value": float(computed[step]), "expected": float(given[step])}
+        yield Finding("RL614", message, evidence)

@@ -1,0 +1,229 @@
+"""Records a small search for good actions, so that rules see more of an environment than chance finds; and RL605.
+
+All its episodes begin with the same seed. The first does nothing. The cross-entropy method plays
+generations of sequences of a few held actions, each drawn around the best of those before. Then the best sequence is
+followed with another action from some step on; at last one that finished stops shortly before its end, to see what
+standing still beside a goal earns.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.episode import Episode, action_at, zero_action
+from rlctl.checking.families.rewards import (
+    DISCOUNT,
+    discounted_steps,
+    discounted_sum,
+    ends_in_success,
+    has_succeeded,
+    reports_success,
+)
+from rlctl.checking.finding import Finding, NotJudged, experiment
+from rlctl.checking.instance import Context, find_longest_episode
+from rlctl.checking.messages import FIRST_SEED, Message, Skipped, Trajectory
+from rlctl.checking.recording import Recording
+
+MOST_STEPS = 6_000
+"""Steps in all. With them the goal of the bundled `reach`, a ball of 5 cm within reach of an arm, is found from most
+seeds; on a fast environment they take a tenth of a second."""
+MOST_EPISODES = 60
+LONGEST = 200
+"""An episode is left after so many steps: most of a goal's pull shows before."""
+SEGMENTS = 3
+"""Of a sequence, each one action that is held: few numbers to search among."""
+GENERATION = 10
+ELITE = 3
+WIDTH = 0.3
+"""Of the first generation, as a standard deviation; the range of an action is 1."""
+LEAST_WIDTH = 0.025
+STRETCH = 1.5
+"""How long a sequence's actions reach, against the longest episode so far."""
+CEM_FRACTION = 0.7
+"""Part of the steps that is for generations; after a success there is no need for another."""
+CONTINUED = 12
+"""Episodes that follow the best and then go on otherwise."""
+STOPS = (1, 2, 4, 8)
+"""How many steps before its end an episode that finished is played again with nothing done from there on."""
+FAR_ABOVE = 5.0
+"""The last reward of an episode is that of a goal, where success is not reported, if it stands out by so many times the
+spread of the rewards in its first half: a robot that falls while it walks fast ends with a good reward too."""
+CLEARLY = 0.1
+"""How much more stopping has to earn than finishing."""
+LATE = 10
+"""The mean of so many rewards is what each later step is taken to earn [steps]."""
+
+
+@dataclasses.dataclass
+class _Attempt:
+    """One episode of the search."""
+
+    sequence: list[Any]
+    played: Trajectory
+
+    @property
+    def score(self) -> float:
+        """Mean reward over the time there was, and the best of it: to come near counts, even for a moment."""
+        rewards = np.nan_to_num(self.played.rewards)
+        return float(rewards.sum() / LONGEST + rewards.max()) if rewards.size else -np.inf
+
+
+@experiment("search", "RL605", share=3.0)
+def search(context: Context) -> Iterator[Message]:
+    """Look for action sequences with a high return, and stop one that finished shortly before its end."""
+    leaves = context.instance.action_leaves
+    unknown = [leaf.kind for leaf in leaves if not leaf.supported]
+    if unknown or not leaves:
+        raise NotJudged(f"no search among actions of a {', '.join(unknown) or 'space without numbers'}")
+    searcher = _Search(context)
+    yield from searcher.play([zero_action(context.instance.env.action_space)] * LONGEST, "zero")
+    yield from searcher.cross_entropy_search()
+    yield from searcher.perturb_best()
+    yield from searcher.stop_early()
+    if context.budget.why_spent:
+        yield Skipped("search", f"{len(searcher.attempts)} episodes were searched: {context.budget.why_spent}")
+
+
+class _Search:
+    def __init__(self, context: Context) -> None:
+        self.instance = context.instance
+        self.budget = context.budget
+        self.attempts: list[_Attempt] = []
+        self._rng = np.random.default_rng(FIRST_SEED)
+        self._space = self.instance.env.action_space
+        self._length = LONGEST
+        self._size = sum(int(np.prod(leaf.shape)) for leaf in self.instance.action_leaves)
+
+    def cross_entropy_search(self) -> Iterator[Message]:
+        """Play generations of held actions, each around the best of the one before."""
+        shape = (SEGMENTS, self._size)
+        mean, width = np.full(shape, 0.5), np.full(shape, WIDTH)
+        best, best_score = mean, -np.inf
+        while self._goes_on(CEM_FRACTION) and not any(has_succeeded(each.played) for each in self.attempts):
+            generation: list[tuple[float, NDArray[np.float64]]] = []
+            for number in range(GENERATION):
+                centre, spread = (best, WIDTH * width) if number == 0 else (mean, width)
+                parameters = np.clip(centre + spread * self._rng.standard_normal(shape), 0.0, 1.0)
+                yield from self.play(self._hold(parameters))
+                generation.append((self.attempts[-1].score, parameters))
+                if not self._goes_on(CEM_FRACTION):
+                    break
+            generation.sort(key=lambda each: -each[0])
+            if generation[0][0] > best_score:
+                best_score, best = generation[0]
+            elite = np.stack([parameters for _, parameters in generation[:ELITE]])
+            mean, width = elite.mean(axis=0), np.maximum(elite.std(axis=0), LEAST_WIDTH)
+
+    def perturb_best(self) -> Iterator[Message]:
+        """Follow the best sequence and hold another action from some step on."""
+        for _ in range(CONTINUED):
+            if not self._goes_on():
+                return
+            best = max(self.attempts, key=lambda each: each.score)
+            at = int(best.played.steps * np.sqrt(self._rng.random()))  # rather late than early
+            action = action_at(self._space, self._rng.random(self._size))
+            yield from self.play([*best.sequence[:at], *[action] * (self._length - at)])
+
+    def stop_early(self) -> Iterator[Message]:
+        """Follow a sequence that finished, do nothing from shortly before its end on, and compare what both earn."""
+        is_reported = reports_success([each.played for each in self.attempts])
+        finished = [each for each in self.attempts if _finishes(each.played, is_reported)]
+        if not finished:
+            yield Skipped("RL605", "the search for high returns ended no episode at a goal", applies=False)
+            return
+        best = max(finished, key=lambda each: each.played.rewards[-1])
+        one, nothing = best.played, zero_action(self._space)
+        stops: list[Stop] = []
+        for before in STOPS:
+            at = max(0, one.steps - before)
+            if self._goes_on():
+                yield from self.play([*best.sequence[:at], *[nothing] * (self._length - at)])
+                two = self.attempts[-1].played
+                is_same = np.array_equal(one.rewards[:at], two.rewards[:at]) and two.ended != "raised"
+                if is_same and two.steps > one.steps and not _finishes(two, is_reported):
+                    limit = find_longest_episode(self.instance.env)
+                    longest = limit or max(each.played.steps for each in self.attempts)
+                    stops.append(compare_returns(one, two, at, longest))
+        if not is_reported:
+            stops = [each for each in stops if each.finishing > 0]  # an end that costs more than it pays is no goal
+        yield from _judge_stops(one, stops)
+
+    def play(self, sequence: list[Any], kind: str = "searched") -> Iterator[Message]:
+        """Play one sequence of actions."""
+        given = (copy.deepcopy(action) for action in sequence)
+        deadline = self.budget.end_within(max(0.0, self.budget.seconds_left / 4))
+        number, steps = len(self.attempts), len(sequence)
+        episode = Episode(
+            self.instance, FIRST_SEED, kind, number=number, max_steps=steps, deadline=deadline, given=given
+        )
+        recording = Recording("search", episode, self.budget)
+        yield from recording.run()
+        played = recording.trajectory
+        self.attempts.append(_Attempt(sequence, played))
+        if played.ended in ("truncated", "both"):
+            self._length = min(self._length, played.steps)
+
+    def _hold(self, parameters: NDArray[np.float64]) -> list[Any]:
+        actions = [action_at(self._space, each) for each in parameters]
+        # Where episodes end soon the actions have to change soon.
+        longest = max(each.played.steps for each in self.attempts)
+        segment = max(2, min(self._length, round(STRETCH * longest)) // SEGMENTS)
+        return [actions[min(SEGMENTS - 1, step // segment)] for step in range(self._length)]
+
+    def _goes_on(self, part: float = 1.0) -> bool:
+        steps = sum(each.played.steps for each in self.attempts)
+        is_left = steps < part * MOST_STEPS and len(self.attempts) < part * MOST_EPISODES
+        return is_left and not self.budget.why_spent
+
+
+def _finishes(episode: Trajectory, success_is_reported: bool) -> bool:
+    """Whether an episode ended at the goal: as it reports, or else with a reward far above what it began with."""
+    if episode.ended not in ("terminated", "both"):
+        return False
+    if success_is_reported:
+        return ends_in_success(episode)
+    begin = episode.rewards[: episode.steps // 2]
+    last = episode.rewards[-1]
+    return len(begin) > 1 and bool(last > begin.max() + FAR_ABOVE * np.ptp(begin) and last >= episode.rewards.max())
+
+
+@dataclasses.dataclass(frozen=True)
+class Stop:
+    """What an episode earns that stops shortly before another one finishes."""
+
+    step: int
+    """The first step that is different."""
+    finishing: float
+    """The discounted rewards of the other one from that step on."""
+    stopping: float
+    """Its own, up to the time limit."""
+    per_step: float
+    """Its mean reward from that step on."""
+
+
+def compare_returns(one: Trajectory, two: Trajectory, at: int, longest: int) -> Stop:
+    """Compare an episode that finished with one that is the same for `at` steps. `longest`: the time limit [steps]."""
+    rest = two.rewards[at:]
+    to_come = 0 if two.has_ended else longest - two.steps
+    stopping = discounted_sum(rest) + DISCOUNT ** len(rest) * discounted_steps(float(rest[-LATE:].mean()), to_come)
+    return Stop(at + 1, discounted_sum(one.rewards[at:]), stopping, float(rest.mean()))
+
+
+def _judge_stops(finished: Trajectory, stops: Sequence[Stop]) -> Iterator[Message]:
+    if not stops:
+        yield Skipped("RL605", "no episode that stops just before the goal could be played")
+        return
+    best = max(stops, key=lambda each: each.stopping - each.finishing)
+    if best.per_step > 0 and best.stopping > best.finishing + CLEARLY * abs(best.finishing):
+        yield Finding(
+            "RL605",
+            f"finishing at step {finished.steps} earns {best.finishing:.4g} from step {best.step} on; stopping there "
+            f"instead earns {best.per_step:.3g} per step, {best.stopping:.4g} in all (discounted by {DISCOUNT})",
+            finished.at(best.step, value=best.stopping, expected=f"below {best.finishing:.6g}", per_step=best.per_step),
+        )

@@ -1,0 +1,102 @@
+"""RL3, seeds: they change something, later episodes follow from them, and no generator of the process is moved."""
+
+from __future__ import annotations
+
+import random
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.episode import Episode
+from rlctl.checking.families.determinism import compare
+from rlctl.checking.finding import Finding, NotJudged, check, experiment
+from rlctl.checking.instance import Context, Instance
+from rlctl.checking.leaves import flatten_numbers
+from rlctl.checking.messages import FIRST_SEED, Message
+from rlctl.checking.records import Records
+
+WATCHED_STEPS = 30
+"""For how many steps the process's random generators are compared."""
+UNSEEDED_RESETS, UNSEEDED_STEPS = 2, 20
+"""Of two discrete starts one may be the same by chance."""
+FEWEST_SEEDS = 4
+
+
+@check("RL306", "comparisons", "episodes")
+def _compare_seeds(records: Records) -> Iterator[Finding]:
+    built = records.require_built()
+    trajectory, difference = compare(records, "alone", "seeds")
+    if difference is not None:
+        return
+    starts = [each for each in records.require_alone() if 0 in each.observations and len(each.observations[0].steps)]
+    seeds = len({each.seed for each in starts})
+    if seeds < FEWEST_SEEDS:
+        raise NotJudged(f"fewer than {FEWEST_SEEDS} seeds were tried")
+    for index, _ in enumerate(built.leaves):
+        values = [each.observations[index].values[0] for each in starts if index in each.observations]
+        if any(not np.array_equal(values[0], other) for other in values[1:]):
+            return
+    message = f"{seeds} seeds give one start, and with the same actions one trajectory of {trajectory.steps} steps"
+    yield Finding("RL306", message, {"seeds": seeds, "value": 1, "expected": seeds})
+
+
+@experiment("unseeded", "RL308", share=0.5)
+def compare_unseeded(context: Context) -> Iterator[Message]:
+    """Play in two new instances after the same resets: first all with a seed, then the last ones without."""
+    with context.fresh() as first, context.fresh() as second:
+        if not first.accepts_seed:
+            raise NotJudged("reset takes no seed (RL202)")
+        deadline = context.budget.deadline
+        if _differing(*(_play(each, deadline, seed=FIRST_SEED) for each in (first, second))):
+            raise NotJudged("equal seeds and actions give unequal episodes (RL3)")
+        values = _differing(*(_play(each, deadline) for each in (first, second)))
+    if values:
+        message = f"reset with one seed, and then without: {values[0]:.6g} in an observation, in another instance "
+        evidence = {"seed": FIRST_SEED, "value": values[1], "expected": values[0]}
+        yield Finding("RL308", f"{message}{values[1]:.6g}", evidence)
+
+
+def _play(instance: Instance, deadline: float, **seed: int) -> NDArray[np.float64]:
+    """Reset with a seed and then a few times as given; return the numbers of these and of some more observations."""
+    episode = Episode(instance, FIRST_SEED, max_steps=UNSEEDED_STEPS, deadline=deadline)
+    episode.reset()
+    starts = [instance.call("reset", instance.env.reset, **seed) for _ in range(UNSEEDED_RESETS)]
+    observations = [each[0] if isinstance(each, tuple) else each for each in starts]
+    while not episode.ended:
+        observations.append(episode.step().observation)
+    return np.nan_to_num(np.concatenate([flatten_numbers(each) for each in observations]).astype(np.float64))
+
+
+def _differing(one: NDArray[np.float64], two: NDArray[np.float64]) -> list[float]:
+    """Return the first two numbers that differ, as far as both go; nothing where none do."""
+    rows = min(len(one), len(two))
+    unequal = np.flatnonzero(one[:rows] != two[:rows])
+    return [float(each[unequal[0]]) for each in (one, two)] if unequal.size else []
+
+
+@experiment("global random", "RL309", share=0.5)
+def compare_generators(context: Context) -> Iterator[Message]:
+    """Play the beginning of an episode, and say which generators of the whole process it moves, and where first."""
+    moved: set[str] = set()
+    episode = Episode(context.instance, FIRST_SEED, max_steps=WATCHED_STEPS, deadline=context.budget.deadline)
+    before = _read_generators()
+    for moment in episode:
+        after = _read_generators()
+        for generator, state in after.items():
+            if state != before.get(generator, state) and generator not in moved:
+                moved.add(generator)
+                call, at = ("step", f" at step {moment.step}") if moment.step else ("reset", "")
+                evidence = {"generator": generator, "call": call, "step": moment.step}
+                yield Finding("RL309", f"{call} moves the global generator {generator}{at}", evidence)
+        before = _read_generators()
+
+
+def _read_generators() -> dict[str, Any]:
+    kind, keys, position, *rest = np.random.get_state()  # noqa: NPY002 (this one is what is compared)
+    states = {"numpy.random": (kind, np.asarray(keys).tobytes(), position, *rest), "random": random.getstate()}
+    if "torch" in sys.modules:
+        states["torch"] = sys.modules["torch"].random.get_rng_state().numpy().tobytes()
+    return states

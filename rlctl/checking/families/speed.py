@@ -1,0 +1,262 @@
+"""RL9: speed. Training takes millions of steps; the time of each decides what can be trained."""
+
+from __future__ import annotations
+
+import cProfile
+import dataclasses
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+
+from rlctl.checking.bullet_calls import visible_to_profilers
+from rlctl.checking.clock import read_clock
+from rlctl.checking.episode import Episode
+from rlctl.checking.finding import Finding, NotJudged, check, experiment, list_names
+from rlctl.checking.instance import Context, Instance, Timer, rebuilds_world
+from rlctl.checking.messages import Fact, Message
+from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_code
+from rlctl.checking.records import Records
+from rlctl.output import format_duration
+
+FIRST_SPEED_SEED = 5000
+TIMED_STEPS = 200
+TIMED_RESETS = 5
+PROFILED_S = 0.15
+"""How long steps are profiled, and resets [s]."""
+MOST_STEPS = 20_000
+"""So many steps, or resets, are enough."""
+BATCH = 25
+"""The time of a step is the median of the means over so many: a disturbance is left out, a step that takes longer every
+now and then is not."""
+LONGEST_S = 2.0
+"""So much time is enough, however much there is: an environment that takes longer for these steps is slow [s]."""
+MOST_CALLS = 5
+
+MILLION = 1_000_000
+SLOW_STEPS_PER_S = 100.0
+"""Below it a million steps, a small training, take about three hours on one core [steps/s]."""
+SLOW_LOADING_S = 0.005
+"""Loading in a reset that takes less is not reported, whatever its share of short episodes: PyBullet's resetSimulation
+of an empty world alone takes half a millisecond [s]."""
+LITTLE_LOADING = 0.05
+"""Share of an episode below which loading in reset is not reported."""
+MOST_LOADING = 0.2
+"""Share of a step that loading or reading files takes from which that is a finding."""
+LEAST_DRAWING = 0.05
+"""Share of a step, or of a reset, below which drawing and waiting are not reported: a `render` that returns at
+once because there is nothing to show."""
+SMALLEST_IMAGE = 8
+"""An observation with two axes at least this long is an image, so a camera is part of the task [pixels]."""
+NAMED_CALLS = 3
+LEAST_SHARE = 0.01
+"""Calls that take less are not named among the slowest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Speed:
+    """How long steps and resets take, and what takes that long."""
+
+    step_s: float | None
+    """A step with a random action, with nothing measured but time [s]; None where none could be taken."""
+    reset_s: float | None
+    steps: int
+    """How many were timed."""
+    resets: int
+    slowest_in_step: list[TimedCall]
+    """By their own time, what they call left out; the slowest first."""
+    suspicious_in_step: list[TimedCall]
+    """Calls that step should not make, with what they call; none is inside another."""
+    suspicious_in_reset: list[TimedCall]
+    rebuilds: bool
+    """Whether it is a task of rlctl that declares that every reset loads the world anew."""
+
+
+@experiment("speed", share=1.5)
+def measure_speed(context: Context) -> Iterator[Message]:
+    """Play random episodes: first with nothing but a clock, then under a profiler."""
+    instance, seconds = context.instance, min(LONGEST_S, context.budget.seconds_left)
+    steps, resets = Stopwatch(), Stopwatch()
+    stopwatches = {"step": steps, "reset": resets}
+    deadline = read_clock() + seconds / 2
+    _play(instance, stopwatches, TIMED_STEPS, deadline)
+    _play(instance, stopwatches, TIMED_RESETS, deadline, only_reset=True)
+    profilers = {"step": cProfile.Profile(), "reset": cProfile.Profile()}
+    timers = {call: each.runcall for call, each in profilers.items()}
+    with visible_to_profilers():
+        for only_reset in (False, True):
+            deadline = read_clock() + min(seconds / 4, PROFILED_S)
+            _play(instance, timers, MOST_STEPS, deadline, only_reset=only_reset)
+    is_own = find_own_code(instance.env)
+    in_step, in_reset = (Profile(each, is_own) for each in profilers.values())
+    yield Fact(
+        "speed",
+        Speed(
+            step_s=typical(steps.seconds, BATCH),
+            reset_s=typical(resets.seconds, 1),
+            steps=len(steps.seconds),
+            resets=len(resets.seconds),
+            slowest_in_step=in_step.slowest()[:MOST_CALLS],
+            suspicious_in_step=in_step.suspicious(),
+            suspicious_in_reset=in_reset.suspicious(),
+            rebuilds=rebuilds_world(instance.env),
+        ),
+    )
+
+
+def _play(
+    instance: Instance, timers: Mapping[str, Timer], calls: int, deadline: float, *, only_reset: bool = False
+) -> None:
+    """Play random episodes for so many steps, or resets, with timers for calls of `step` and `reset`."""
+    instance.timers = timers
+    number = 0
+    try:
+        while calls > 0 and read_clock() < deadline:
+            steps = 0 if only_reset else calls
+            episode = Episode(instance, FIRST_SPEED_SEED + number, number=number, max_steps=steps, deadline=deadline)
+            for _ in episode:
+                pass
+            number += 1
+            calls -= max(1, episode.steps)
+    finally:
+        instance.timers = {}
+
+
+def typical(seconds: Sequence[float], batch: int) -> float | None:
+    """Return the median of the means of batches; those left over count only where there is no whole one."""
+    if not seconds:
+        return None
+    batch = min(batch, len(seconds))
+    starts = range(0, len(seconds) - batch + 1, batch)
+    return statistics.median(statistics.fmean(seconds[start : start + batch]) for start in starts)
+
+
+@check("RL901", "speed")
+def _find_slow_step(records: Records) -> Iterator[Finding]:
+    speed = _require_speed(records)
+    if speed.step_s is None:
+        raise NotJudged("no step could be timed")
+    named_elsewhere = _idle(records, speed, "step") + _loading(speed, "step")
+    left = speed.step_s * (1 - _share(named_elsewhere))
+    if left * SLOW_STEPS_PER_S <= 1:
+        return
+    per_s, hours = 1 / speed.step_s, MILLION * speed.step_s / 3600
+    calls = _list(speed.slowest_in_step)
+    yield Finding(
+        "RL901",
+        f"{per_s:,.3g} steps/s: a million steps take {hours:,.3g} hours per process on this machine; slowest: {calls}",
+        {"value": per_s, "expected": SLOW_STEPS_PER_S, "step_ms": 1e3 * speed.step_s, "steps": speed.steps},
+    )
+
+
+@check("RL903", "speed")
+def _find_drawing_and_waiting(records: Records) -> Iterator[Finding]:
+    speed = _require_speed(records)
+    for call, seconds in (("step", speed.step_s), ("reset", speed.reset_s)):
+        for each in _idle(records, speed, call):
+            lost = _time(each.share * seconds) if seconds else "?"
+            yield Finding(
+                "RL903",
+                f"{call} calls {each.name}{_at(each)}: {lost} per {call}, {each.share:.0%} of its time",
+                {"call": call, "value": each.name, "place": each.place, "share": each.share},
+            )
+
+
+@check("RL904", "speed", "episodes")
+def _find_loading(records: Records) -> Iterator[Finding]:
+    speed, step_s, reset_s, steps = _require_times(records)
+    for call, call_s, part, whole_s in (
+        ("reset", reset_s, "an episode", reset_s + steps * step_s),
+        ("step", step_s, "its time", step_s),
+    ):
+        calls = _loading(speed, call)
+        seconds = call_s * _share(calls)
+        share = seconds / whole_s if whole_s else 0.0
+        connects = any(each.kind == "connecting" for each in calls)
+        if calls and (connects or call == "step" or share >= LITTLE_LOADING):
+            named = sorted(calls, key=lambda each: (each.kind != "connecting", -each.share))
+            names = list_names([f"{each.name}{_at(each)}" for each in named], NAMED_CALLS)
+            yield Finding(
+                "RL904",
+                f"{call} calls {names}: {_time(seconds)} per {call}, {share:.0%} of {part}",
+                {"call": call, "value": [each.name for each in named], "ms": 1e3 * seconds, "share": share},
+            )
+
+
+def format_speed(records: Records) -> str:
+    """Return what a report says about speed in a line; empty where nothing was timed."""
+    try:
+        speed, step_s, reset_s, steps = _require_times(records)
+    except NotJudged:
+        return ""
+    episode_s = reset_s + steps * step_s
+    per_s = float(f"{steps / episode_s:.2g}")
+    calls = f"; slowest: {_list(speed.slowest_in_step)}" if speed.slowest_in_step else ""
+    return (
+        f"step {_time(step_s)}, reset {_time(reset_s)} ({reset_s / episode_s:.1%} of an episode), "
+        f"{per_s:,.{0 if per_s >= 10 else 1}f} steps/s: a million steps take {format_duration(MILLION / per_s)}{calls}"
+    )
+
+
+def episode_steps(records: Records) -> float | None:
+    """Return the mean length of an episode with random actions, or of any, cut ones only if there are no others."""
+    episodes = [each for each in records.episodes if each.steps]
+    whole = [each for each in episodes if each.has_ended] or episodes
+    random = [each for each in whole if each.actions == "random"] or whole
+    return statistics.fmean(each.steps for each in random) if random else None
+
+
+def _require_speed(records: Records) -> Speed:
+    speed: Speed = records.require_fact("speed")
+    return speed
+
+
+def _require_times(records: Records) -> tuple[Speed, float, float, float]:
+    """Return the speed, the time of a step and of a reset [s], and the steps of an episode."""
+    speed, steps = _require_speed(records), episode_steps(records)
+    if not speed.step_s or speed.reset_s is None or steps is None:
+        raise NotJudged("no step or no reset could be timed")
+    return speed, speed.step_s, speed.reset_s, steps
+
+
+def _suspicious(speed: Speed, call: str, kinds: Sequence[str]) -> list[TimedCall]:
+    calls = speed.suspicious_in_step if call == "step" else speed.suspicious_in_reset
+    return [each for each in calls if each.kind in kinds]
+
+
+def _idle(records: Records, speed: Speed, call: str) -> list[TimedCall]:
+    """Return the calls that RL903 finds."""
+    shapes = [leaf.shape for leaf in records.require_built().leaves]
+    has_image = any(sum(size >= SMALLEST_IMAGE for size in shape) >= 2 for shape in shapes)
+    kinds = ("sleeping",) if has_image else ("sleeping", "rendering")
+    return [each for each in _suspicious(speed, call, kinds) if each.share >= LEAST_DRAWING]
+
+
+def _loading(speed: Speed, call: str) -> list[TimedCall]:
+    """Return the calls that RL904 finds."""
+    if call == "reset" and speed.rebuilds:
+        return []
+    calls = _suspicious(speed, call, ("loading", "connecting"))
+    share = _share(calls)
+    seconds = share * ((speed.step_s if call == "step" else speed.reset_s) or 0.0)
+    is_much = seconds > SLOW_LOADING_S or (call == "step" and share > MOST_LOADING)
+    return calls if is_much or any(each.kind == "connecting" for each in calls) else []
+
+
+def _share(calls: Sequence[TimedCall]) -> float:
+    return min(1.0, sum(each.share for each in calls))
+
+
+def _list(calls: Sequence[TimedCall]) -> str:
+    return ", ".join(
+        f"{each.name} {each.share:.0%}{_at(each)}" for each in calls[:NAMED_CALLS] if each.share >= LEAST_SHARE
+    )
+
+
+def _at(call: TimedCall) -> str:
+    return f" ({call.place})" if call.place else ""
+
+
+def _time(seconds: float) -> str:
+    for unit, size in (("s", 1.0), ("ms", 1e-3)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds * 1e6:.3g} us"

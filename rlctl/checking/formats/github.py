@@ -1,0 +1,45 @@
+"""A report as GitHub Actions annotations: workflow commands that put findings beside the class's line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from rlctl.checking.check import Report
+from rlctl.checking.finding import Finding, Severity
+from rlctl.checking.formats.plain import summary
+
+COMMANDS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "notice"}
+
+
+def text(report: Report) -> str:
+    """Return a line per finding, and one that says what was found."""
+    place = _place(report)
+    lines = [_annotation(finding, place) for finding in report.verdict.findings]
+    lines += [f"::error title={name} crashed::a bug in rlctl" for name in report.verdict.crashed]
+    return "\n".join([*lines, summary(report)]) + "\n"
+
+
+def _annotation(finding: Finding, place: str) -> str:
+    title = _property(f"{finding.rule} {finding.name}")
+    message = _data(f"{finding.message}\nfix: {finding.fix}")
+    return f"::{COMMANDS[finding.severity]} {place}title={title}::{message}"
+
+
+def _place(report: Report) -> str:
+    """Return file and line as properties; empty for a file outside the repository, which cannot be annotated."""
+    if report.place is None:
+        return ""
+    file, line = report.place
+    root = Path(os.environ.get("GITHUB_WORKSPACE", Path.cwd())).resolve()
+    if not file.resolve().is_relative_to(root):
+        return ""
+    return f"file={_property(file.resolve().relative_to(root).as_posix())},line={line},"
+
+
+def _data(text: str) -> str:
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _data(text).replace(":", "%3A").replace(",", "%2C")

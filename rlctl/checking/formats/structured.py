@@ -1,0 +1,151 @@
+"""A report as JSON (its schema is report.schema.json), and what of observations and actions was declared and seen."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.check import Report
+from rlctl.checking.families.speed import Speed
+from rlctl.checking.finding import Finding
+from rlctl.checking.leaves import Leaf, name_leaf
+from rlctl.checking.messages import Built
+from rlctl.checking.records import Records
+from rlctl.version import __version__
+
+SCHEMA = Path(__file__).parent.parent / "report.schema.json"
+ELEMENTS_SHOWN = 8
+"""So many numbers without names get a row each; more of them share one."""
+
+
+def text(report: Report) -> str:
+    """Return a report as JSON text."""
+    return json.dumps(content(report), indent=2, allow_nan=False) + "\n"
+
+
+def content(report: Report) -> dict[str, Any]:
+    """Return a report as plain data."""
+    verdict, records = report.verdict, report.records
+    return {
+        "format": "rlctl check-env 1",
+        "rlctl": __version__,
+        "task": report.task,
+        "exit_code": report.exit_code,
+        "strict": report.strict,
+        "findings": [finding_json(each) for each in verdict.findings],
+        "waived": [
+            {**finding_json(each), "reason": records.built.waivers[each.rule] if records.built else ""}
+            for each in verdict.waived
+        ],
+        "judged": verdict.judged,
+        "not_judged": [{"what": rule, "reason": why} for rule, why in verdict.not_judged.items()],
+        "not_applicable": [{"rule": rule, "reason": why} for rule, why in verdict.not_applicable.items()],
+        "crashed": [{"what": name, "traceback": trace} for name, trace in verdict.crashed.items()],
+        "environment": _environment(report),
+        "speed": _speed(report),
+        "episodes": len(records.episodes),
+        "steps": sum(each.steps for each in records.trajectories),
+        "seconds": report.seconds,
+        "budget_seconds": report.budget_s,
+        "experiments": {name: each.seconds for name, each in records.finished.items()},
+    }
+
+
+def finding_json(finding: Finding) -> dict[str, Any]:
+    """Return a finding as plain data."""
+    return {
+        "rule": finding.rule,
+        "name": finding.name,
+        "severity": str(finding.severity),
+        "message": finding.message,
+        "evidence": plain(finding.evidence),
+        "fix": finding.fix,
+    }
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: infinity and NaN become text."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, dict):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(each) for each in value]
+    return value
+
+
+def _environment(report: Report) -> dict[str, Any] | None:
+    built = report.records.built
+    if built is None:
+        return None
+    return {
+        "observation_space": built.observation_space,
+        "action_space": built.action_space,
+        "observations": [plain(dataclasses.asdict(row)) for row in observation_rows(report.records)],
+        "actions": [plain(dataclasses.asdict(row)) for row in action_rows(report.records)],
+        "max_steps": built.max_steps,
+        "randomized": any(built.events.values()),
+        "uses_pybullet": built.uses_pybullet,
+        "file": built.file,
+        "line": built.line,
+    }
+
+
+def _speed(report: Report) -> Any:
+    """What one process does; null where no step could be timed."""
+    speed: Speed | None = report.records.facts.get("speed")
+    if speed is None or speed.step_s is None:
+        return None
+    return plain({**dataclasses.asdict(speed), "steps_per_second": 1 / speed.step_s})
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A part of an observation or an action that has a name."""
+
+    name: str
+    size: int
+    low: float
+    """The lowest declared bound of its numbers."""
+    high: float
+    observed: tuple[float, float] | None = None
+    """Smallest and largest value that occurred; None where none was recorded."""
+
+
+def observation_rows(records: Records) -> list[Row]:
+    """Return the parts of the observation, in order."""
+    built, rows = records.built, []
+    for index, leaf in enumerate(built.leaves if built else ()):
+        if built is not None and leaf.supported and 0 not in leaf.shape:
+            values = [each.observations[index].values for each in records.alone if index in each.observations]
+            flat = [each.reshape(len(each), -1).astype(np.float64) for each in values if each.size]
+            rows += [_row(name, leaf, part, flat) for name, part in _parts(built, leaf).items()]
+    return rows
+
+
+def action_rows(records: Records) -> list[Row]:
+    """Return the parts of the action, in order, without the values that were played: a learner plays others."""
+    leaves = records.built.action_leaves if records.built else []
+    named = [(name_leaf(leaf, "action"), leaf) for leaf in leaves if leaf.supported and 0 not in leaf.shape]
+    return [_row(name, leaf, slice(None), []) for name, leaf in named]
+
+
+def _parts(built: Built, leaf: Leaf) -> dict[str, slice]:
+    size = int(np.prod(leaf.shape))
+    if leaf.path or not leaf.shape or size > ELEMENTS_SHOWN:
+        return built.parts or {name_leaf(leaf): slice(0, size)}
+    return built.parts or {built.element(0, i): slice(i, i + 1) for i in range(size)}
+
+
+def _row(name: str, leaf: Leaf, part: slice, values: list[NDArray[np.float64]]) -> Row:
+    low, high = (np.ravel(np.asarray(bound, np.float64))[part] for bound in (leaf.low, leaf.high))
+    with np.errstate(invalid="ignore"):
+        smallest, largest = ([float(function(each[:, part])) for each in values] for function in (np.min, np.max))
+    observed = (float(np.min(smallest)), float(np.max(largest))) if values else None
+    return Row(name, low.size, float(low.min()), float(high.max()), observed)

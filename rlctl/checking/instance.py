@@ -1,0 +1,193 @@
+"""Instances of an environment that is not trusted: how they are called, and what an experiment may use."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import inspect
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Literal
+
+from rlctl.checking.clock import read_clock
+from rlctl.checking.failures import EnvironmentRaised, describe, describe_failure
+from rlctl.checking.leaves import find_leaves
+from rlctl.checking.messages import Failure
+from rlctl.checking.progress import Progress
+from rlctl.environments import registry
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import TaskError
+
+Timer = Callable[..., Any]
+"""Calls a function, its first argument, with the other arguments, and returns what it returns."""
+
+MOST_FAILURES = 3
+"""After so many episodes that raise no other is played for the same purpose."""
+
+
+@dataclasses.dataclass
+class Budget:
+    """What the episodes of an experiment may use together."""
+
+    deadline: float
+    """On `read_clock`'s clock [s]."""
+    bytes_left: int = 48 * 2**20
+    failures: int = 0
+
+    @property
+    def seconds_left(self) -> float:
+        return self.deadline - read_clock()
+
+    @property
+    def why_spent(self) -> str:
+        """What there is no more of; empty while there is some of everything."""
+        if self.failures >= MOST_FAILURES:
+            return f"{self.failures} of them raised"
+        return "time was over" if self.seconds_left <= 0 else "memory was over" if self.bytes_left <= 0 else ""
+
+    def end_within(self, seconds: float) -> float:
+        """Return when something that may take so long ends at the latest, on the same clock [s]."""
+        return min(read_clock() + seconds, self.deadline)
+
+
+class Instance:
+    """One environment, and how it is called."""
+
+    def __init__(self, env: Any, progress: Progress) -> None:
+        """Raises `TaskError` where its observation space cannot be read."""
+        try:
+            self.leaves = find_leaves(getattr(env, "observation_space", None))
+        except Exception as error:
+            raise TaskError(f"observation_space raises {describe(error)}") from error
+        self.env = env
+        self.action_leaves = find_leaves(getattr(env, "action_space", None))
+        self.accepts_seed, self.accepts_options = (_accepts(env, name) for name in ("seed", "options"))
+        self.progress = progress
+        self.timers: Mapping[str, Timer] = {}
+        """What calls the environment's functions, by their names, while they are timed."""
+
+    @property
+    def is_env(self) -> bool:
+        """Whether it inherits from `gymnasium.Env`."""
+        import gymnasium
+
+        return isinstance(self.env, gymnasium.Env)
+
+    @property
+    def can_act(self) -> bool:
+        """Whether its action space is one of Gymnasium's, from which actions can be drawn."""
+        from gymnasium import spaces
+
+        return isinstance(self.env.action_space, spaces.Space)
+
+    def call(self, name: str, function: Any, *arguments: Any, step: int = 0, **keywords: Any) -> Any:
+        """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`."""
+        self.progress.enter(name, step)
+        try:
+            if timer := self.timers.get(name):
+                return timer(function, *arguments, **keywords)
+            return function(*arguments, **keywords)
+        except BaseException as error:
+            raise EnvironmentRaised(name) from error
+        finally:
+            self.progress.leave()
+
+    def reset(self, seed: int, episode: int = 0) -> Any:
+        """Reset with a seed, where reset takes one, and return what it returns."""
+        self.progress.episode(episode, seed)
+        keywords = {"seed": seed} if self.accepts_seed else {}
+        return self.call("reset", self.env.reset, **keywords)
+
+    def close(self) -> None:
+        """Close the environment, where it can be."""
+        self.call("close", getattr(self.env, "close", lambda: None))
+
+
+class Context:
+    """One child process's view of the environment."""
+
+    def __init__(self, spec: EnvSpec, progress: Progress | None = None) -> None:
+        self.spec = spec
+        self.progress = progress or Progress()
+        self.budget = Budget(read_clock())
+        """What the experiment that is running may use."""
+        self._instance: Instance | None = None
+
+    def build(self, render_mode: Literal["rgb_array"] | None = None) -> Instance:
+        """Return a new instance; what its import or constructor raises is an `EnvironmentRaised`."""
+        try:
+            # Loaded before it is built, to distinguish an import error from a constructor's.
+            self.progress.enter("load")
+            registry.load(self.spec.task)
+            self.progress.enter("build")
+            env = self.spec.make(render_mode)
+            self.progress.leave()
+            return Instance(env, self.progress)
+        except BaseException as error:
+            raise EnvironmentRaised("build") from error
+
+    @property
+    def instance(self) -> Instance:
+        """The instance that this process keeps; built by its first use."""
+        if self._instance is None:
+            self._instance = self.build()
+        return self._instance
+
+    @property
+    def is_built(self) -> bool:
+        """Whether this process keeps an instance."""
+        return self._instance is not None
+
+    @contextlib.contextmanager
+    def fresh(self, render_mode: Literal["rgb_array"] | None = None) -> Iterator[Instance]:
+        """A new instance for one experiment, closed after it; what its close raises is not this experiment's matter."""
+        instance = self.build(render_mode)
+        try:
+            yield instance
+        finally:
+            with contextlib.suppress(EnvironmentRaised):
+                instance.close()
+
+    def close(self, instance: Instance | None = None) -> Iterator[Failure]:
+        """Close an instance, by default the one that this process keeps; yield what it raised."""
+        if instance is None:
+            self.progress.phase("close")
+            instance = self._instance
+        try:
+            if instance is not None:
+                instance.close()
+        except EnvironmentRaised as error:
+            yield describe_failure(error, self.progress)
+
+
+def _accepts(env: Any, name: str) -> bool:
+    """Say whether reset has a parameter of that name."""
+    try:
+        parameters = inspect.signature(env.reset).parameters.values()
+    except ValueError:  # not written in Python
+        return True
+    return any(each.name == name or each.kind is each.VAR_KEYWORD for each in parameters)
+
+
+def find_author(env: Any) -> Any:
+    """Return the object whose class the environment's author wrote: not rlctl's environment of a task, but the task."""
+    inner = getattr(env, "unwrapped", env)
+    return inner.task if is_task(env) else inner
+
+
+def is_task(env: Any) -> bool:
+    """Say whether it is an environment of a task of rlctl."""
+    task_env = sys.modules.get("rlctl.task.env")
+    return task_env is not None and isinstance(getattr(env, "unwrapped", env), task_env.TaskEnv)
+
+
+def find_longest_episode(env: Any) -> int | None:
+    """Return after how many steps an environment says that its episodes end; None where it does not."""
+    from rlctl.environments.time_limit import find_time_limit
+
+    return int(env.unwrapped.max_steps) if is_task(env) else find_time_limit(env)
+
+
+def rebuilds_world(env: Any) -> bool:
+    """Say whether it is a task that declares that every reset loads the world anew."""
+    return is_task(env) and not find_author(env).fast_reset

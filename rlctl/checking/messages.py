@@ -1,0 +1,282 @@
+"""What the experiments of a child process send: recorded episodes, failures, findings, and what could not be judged.
+
+Dataclasses are sent as JSON, arrays as bytes behind it; nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.finding import Finding
+from rlctl.checking.leaves import Leaf, name_element
+
+FIRST_SEED = 1000
+SECOND_SEED = 1001
+
+MOST_INFOS = 100
+"""So many numbers of info are recorded per episode, by name."""
+_PACKAGE = __name__.rpartition(".")[0]
+ENDS = ("terminated", "truncated", "both")
+
+
+@dataclasses.dataclass(frozen=True)
+class Built:
+    """The environment that was built: its spaces and what it says about itself."""
+
+    leaves: list[Leaf]
+    """The observation space, taken apart into arrays."""
+    action_leaves: list[Leaf]
+    observation_space: str
+    action_space: str
+    names: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """Size per observation name in the order of a flat observation; empty where names are not known."""
+    events: Mapping[str, bool] = dataclasses.field(default_factory=dict)
+    """Per event of a task, whether it acts."""
+    max_steps: int | None = None
+    """The time limit it declares [steps]."""
+    nondeterministic: bool = False
+    """Whether its Gymnasium registration says that equal seeds may give unequal episodes."""
+    truncation: str = "unknown"
+    """What the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
+    accepts_seed: bool = True
+    accepts_options: bool = True
+    uses_pybullet: bool = False
+    """Whether a PyBullet client was connected once it was built."""
+    waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Per rule that its class waives, the reason."""
+    file: str | None = None
+    """Where its class is written."""
+    line: int | None = None
+
+    @property
+    def parts(self) -> dict[str, slice]:
+        """The parts of a flat observation by name; empty where names are not known."""
+        ends = list(itertools.accumulate(self.names.values()))
+        if len(self.leaves) != 1 or not ends or ends[-1] != int(np.prod(self.leaves[0].shape)):
+            return {}
+        return {name: slice(end - size, end) for (name, size), end in zip(self.names.items(), ends, strict=True)}
+
+    def element(self, leaf: int, index: int) -> str:
+        """Name one number of an observation by the place of its array and its flat index."""
+        for name, part in self.parts.items():
+            if index < part.stop:
+                return name if part.stop - part.start == 1 else f"{name}[{index - part.start}]"
+        return name_element(self.leaves[leaf], index)
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """The values of one leaf of the observation: those that have the leaf's shape."""
+
+    steps: NDArray[np.int64]
+    """Which observation each row is; 0 is the one of `reset`. Shape (n,)."""
+    values: NDArray[Any]
+    """Shape (n, *leaf.shape)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Form:
+    """A type that something had: where it came first, and how often."""
+
+    what: str
+    """`observation`, `memory`, `keys`, `reward`, `terminated`, `truncated`, `info`, `reset` or `step`."""
+    type: str
+    step: int
+    count: int
+    leaf: int | None = None
+    dtype: str | None = None
+    shape: tuple[int, ...] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """One episode of T steps, or the part of it that was played."""
+
+    role: str
+    """What it was recorded for: `episodes`, or the name of a comparison."""
+    episode: int
+    seed: int
+    actions: str
+    """How actions were chosen: `random`, `zero` or `extreme`."""
+    ended: str
+    """`terminated`, `truncated`, `both`, `raised`, or what cut it: `steps`, `time`, `memory`."""
+    observations: dict[int, Series]
+    """Per leaf."""
+    rewards: NDArray[np.float64]
+    """Shape (T,); NaN where it was no number."""
+    reward_is_number: NDArray[np.bool_]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    infos: Mapping[str, Series]
+    """Numbers in info, by name; those in a dictionary of info as `reward_terms/distance`. Values have shape (n,)."""
+    forms: list[Form]
+
+    @property
+    def steps(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def has_ended(self) -> bool:
+        return self.ended in ENDS
+
+    def at(self, step: int, **more: Any) -> dict[str, Any]:
+        """Return where a step is, and more, as a finding's evidence."""
+        return {"seed": self.seed, "episode": self.episode, "actions": self.actions, "step": step, **more}
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """A call into the environment that raised, never came back, or ended the process."""
+
+    kind: str
+    """`raised`, `hung` or `died`."""
+    call: str
+    """`load`, `build`, `reset`, `step`, `close`, `sample`, `render` or `compute_reward`."""
+    phase: str
+    """The experiment, or the part of one."""
+    episode: int
+    seed: int
+    step: int
+    error: str
+    details: str | None = None
+    """A traceback, or the last lines that a dying process printed."""
+    file: Mapping[str, Any] | None = None
+    """A file that was not found: its name, and the folders that were searched."""
+    process: str = ""
+    """Which child process: `probe` or `instances`."""
+
+    @property
+    def in_call(self) -> str:
+        """The call, in words for a message: `step 7`, `reset`, `the constructor`."""
+        names = {"step": f"step {self.step}", "load": "the import", "build": "the constructor"}
+        return names.get(self.call, self.call)
+
+    @property
+    def message(self) -> str:
+        """What happened, in words."""
+        if self.kind == "raised":
+            return f"{self.in_call} raised {self.error}"
+        return f"{self.in_call} {self.error}" if self.kind == "hung" else f"the process {self.error} in {self.in_call}"
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """Where it was, as a finding's evidence."""
+        place = {"call": self.call, "seed": self.seed, "episode": self.episode, "step": self.step}
+        if self.details:
+            place["traceback" if self.kind == "raised" else "last_output"] = self.details
+        return place
+
+
+@dataclasses.dataclass(frozen=True)
+class Fact:
+    """What an experiment has found out for checks of the parent."""
+
+    experiment: str
+    value: Any
+    """What JSON can hold, or a dataclass of this package."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Skipped:
+    """An experiment, a role of one, or a rule that cannot be judged, and why."""
+
+    name: str
+    reason: str
+    applies: bool = True
+    """False where this kind of environment does not have what the rule is about."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Finished:
+    """An experiment has come to its end: by itself, by what the environment raised, or by a bug."""
+
+    experiment: str
+    seconds: float
+    is_complete: bool
+    crash: str = ""
+    """The traceback of a bug of the experiment."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Mistake:
+    """The user named a task or a parameter that does not exist."""
+
+    message: str
+
+
+@dataclasses.dataclass(frozen=True)
+class End:
+    """The process has done all it was asked for."""
+
+
+Message = Built | Trajectory | Failure | Finding | Fact | Skipped | Finished | Mistake | End
+
+
+def encode(message: Any) -> bytes:
+    """Return a dataclass of this package as bytes; it may hold others, arrays, and what JSON can hold."""
+    arrays: list[NDArray[Any]] = []
+    plain = _to_plain(message, arrays)
+    header = json.dumps([plain, [[each.dtype.str, each.shape] for each in arrays]]).encode()
+    return b"\n".join([header, b"".join(each.tobytes() for each in arrays)])
+
+
+def decode(content: bytes) -> Any:
+    """Return the dataclass that `encode` was given."""
+    start = content.index(b"\n") + 1  # JSON has none
+    plain, forms = json.loads(content[:start])
+    arrays = []
+    for kind, shape in forms:
+        array = np.frombuffer(content, kind, math.prod(shape), start).reshape(shape)
+        arrays.append(array.copy())  # its own memory, which can be written
+        start += array.nbytes
+    return _from_plain(plain, arrays)
+
+
+def _to_plain(value: Any, arrays: list[NDArray[Any]]) -> Any:
+    if isinstance(value, np.ndarray):
+        if value.dtype.hasobject:
+            raise TypeError(f"an array of {value.dtype} cannot be sent")
+        arrays.append(value)
+        return {"array": len(arrays) - 1}
+    if dataclasses.is_dataclass(value):
+        fields = {field.name: _to_plain(getattr(value, field.name), arrays) for field in dataclasses.fields(value)}
+        return {"class": f"{type(value).__module__}:{type(value).__name__}", "fields": fields}
+    if isinstance(value, dict):  # its keys may be numbers
+        return {"dict": [[key, _to_plain(each, arrays)] for key, each in value.items()]}
+    if isinstance(value, tuple):
+        return {"tuple": [_to_plain(each, arrays) for each in value]}
+    if isinstance(value, list):
+        return [_to_plain(each, arrays) for each in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _from_plain(value: Any, arrays: Sequence[NDArray[Any]]) -> Any:
+    if isinstance(value, list):
+        return [_from_plain(each, arrays) for each in value]
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        return arrays[value["array"]]
+    if "dict" in value:
+        return {key: _from_plain(each, arrays) for key, each in value["dict"]}
+    if "tuple" in value:
+        return tuple(_from_plain(each, arrays) for each in value["tuple"])
+    return _class(value["class"])(**{name: _from_plain(each, arrays) for name, each in value["fields"].items()})
+
+
+def _class(name: str) -> type:
+    """Return a dataclass of this package: what a child process names is not trusted further than that."""
+    module, _, name = name.partition(":")
+    found = getattr(importlib.import_module(module), name, None) if module.startswith(f"{_PACKAGE}.") else None
+    if not (isinstance(found, type) and dataclasses.is_dataclass(found)):
+        raise ValueError(f"{module}:{name} is not a dataclass of {_PACKAGE}")
+    return found

@@ -1,0 +1,180 @@
+"""Writes an episode down: everything that an environment that is not trusted returns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.episode import Episode, Moment
+from rlctl.checking.failures import EnvironmentRaised, describe_failure
+from rlctl.checking.instance import Budget
+from rlctl.checking.leaves import Leaf, find_numbers, name_type, pick
+from rlctl.checking.messages import MOST_INFOS, Failure, Form, Series, Trajectory
+
+
+class Recording:
+    """An episode that is written down while it is played: `advance` while `running`, or `run`."""
+
+    def __init__(self, role: str, episode: Episode, budget: Budget) -> None:
+        """`role` is what it is recorded for; `budget` is charged with its memory."""
+        self.role = role
+        self.episode = episode
+        self.budget = budget
+        self.failure: Failure | None = None
+        self._moments = iter(episode)
+        self._ended = ""
+        self._step = 0
+        self._rewards: list[float] = []
+        self._values: dict[int, tuple[list[int], list[Any]]] = {}
+        self._is_number: list[bool] = []
+        self._flags: list[tuple[bool, bool]] = []
+        self._forms: dict[tuple[Any, ...], list[int]] = {}
+        self._infos: dict[str, tuple[list[int], list[float]]] = {}
+        self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
+
+    def run(self) -> list[Trajectory | Failure]:
+        """Play the episode to its end; return what to send."""
+        while self.running:
+            self.advance()
+        return self.messages()
+
+    def advance(self) -> None:
+        """Begin the episode, or take its next step."""
+        try:
+            moment = next(self._moments)
+        except EnvironmentRaised as error:
+            self._ended = "raised"
+            self.failure = describe_failure(error, self.episode.instance.progress)
+            self.budget.failures += 1
+            return
+        self.budget.bytes_left -= self._add(moment)
+        self._ended = self.episode.ended or ("memory" if self.budget.bytes_left <= 0 and moment.step else "")
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not begun, or there is another step to take."""
+        return not self._ended
+
+    @property
+    def steps(self) -> int:
+        """How many steps were taken."""
+        return len(self._rewards)
+
+    @property
+    def was_cut(self) -> bool:
+        """Whether the episode was left before its end, for steps or time."""
+        return self._ended in ("steps", "time")
+
+    def messages(self) -> list[Trajectory | Failure]:
+        """Return what to send: the trajectory, and the failure that ended it, if one did."""
+        return [self.trajectory, *([self.failure] if self.failure else [])]
+
+    def _add(self, moment: Moment) -> int:
+        """Write down what a call returned; return how much memory that takes [bytes]."""
+        self._step = moment.step
+        if moment.form:
+            self._count_form("step" if moment.step else "reset", moment.form)
+        if not moment.is_readable:
+            return 0
+        if moment.step:
+            self._count_form("terminated", name_type(moment.terminated))
+            self._count_form("truncated", name_type(moment.truncated))
+            self._flags.append(moment.flags)
+            self._add_reward(moment.reward)
+        self._add_info(moment.info)
+        return self._add_observation(moment.observation)
+
+    def _count_form(self, what: str, type_name: str, *more: Any) -> None:
+        form = self._forms.setdefault((what, type_name, *more), [self._step, 0])
+        form[1] += 1
+
+    def _add_info(self, info: Any) -> None:
+        self._count_form("info", name_type(info))
+        if isinstance(info, dict):
+            for name, value in find_numbers(info):
+                if name in self._infos or len(self._infos) < MOST_INFOS:
+                    steps, values = self._infos.setdefault(name, ([], []))
+                    steps.append(self._step)
+                    values.append(value)
+
+    def _add_reward(self, reward: Any) -> None:
+        self._count_form("reward", name_type(reward))
+        try:
+            self._rewards.append(float(reward))
+            self._is_number.append(True)
+        except Exception:  # its type is noted, and is a finding
+            self._rewards.append(float("nan"))
+            self._is_number.append(False)
+
+    def _add_observation(self, observation: Any) -> int:
+        size = 0
+        for index, leaf in enumerate(self.episode.instance.leaves):
+            try:
+                value = pick(observation, leaf.path)
+            except (LookupError, TypeError):
+                self._count_form("observation", "missing", index, None, None)
+                continue
+            if leaf.supported:
+                size += self._add_leaf(index, leaf, value)
+        keys = {leaf.path[0] for leaf in self.episode.instance.leaves if leaf.path}
+        if isinstance(observation, dict) and keys and observation.keys() != keys:
+            self._count_form("keys", ", ".join(sorted(map(str, observation))))
+        return size
+
+    def _add_leaf(self, index: int, leaf: Leaf, value: Any) -> int:
+        try:
+            array = np.array(value)  # a copy: an environment may write into what it returned
+        except Exception:  # a ragged list, or an object of its own kind; its type is noted, and is a finding
+            self._count_form("observation", name_type(value), index, None, None)
+            return 0
+        self._count_form("observation", name_type(value), index, array.dtype, array.shape)
+        self._compare_memory(index, value, array)
+        if array.shape != leaf.shape or array.dtype.kind not in "biuf":
+            return 0
+        steps, values = self._values.setdefault(index, ([], []))
+        steps.append(self._step)
+        values.append(array)
+        return array.nbytes + 100
+
+    def _compare_memory(self, index: int, value: Any, copy: NDArray[Any]) -> None:
+        """Note an observation that a later step has changed: both are one memory."""
+        if not isinstance(value, np.ndarray) or not value.shape:
+            return
+        earlier = self._previous.get(index)
+        if earlier is not None and np.shares_memory(earlier[0], value) and not np.array_equal(*earlier, equal_nan=True):
+            self._count_form("memory", "shared", index)
+        self._previous[index] = value, copy
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """What was written down."""
+        names = ("what", "type", "leaf", "dtype", "shape")
+        return Trajectory(
+            role=self.role,
+            episode=self.episode.number,
+            seed=self.episode.seed,
+            actions=self.episode.actions,
+            ended=self._ended or "steps",
+            observations={
+                index: Series(np.array(steps, np.int64), np.stack(values))
+                for index, (steps, values) in self._values.items()
+            },
+            rewards=np.array(self._rewards, np.float64),
+            reward_is_number=np.array(self._is_number, np.bool_),
+            terminated=np.array([flag for flag, _ in self._flags], np.bool_),
+            truncated=np.array([flag for _, flag in self._flags], np.bool_),
+            infos={
+                name: Series(np.array(steps, np.int64), np.array(values, np.float64))
+                for name, (steps, values) in self._infos.items()
+            },
+            forms=[
+                Form(**dict(zip(names, map(_plain, key), strict=False)), step=step, count=count)
+                for key, (step, count) in self._forms.items()
+            ],
+        )
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, np.dtype) else value

@@ -1,0 +1,113 @@
+"""Everything that is known about one environment: what the child processes have sent. No environment code runs here."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from rlctl.checking.finding import Finding, NotJudged
+from rlctl.checking.messages import Built, Fact, Failure, Finished, Form, Message, Series, Skipped, Trajectory
+
+OTHERS_MATTER = ("interleaved", "interleaved second", "after close")
+"""Roles of episodes beside another instance: rules of their own judge them."""
+
+
+@dataclasses.dataclass
+class Records:
+    """Everything known about one environment; what the checks of the parent process read."""
+
+    task: str
+    built: Built | None = None
+    trajectories: list[Trajectory] = dataclasses.field(default_factory=list)
+    failures: list[Failure] = dataclasses.field(default_factory=list)
+    findings: list[Finding] = dataclasses.field(default_factory=list)
+    """Those of the experiments."""
+    facts: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """By the name of the experiment that found it out."""
+    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Experiments, roles and rules that were left out, and why."""
+    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Rules that an experiment found nothing to look at for, and why."""
+    finished: dict[str, Finished] = dataclasses.field(default_factory=dict)
+    """Per experiment that was run and did not end its process."""
+    normalizes_rewards: Callable[[], bool] = lambda: False
+    """Says whether there is a packaged recipe, and it normalises rewards."""
+    printed_lines: int = 0
+    """Lines that the environment of the first process wrote to stdout."""
+    printed_first: str = ""
+
+    def add(self, message: Message) -> None:
+        """Take in one message of a child process."""
+        match message:
+            case Built():
+                self.built = message
+            case Trajectory():
+                self.trajectories.append(message)
+            case Failure():
+                self.failures.append(message)
+            case Finding():
+                self.findings.append(message)
+            case Fact():
+                self.facts[message.experiment] = message.value
+            case Skipped():
+                (self.skipped if message.applies else self.not_applicable)[message.name] = message.reason
+            case Finished():
+                self.finished[message.experiment] = message
+
+    def role(self, role: str) -> list[Trajectory]:
+        """Return what was recorded for one purpose."""
+        return [each for each in self.trajectories if each.role == role]
+
+    @property
+    def episodes(self) -> list[Trajectory]:
+        """Return the whole episodes of the first process."""
+        return self.role("episodes")
+
+    def require_built(self) -> Built:
+        """Return the environment that was built; raises `NotJudged` if there is none."""
+        if self.built is None:
+            raise NotJudged("no instance could be built")
+        return self.built
+
+    @property
+    def alone(self) -> list[Trajectory]:
+        """Return all episodes of instances that were alone in their process and used as a learner uses them."""
+        return [each for each in self.trajectories if each.role not in OTHERS_MATTER]
+
+    def require_alone(self) -> list[Trajectory]:
+        """Return the same; raises `NotJudged` if there is none."""
+        found = self.alone
+        if not any(each.steps or each.observations for each in found):
+            raise NotJudged("no episode was recorded")
+        return found
+
+    def forms(self, what: str) -> list[tuple[Trajectory, Form]]:
+        """Return every type that something had in the same episodes."""
+        return [(each, form) for each in self.require_alone() for form in each.forms if form.what == what]
+
+    def series(self, leaf: int) -> list[tuple[Trajectory, Series]]:
+        """Return the values of a leaf of the observation in the same episodes, where there are any."""
+        return [(each, each.observations[leaf]) for each in self.require_alone() if leaf in each.observations]
+
+    def require_role(self, role: str) -> Trajectory:
+        """Return the episode of a comparison; raises `NotJudged` if there is none."""
+        found = self.role(role)
+        if not found:
+            raise NotJudged(self.skipped.get(role, f"the comparison {role!r} could not be made"))
+        return found[0]
+
+    def require_fact(self, experiment: str) -> Any:
+        """Return what an experiment found out; raises `NotJudged` with the reason where it did not."""
+        if experiment not in self.facts:
+            raise NotJudged(self.why_missing(experiment))
+        return self.facts[experiment]
+
+    def why_missing(self, experiment: str) -> str:
+        """Return why an experiment has not come to its end."""
+        if experiment in self.skipped:
+            return self.skipped[experiment]
+        failed = [failure for failure in self.failures if failure.phase == experiment]
+        if failed:
+            return f"the environment failed in {failed[0].call} during this experiment: {failed[0].error}"
+        return f"the process ended before the experiment {experiment!r}"

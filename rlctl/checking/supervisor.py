@@ -1,0 +1,209 @@
+"""Starts the child processes, two at a time, and passes on what they send; deaths and hangs become failures.
+
+What a process had left to do when it died or hung is done in another one, so that most rules are judged even then.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.connection import Connection, wait
+
+from rlctl.checking import families
+from rlctl.checking.clock import read_clock_of
+from rlctl.checking.messages import Built, End, Failure, Finished, Message, Mistake, decode
+from rlctl.checking.progress import Position, Progress
+from rlctl.environments.spec import EnvSpec
+from rlctl.processes.child_process import ChildProcess, LineReader, anonymous_file
+
+AT_ONCE = 2
+BUILD_TIMEOUT_S = 60.0
+"""How long importing and building may take, unless a step may take longer."""
+FIRST_CALL_TIMEOUT_S = 30.0
+"""How long the first reset and the first step of a process may take, where much is compiled or loaded [s]."""
+IDLE_TIMEOUT_S = 300.0
+"""How long a child may do nothing with the environment: loading libraries on a busy machine, at the worst."""
+_POLL_S = 0.1
+_KEPT_LINES = 8
+_PYBULLETS = ("pybullet build time", "argv[")
+"""Lines that PyBullet prints when it is imported and when it connects."""
+
+
+class Child:
+    """A process of the check, watched."""
+
+    def __init__(self, name: str, spec: EnvSpec, experiments: Sequence[str], seconds: float) -> None:
+        self.name = name
+        self.experiments = list(experiments)
+        """Those that it has not finished; the first is running."""
+        self.has_finished_one = False
+        self.printed = 0
+        """Lines that were written to stdout."""
+        self.first_line = ""
+        self.last_lines: deque[str] = deque(maxlen=_KEPT_LINES)
+        self._memory = anonymous_file()
+        self._progress = Progress(self._memory)
+        self._readers = LineReader(self._count), LineReader(self._keep)
+        arguments = {
+            "process": name,
+            "spec": dataclasses.asdict(spec),
+            "experiments": self.experiments,
+            "seconds": seconds,
+            "memory": self._memory,
+        }
+        self.process = ChildProcess(
+            "rlctl.checking.child:main",
+            arguments,
+            stdout=self._readers[0].descriptor,
+            stderr=self._readers[1].descriptor,
+            pass_fds=[self._memory],
+            env={"PYTHONHASHSEED": str(families.PROCESSES[name].hash_seed)},
+        )
+        for reader in self._readers:
+            reader.close_descriptor()
+        self._changed = (-1, self._clock)
+
+    def _count(self, line: str) -> None:
+        if line and not line.startswith(_PYBULLETS):
+            self.printed += 1
+            self.first_line = self.first_line or line
+        self._keep(line)
+
+    def _keep(self, line: str) -> None:
+        if line and not line.startswith(_PYBULLETS):
+            self.last_lines.append(line)
+
+    @property
+    def position(self) -> Position:
+        """Where it is."""
+        return self._progress.read()
+
+    def hangs(self, env_timeout_s: float) -> str | None:
+        """Say so if the call that the child is in takes longer than it may."""
+        position = self.position
+        if position.counter != self._changed[0]:
+            self._changed = (position.counter, self._clock)
+        limit_s = _limit_s(position, env_timeout_s)
+        return f"did not come back in {limit_s:g} s" if self._clock - self._changed[1] > limit_s else None
+
+    @property
+    def _clock(self) -> float:
+        return read_clock_of(self.process.process.pid)
+
+    def fail(self, kind: str, error: str) -> Failure:
+        """Return the failure that ends it."""
+        at, details = self.position, "\n".join(self.last_lines)
+        call = at.call or "between calls"
+        return Failure(kind, call, at.phase, at.episode, at.seed, at.step, error, details or None, process=self.name)
+
+    def describe_end(self) -> str:
+        """Wait for its end, after its connection closed, and for the last it has printed; return how it ended."""
+        how = self.process.describe_end()
+        self._wait_for_lines()
+        return how
+
+    def _wait_for_lines(self) -> None:
+        for reader in self._readers:
+            reader.wait()
+
+    def close(self, grace_s: float = 0.0) -> None:
+        """End it, and what it has started. A second call does nothing."""
+        if self._memory < 0:
+            return
+        self.process.close(grace_s)
+        self._wait_for_lines()
+        os.close(self._memory)
+        self._memory = -1
+
+
+def _limit_s(position: Position, env_timeout_s: float) -> float:
+    call = position.call
+    if position.is_first and call in ("reset", "step"):
+        return max(FIRST_CALL_TIMEOUT_S, env_timeout_s)
+    if call in ("load", "build"):
+        return max(BUILD_TIMEOUT_S, env_timeout_s)
+    return env_timeout_s if call else IDLE_TIMEOUT_S
+
+
+class Supervisor:
+    """The child processes of one check."""
+
+    def __init__(
+        self, spec: EnvSpec, budget_s: float, env_timeout_s: float, receive: Callable[[Message], None]
+    ) -> None:
+        self._spec = spec
+        self._budget_s = budget_s
+        self._env_timeout_s = env_timeout_s
+        self._receive = receive
+        self._waiting: dict[str, list[str]] = {}
+        self._active: dict[Connection, Child] = {}
+        self._has_built = False
+        self._started_again: set[str] = set()
+        self.children: list[Child] = []
+        """Those that were started, the first process first."""
+
+    def run(self, experiments: Mapping[str, Sequence[str]], on_poll: Callable[[Position], None]) -> None:
+        """Run each process with some experiments, and come back when all are done, dead or ended."""
+        self._waiting = {process: list(names) for process, names in experiments.items()}
+        self._start()
+        while self._active:
+            for ready in wait(list(self._active), timeout=_POLL_S):
+                self._read(self._active[ready])  # type: ignore[index]
+            for child in list(self._active.values()):
+                if child.process.connection in self._active:  # not ended because of another
+                    self._check(child)
+            self._start()
+            if self._active:
+                on_poll(next(iter(self._active.values())).position)
+
+    def close(self) -> None:
+        """End what still runs."""
+        for child in self.children:
+            child.close()
+
+    def _start(self) -> None:
+        while self._waiting and len(self._active) < (AT_ONCE if self._has_built else 1):
+            name = next(iter(self._waiting))
+            child = Child(name, self._spec, self._waiting.pop(name), self._budget_s)
+            self.children.append(child)
+            self._active[child.process.connection] = child
+
+    def _read(self, child: Child) -> None:
+        try:
+            message = decode(child.process.connection.recv_bytes())
+        except (EOFError, OSError):
+            self._end(child, child.fail("died", child.describe_end()))
+            return
+        if isinstance(message, End):
+            self._end(child, grace_s=1.0)
+            return
+        if isinstance(message, Built):
+            self._has_built = True
+        if isinstance(message, Mistake):
+            self._waiting.clear()
+        if isinstance(message, Finished):
+            child.experiments.remove(message.experiment)
+            child.has_finished_one = True
+        self._receive(message)
+
+    def _check(self, child: Child) -> None:
+        if why := child.hangs(self._env_timeout_s):
+            self._end(child, child.fail("hung", why))
+
+    def _end(self, child: Child, failure: Failure | None = None, grace_s: float = 0.0) -> None:
+        if failure is not None:
+            self._receive(failure)
+            self._start_again(child)
+        if not self._has_built:
+            self._waiting.clear()  # what cannot be built here cannot be built there
+        del self._active[child.process.connection]
+        child.close(grace_s)
+
+    def _start_again(self, child: Child) -> None:
+        """Have a new process do what is left of one that died or hung, once, if the environment worked before."""
+        rest = child.experiments[1:]
+        if rest and child.has_finished_one and child.name not in self._started_again:
+            self._started_again.add(child.name)
+            self._waiting = {child.name: rest, **self._waiting}

@@ -1,0 +1,166 @@
+"""The worlds of an instance, logged through a few short episodes."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.bullet_worlds import (
+    ANGULAR,
+    JOINTS,
+    VELOCITY,
+    Body,
+    Jump,
+    Pair,
+    World,
+    bullet,
+    find_clients,
+    find_jumps,
+    measure_thickness,
+    read_contacts,
+    read_gravity,
+    read_states,
+    read_world,
+    weight_matters,
+)
+from rlctl.checking.episode import Episode
+from rlctl.checking.finding import NotApplicable
+from rlctl.checking.instance import Instance
+from rlctl.checking.messages import FIRST_SEED
+
+MOST_WORLDS = 4
+DEEPEST_FINE = 0.02
+"""Links of ordinary size may be so far inside each other [m]: Bullet pushes them apart over several steps, and 2 cm
+are more than a stiff contact leaves even for a heavy robot that falls."""
+LEAST_LIMIT = 0.005
+"""The same for the smallest things [m]: collision margins alone are 1 to 4 mm."""
+PART_OF_LINK = 0.25
+"""Between those two it is this part of the thinner link."""
+Place = dict[str, Any]
+"""`seed`, `episode`, `actions` and `step` of a look at a world, as a finding's evidence; step 0 is the reset."""
+
+
+@dataclasses.dataclass
+class Log:
+    """One world in one episode: an entry per look."""
+
+    world: World
+    places: list[Place] = dataclasses.field(default_factory=list)
+    states: list[list[NDArray[np.float64]]] = dataclasses.field(default_factory=list)
+    """Per look, per body, as `read_states` returns them."""
+    deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)
+    """Depth and limit of what is too far inside each other [m]."""
+
+    def look(self, place: Place) -> bool:
+        """Add what is there now; False where the world has gone, or has other bodies."""
+        client = self.world.client
+        try:
+            states, contacts = read_states(self.world), read_contacts(client)
+            deep = {pair: (-d, _limit(client, pair)) for pair, d in contacts.items() if d < -LEAST_LIMIT}
+        except bullet().error:
+            return False
+        self.places.append(place)
+        self.states.append(states)
+        self.deep.append({pair: each for pair, each in deep.items() if each[0] > each[1]})
+        return True
+
+    @property
+    def actions(self) -> str:
+        """The kind of the episode's actions."""
+        return str(self.places[0]["actions"]) if self.places else ""
+
+    @property
+    def bodies(self) -> list[tuple[Body, NDArray[np.float64]]]:
+        """The bodies, and the state of each at every look. Shape (looks, 9 + 2 * joints) each."""
+        series = zip(*self.states, strict=True)
+        return [(body, np.array(each)) for body, each in zip(self.world.bodies, series, strict=False)]
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything ever had a speed."""
+        return any(
+            states[:, VELOCITY].any() or states[:, ANGULAR].any() or states[:, JOINTS + len(body.joints) :].any()
+            for body, states in self.bodies
+        )
+
+
+def _limit(client: int, pair: Pair) -> float:
+    thinner = min(measure_thickness(client, link) for link in pair)
+    return min(DEEPEST_FINE, max(LEAST_LIMIT, PART_OF_LINK * thinner))
+
+
+@dataclasses.dataclass
+class LoggedWorld:
+    """Everything about one world."""
+
+    world: World
+    gravity: list[float]
+    """The strongest [m/s^2]."""
+    logs: list[Log] = dataclasses.field(default_factory=list)
+    jumps: list[Jump] = dataclasses.field(default_factory=list)
+    weight_matters: bool | None = None
+    """Whether anything would move otherwise with gravity; tested only where there is none."""
+
+
+class WorldLogger:
+    """Logs the worlds of one instance. `older`: the clients that were connected before it was built."""
+
+    def __init__(self, instance: Instance, older: set[int]) -> None:
+        if "pybullet" not in sys.modules:
+            raise NotApplicable("no PyBullet world")
+        self.instance = instance
+        self.resets = 0
+        self._older = older
+        self._worlds: dict[int, LoggedWorld] = {}
+        """By their index in the list of worlds: an environment that connects anew may get another client."""
+
+    @property
+    def worlds(self) -> list[LoggedWorld]:
+        """The worlds, without what never moves: a copy of the robot that kinematics are solved with."""
+        moving = [each for each in self._worlds.values() if any(log.moves for log in each.logs)]
+        return moving or list(self._worlds.values())
+
+    def play(self, number: int, kind: str, steps: int, deadline: float) -> None:
+        """Log an episode; where it raises, what was logged before stays."""
+        seed = FIRST_SEED + number
+        logs: list[Log] = []
+        for moment in Episode(self.instance, seed, kind, number=number, max_steps=steps, deadline=deadline):
+            place = {"seed": seed, "episode": number, "actions": kind, "step": moment.step}
+            logs = [log for log in (logs if moment.step else self._begin()) if log.look(place)]
+            if not logs:
+                return
+
+    def _begin(self) -> list[Log]:
+        self.resets += 1
+        logs = []
+        for i, world in enumerate(self._read()):
+            gravity = read_gravity(world.client)
+            logged = self._worlds.setdefault(i, LoggedWorld(world, gravity))
+            logged.gravity = max(logged.gravity, gravity, key=np.linalg.norm)
+            if world.key == logged.world.key:
+                logged.world = world
+            logs.append(Log(world))
+            logged.logs.append(logs[-1])
+        return logs
+
+    def _read(self) -> list[World]:
+        """Return the worlds of the clients that came with the instance, or of all where it shares older ones."""
+        ids = find_clients()
+        own = [read_world(each) for each in ids if each not in self._older]
+        if not any(world.bodies for world in own):
+            own = [read_world(each) for each in ids]
+        return [world for world in own if world.bodies][:MOST_WORLDS]
+
+    def simulate_alone(self, number: int, deadline: float) -> None:
+        """Reset, and simulate every world without the environment, which leaves them unusable."""
+        self.play(number, "none", 0, deadline)
+        for logged in self._worlds.values():
+            with contextlib.suppress(bullet().error):
+                if not any(logged.gravity):
+                    logged.weight_matters = weight_matters(logged.world)
+                logged.jumps += find_jumps(logged.world, FIRST_SEED + number)

@@ -1,0 +1,37 @@
+"""What the shell offers after TAB: tasks, algorithms, runs. Imports no plugin and no library."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_RUNS = Path("runs")
+_MOST = 50
+
+
+def complete_task(incomplete: str) -> list[str]:
+    """Return the installed tasks that begin so, and the Python files here."""
+    from rlctl.environments import registry  # only here: every command's help imports this module
+
+    names = [entry.name for entry in registry.list_installed() if entry.problem is None]
+    return [each for each in (*dict.fromkeys(names), *_list_paths(incomplete, "*.py")) if each.startswith(incomplete)]
+
+
+def complete_algorithm(incomplete: str) -> list[str]:
+    """Return the algorithms that begin so."""
+    known = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo")
+    return [each for each in known if each.startswith(incomplete)]
+
+
+def complete_run(incomplete: str) -> list[str]:
+    """Return `latest`, the tasks with a run, the runs, newest first, and policy files here."""
+    runs = sorted((file.parent for file in _RUNS.glob("*/*/run.json")), key=lambda run: run.name, reverse=True)
+    tasks = dict.fromkeys(run.parent.name for run in runs)
+    latest = ["latest"] if runs else []
+    files = [*_list_paths(incomplete, "*.safetensors"), *_list_paths(incomplete, "*.onnx")]
+    found = [*latest, *tasks, *(str(run) for run in runs[:_MOST]), *files]
+    return [each for each in found if each.startswith(incomplete)]
+
+
+def _list_paths(incomplete: str, pattern: str) -> list[str]:
+    folder = Path(incomplete).parent if "/" in incomplete else Path()
+    return [str(each) for each in sorted(folder.glob(pattern))[:_MOST]]

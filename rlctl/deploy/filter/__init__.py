@@ -1,0 +1,1 @@
+"""The safety filter between a policy and a robot."""

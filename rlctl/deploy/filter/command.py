@@ -1,0 +1,157 @@
+"""From the actions a policy wants to commands within limits: low-pass, blend, and the bounds of motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.deploy.filter.bounds import Bounds
+from rlctl.deploy.filter.fitting import FittedLimits
+from rlctl.deploy.filter.limits import Limits
+from rlctl.deploy.filter.safety_events import Intervention
+
+Array = NDArray[np.float64]
+
+
+class OutsideLimits(Exception):
+    """A joint is outside its limits before it is moved for the first time: no command is safe."""
+
+    def __init__(self, joint: str, value: float, limit: float) -> None:
+        super().__init__(f"{joint} is outside its limits at the start")
+        self.joint, self.value, self.limit = joint, value, limit
+
+
+class Command:
+    """The command that a robot is given, step by step. `report` is called with what limits do, without its time."""
+
+    def __init__(
+        self, limits: Limits, fitted: FittedLimits, bounds: Bounds, report: Callable[[Intervention], None]
+    ) -> None:
+        self._bounds, self._report = bounds, report
+        self.names = bounds.names
+        """Of the joints."""
+        assert isinstance(fitted.space, spaces.Box)  # what has bounds
+        self._space = fitted.space
+        self._safe, self._home = fitted.safe, fitted.home
+        self._is_position = limits.command == "position"
+        self._blend_steps = round(limits.blend_in_s / bounds.dt)
+        cutoff = limits.lowpass_hz
+        self._alpha = 1.0 if cutoff is None else 1.0 - math.exp(-2.0 * math.pi * cutoff * bounds.dt)
+        self._is_action = bool((bounds.factor == 1.0).all() and not bounds.offset.any())
+        """Whether a command is the action itself."""
+        self._zeros = np.zeros(len(self._safe))
+        self._none = bytes(len(self._safe))
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode: nothing is known of where the robot is."""
+        self.position: Array | None = None
+        """Measured positions of the joints."""
+        self._expected: Array | None = None
+        """Where the last command should have brought the joints."""
+        self._reference: Array | None = None
+        """Where the last command led: its value, or the measured positions."""
+        self._before = self._zeros
+        """The motion of the last step."""
+        self._smooth: Array | None = None
+        self._blend_from: Array | None = None
+        self.begin_blend()
+
+    def begin_blend(self) -> None:
+        """Let what comes next take over gradually."""
+        self._blend_left = self._blend_steps
+        self._blend_from = None
+
+    def measure(self, position: Array) -> None:
+        """Take the measured positions of the joints."""
+        self._expected = self._reference if self._bounds.is_value else None
+        if self._reference is not None and not self._bounds.is_value:
+            self._expected = self._reference + self._before
+        self.position = position.copy()
+
+    def find_error(self) -> float:
+        """Return the largest difference between where a joint is and where the last command should have brought it."""
+        if self._expected is None or self.position is None:
+            return math.nan
+        return float(np.abs(self._expected - self.position).max())
+
+    def follow(self, action: Array) -> NDArray[Any]:
+        """Return the action closest to a wanted one. Raises `OutsideLimits` at the first step."""
+        start = self._present(action)
+        target = action if self._is_action else self._bounds.offset + action * self._bounds.factor
+        if self._alpha < 1.0:
+            before = start if self._smooth is None else self._smooth
+            self._smooth = target = before + self._alpha * (target - before)
+        if self._blend_left:
+            part = self._blend_left / (self._blend_steps + 1)
+            self._blend_left -= 1
+            if self._blend_from is None:
+                self._blend_from = start
+            target = target + part * (self._blend_from - target)
+        return self._move(target)
+
+    def rest(self, go_home: bool) -> NDArray[Any]:
+        """Return the action that brakes the robot and keeps it where it is, or brings it home."""
+        self._smooth = None
+        present = self._present(None)
+        if not self._bounds.is_value:
+            if go_home and self._home is not None and self.position is not None:
+                return self._move(self._home - self.position)
+            return self._move(self._zeros)
+        if not self._is_position:
+            return self._move(self._safe)
+        return self._move(self._home if go_home and self._home is not None else present)
+
+    def _present(self, action: Array | None) -> Array:
+        """Return what the command is now: a value, or a motion. At the first step the robot says where it is."""
+        if not self._bounds.is_value:
+            self._reference = self.position
+            return self._before
+        if self._reference is not None:
+            return self._reference
+        if not self._is_position:
+            start = self._safe
+        elif self.position is not None:
+            start = self.position
+        elif action is not None:
+            start = self._bounds.offset + action * self._bounds.factor
+        else:  # where it is is not measured
+            return self._safe if self._home is None else self._home
+        self._reference = np.minimum(np.maximum(start, self._bounds.low), self._bounds.high)
+        away = np.abs(self._reference - start)
+        if self.position is not None and away.max(initial=0.0) > 1e-6:
+            index = int(away.argmax())
+            raise OutsideLimits(self._bounds.names[index], float(start[index]), float(self._reference[index]))
+        return self._reference
+
+    def _move(self, target: Array) -> NDArray[Any]:
+        """Return the action for a value or motion that is wanted, within the bounds."""
+        bounds, reference = self._bounds, self._reference
+        if not bounds.is_value:
+            command = self._before = bounds.bound(target, self._before, reference, self._note)
+        elif reference is None:
+            command = target
+        elif bounds.change is None and bounds.speed is None and bounds.keeps_ends(target):
+            command = self._reference = target
+        else:
+            self._before = bounds.bound(target - reference, self._before, reference, self._note)
+            command = np.minimum(np.maximum(reference + self._before, bounds.low), bounds.high)
+            self._reference = command
+        action = command if self._is_action else (command - bounds.offset) / bounds.factor
+        action = action.astype(self._space.dtype)
+        if action.ndim != len(self._space.shape):
+            action = action.reshape(self._space.shape)
+        if self._is_action:
+            return action
+        result: NDArray[Any] = np.minimum(np.maximum(action, self._space.low), self._space.high)  # rounding
+        return result
+
+    def _note(self, limit: str, x: Array, allowed: Array, ends: tuple[Array, Array]) -> None:
+        acted = np.abs(allowed - x) > 1e-9  # bounds are reached exactly: what is less is rounding
+        if acted.tobytes() != self._none:
+            self._report(Intervention(0.0, self._bounds, limit, x, allowed, ends, self._before, self._reference, acted))

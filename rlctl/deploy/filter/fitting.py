@@ -1,0 +1,248 @@
+"""Limits fitted to a policy: which elements of its observation and action they are about, and whether they can be."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.deploy.filter.bounds import Bounds
+from rlctl.deploy.filter.limits import JointLimits, Limits
+from rlctl.deploy.filter.observation import ObservationLayout
+from rlctl.environments.info import EnvInfo
+from rlctl.errors import RecipeError, UsageError, check_name
+from rlctl.joints import Joints
+
+Array = NDArray[np.float64]
+
+_CAN_BE_LIMITED = {
+    "position": ("position", "speed", "acceleration", "action"),
+    "step": ("position", "speed", "acceleration", "action"),
+    "speed": ("position", "speed", "acceleration", "action"),
+    "torque": ("torque", "rate", "action"),
+    "action": ("rate", "action"),
+}
+_NO_CONTROL_DT = "limits: this policy does not say its control_dt; write control_dt: SECONDS"
+
+
+@dataclasses.dataclass(frozen=True)
+class FittedLimits:
+    """What limits mean for one policy."""
+
+    layout: ObservationLayout
+    space: spaces.Space[Any]
+    """The action space."""
+    control_dt: float | None
+    bounds: Bounds | None
+    """None where actions are choices."""
+    measured: slice | None
+    """Where the joints' positions are in the flat observation."""
+    home: Array | None
+    safe: Array
+    """The command that is given while holding or stopped, where it is a value."""
+
+
+def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
+    """Return what limits mean for a policy; raises `RecipeError` for limits that it cannot have."""
+    layout = ObservationLayout(info)
+    control_dt = limits.control_dt or info.control_dt
+    _, space = info.spaces()
+    count = math.prod(space.shape or ())
+    bounds: Bounds | None = None
+    if isinstance(space, spaces.Box):
+        known = info.joints if info.joints is not None and len(info.joints.names) == count else None
+        if limits.joints is not None and known is not None and limits.joints != list(known.names):
+            for name in limits.joints:
+                check_name(name, known.names, "limits: joints: no joint", RecipeError, listed="Known")
+            raise RecipeError(f"limits: joints: the action's order is {', '.join(known.names)}")
+        names = limits.joints or (list(known.names) if known else [f"action[{index}]" for index in range(count)])
+        if len(names) != count or len(set(names)) != count:
+            raise RecipeError(f"limits: joints: {len(set(names))} different names, the action has {count} elements")
+        bounds = _make_bounds(limits, space, names, control_dt, known)
+    elif limits.limits or limits.lowpass_hz:
+        raise UsageError("limits: the actions of this policy are choices, not quantities that can be bounded")
+    measured = _find_measured(limits, layout, count)
+    home = _read_list(limits, "home", count)
+    if (limits.lowpass_hz or limits.blend_in_s) and control_dt is None:
+        raise RecipeError(_NO_CONTROL_DT)
+    _check_home(limits, bounds, home)
+    _check_measured(limits, bounds, measured, layout)
+    safe = _make_safe_command(limits, bounds, count)
+    return FittedLimits(layout, space, control_dt, bounds, measured, home, safe)
+
+
+def _make_bounds(
+    limits: Limits, space: spaces.Box, names: list[str], control_dt: float | None, known: Joints | None
+) -> Bounds:
+    """Return the limits as arrays, in the units of a command and per control step."""
+    named = limits.joints is not None or known is not None
+    listed = "Known" if named else "Write joints: [names, in the action's order], or one of"
+    for name in limits.limits.keys() - {"all"}:
+        check_name(name, names, "limits: no joint", RecipeError, listed=listed)
+    each = [_merge(limits, name, _list_known(limits, known, index)) for index, name in enumerate(names)]
+    for joint, name in zip(each, names, strict=True):
+        _check_can_be_limited(limits, joint, name)
+    timed = limits.command == "speed" or any(joint.speed or joint.acceleration or joint.rate for joint in each)
+    if timed and control_dt is None:
+        raise RecipeError(_NO_CONTROL_DT)
+    dt, is_value = control_dt or 1.0, limits.command in ("position", "torque", "action")
+    scale, offset = _choose_units(limits, space, known, names)
+    if not is_value and offset.any():
+        raise RecipeError(f"limits: offset: with command: {limits.command} action 0 is to keep still; leave it out")
+    factor = scale * (dt if limits.command == "speed" else 1.0)
+    low = offset + factor * np.maximum(space.low.ravel(), _gather(each, "action", -np.inf, 0))
+    high = offset + factor * np.minimum(space.high.ravel(), _gather(each, "action", np.inf, 1))
+    position = np.array([_gather(each, "position", -np.inf, 0), _gather(each, "position", np.inf, 1)])
+    if is_value:
+        torque = np.array([joint.torque or np.inf for joint in each])
+        low = np.maximum(np.maximum(low, position[0]), -torque)
+        high = np.minimum(np.minimum(high, position[1]), torque)
+        position = np.array([low, high])
+    elif ((low > 0) | (high < 0)).any():
+        raise UsageError("limits: an action of this policy cannot stand still: its bounds exclude zero")
+    if (low > high).any():
+        name = names[int(np.argmax(low > high))]
+        raise RecipeError(f"limits: {name}: no action keeps these limits and the policy's own action bounds")
+    return Bounds(
+        names,
+        dt,
+        is_value,
+        factor,
+        offset,
+        low,
+        high,
+        position,
+        speed=_drop_infinite(np.array([joint.speed or joint.rate or np.inf for joint in each]) * dt),
+        change=_drop_infinite(np.array([joint.acceleration or np.inf for joint in each]) * dt**2),
+        position_name=limits.command if limits.command in ("torque", "action") else "position",
+        speed_name="rate" if limits.command in ("torque", "action") else "speed",
+    )
+
+
+def _drop_infinite(values: Array) -> Array | None:
+    return values if np.isfinite(values).any() else None
+
+
+def _merge(limits: Limits, name: str, known: dict[str, Any]) -> JointLimits:
+    own = limits.limits.get(name, JointLimits())
+    every = limits.limits.get("all", JointLimits())
+    given = {**every.model_dump(exclude_none=True), **own.model_dump(exclude_none=True)}
+    return JointLimits(**{**known, **given})
+
+
+def _list_known(limits: Limits, joints: Joints | None, index: int) -> dict[str, Any]:
+    """Return the limits of one joint that the task's model of the robot has, as far as they can be kept.
+
+    Model files write a limit that is none as one of 0, or as a lower end that is not below the upper.
+    """
+    found: dict[str, Any] = {}
+    if joints is None:
+        return found
+    measured = limits.measured.position is not None
+    moves = limits.command in ("position", "step", "speed")
+    if joints.low and joints.high and (limits.command == "position" or (moves and measured)):
+        low, high = joints.low[index], joints.high[index]
+        found |= {"position": (low, high)} if low < high else {}
+    if joints.max_speed and moves and measured:
+        found |= {"speed": speed} if (speed := joints.max_speed[index]) > 0 else {}
+    if joints.max_torque and limits.command == "torque":
+        found |= {"torque": torque} if (torque := joints.max_torque[index]) > 0 else {}
+    return found
+
+
+def _check_can_be_limited(limits: Limits, joint: JointLimits, name: str) -> None:
+    for key in joint.model_fields_set:
+        if key not in _CAN_BE_LIMITED[limits.command]:
+            can = ", ".join(_CAN_BE_LIMITED[limits.command])
+            raise RecipeError(
+                f"limits: {name}.{key}: with command: {limits.command} only {can} can be limited; "
+                "say with command: what an action is, or watch a measured value with sensors:"
+            )
+
+
+def _choose_units(limits: Limits, space: spaces.Box, known: Joints | None, names: list[str]) -> tuple[Array, Array]:
+    """Return scale and offset of the command, per joint."""
+    scale: Any = 1.0
+    offset: Any = 0.0
+    if known is not None and known.action_scale and limits.command == "position":
+        scale, offset = known.action_scale, known.default_positions or 0.0
+    elif limits.scale is None and limits.command != "action" and (space.low == -1).all() and (space.high == 1).all():
+        raise RecipeError(
+            f"limits: scale: how much {limits.command} is 1 of the action? The policy's go from -1 to 1; write scale: "
+            "NUMBER, in rad, rad/s or N m, and 1 if they are in that unit"
+        )
+    return _spread("scale", limits.scale, scale, names), _spread("offset", limits.offset, offset, names)
+
+
+def _spread(key: str, given: Any, default: Any, names: list[str]) -> Array:
+    """Return a number per joint: what was given, or the default."""
+    values = np.atleast_1d(np.asarray(default if given is None else given, np.float64))
+    if len(values) not in (1, len(names)):
+        raise RecipeError(f"limits: {key} has {len(values)} numbers, the action {len(names)}")
+    return np.broadcast_to(values, (len(names),)).copy()
+
+
+def _gather(joints: list[JointLimits], key: str, default: float, end: int) -> Array:
+    return np.array([default if (ends := getattr(joint, key)) is None else ends[end] for joint in joints])
+
+
+def _find_measured(limits: Limits, layout: ObservationLayout, count: int) -> slice | None:
+    name = limits.measured.position
+    if name is None:
+        return None
+    check_name(name, layout.slices, "limits: measured.position: no observation", RecipeError, listed="Known")
+    place = layout.slices[name]
+    if (size := place.stop - place.start) != count:
+        raise RecipeError(f"limits: measured.position: {name} has {size} elements, the action has {count}")
+    return place
+
+
+def _read_list(limits: Limits, key: str, count: int) -> Array | None:
+    values = getattr(limits, key)
+    if values is not None and len(values) != count:
+        raise RecipeError(f"limits: {key}: {len(values)} numbers, the action has {count} elements")
+    return None if values is None else np.array(values, np.float64)
+
+
+def _check_home(limits: Limits, bounds: Bounds | None, home: Array | None) -> None:
+    if home is None:
+        if limits.on_fault == "home":
+            raise RecipeError("limits: on_fault: home: where that is must be said: home: [positions]")
+        return
+    if limits.command in ("torque", "action") or bounds is None:
+        raise RecipeError(f"limits: home: actions that command {limits.command!r} cannot bring a robot to positions")
+    if ((home < bounds.position[0]) | (home > bounds.position[1])).any():
+        raise RecipeError("limits: home: it is outside the limits of position")
+
+
+def _check_measured(limits: Limits, bounds: Bounds | None, measured: slice | None, layout: ObservationLayout) -> None:
+    """Raise `RecipeError` where limits need the joints' positions and nothing says which observation has them."""
+    if measured is not None or bounds is None:
+        return
+    moves = bounds.speed is not None or bounds.change is not None or limits.blend_in_s > 0
+    if (
+        (limits.command == "position" and moves)
+        or (not bounds.is_value and bounds.bounds_position)
+        or limits.home is not None
+    ):
+        raise RecipeError(
+            "limits: these need to know where the joints are; write measured: {position: NAME} with the name of the "
+            f"observation, one of {', '.join(layout.slices)}"
+        )
+
+
+def _make_safe_command(limits: Limits, bounds: Bounds | None, count: int) -> Array:
+    safe = _read_list(limits, "safe_action", count)
+    if safe is not None and limits.command not in ("torque", "action"):
+        raise RecipeError("limits: safe_action: of positions, steps and speeds it is to keep still; leave it out")
+    if bounds is None:
+        return np.zeros(count)
+    wanted = bounds.offset + (np.zeros(count) if safe is None else safe) * bounds.factor
+    clipped: Array = np.clip(wanted, bounds.low, bounds.high)
+    if safe is not None and not np.allclose(clipped, wanted):
+        raise RecipeError("limits: safe_action: it is outside the limits of the action")
+    return clipped

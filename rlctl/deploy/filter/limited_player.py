@@ -1,0 +1,52 @@
+"""A policy in simulation whose actions go through the safety filter."""
+
+from __future__ import annotations
+
+import collections
+from typing import Any
+
+from rlctl.deploy.filter.limits import Limits
+from rlctl.deploy.filter.safety_filter import SafetyFilter
+from rlctl.environments.info import EnvInfo
+from rlctl.policy.acting import Exploration, Player
+
+
+class LimitedPlayer(Player):
+    """Plays what another player wants, within limits; reports how often they stepped in."""
+
+    def __init__(self, player: Player, info: EnvInfo, limits: Limits) -> None:
+        self._player = player
+        self._safety = SafetyFilter(info, limits)
+        self._before: collections.Counter[str] = collections.Counter()
+
+    @property
+    def state(self) -> Any:
+        """Recurrent state of the player."""
+        return self._player.state
+
+    def explore(self, exploration: Exploration) -> None:
+        """Let the player explore."""
+        self._player.explore(exploration)
+
+    def begin_segment(self, seed: int, step: int) -> None:
+        """Begin to play on at a step of an episode."""
+        self._player.begin_segment(seed, step)
+
+    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Return the limited action, stored and taken."""
+        if step == 0:
+            self._safety.resume()
+            self._safety.reset()
+            self._before = self._safety.counts
+        is_usable = self._safety.observe(observation)
+        wanted = self._player.act(observation, seed, step)[1] if is_usable else None
+        action = self._safety.limit(wanted)
+        return action, action
+
+    def close(self) -> None:
+        """Give back what the player holds."""
+        self._player.close()
+
+    def report(self) -> dict[str, Any]:
+        """Return how often each limit stepped in and each fault occurred in this episode."""
+        return {**self._player.report(), "interventions": dict(self._safety.counts - self._before)}

@@ -1,0 +1,122 @@
+"""`limits.yaml`: limits on the commands of a robot, by the names of its joints. Typed, every key checked."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import Field
+
+from rlctl.errors import RecipeError, short_repr
+from rlctl.recipe import schema_text
+from rlctl.recipe.quantities import Number, Section
+from rlctl.storage import yaml_text
+
+_NUMBER_WITH_UNIT = re.compile(r"^\s*[-+]?\d[\d.eE+-]*\s*[^\d\s.]")
+Positive = Annotated[Number, Field(gt=0)]
+
+
+def _check_order(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] >= value[1]:
+        raise ValueError(f"the lower bound {value[0]:g} is not below the upper one, {value[1]:g}; write [low, high]")
+    return value
+
+
+Bounds = Annotated[tuple[Number, Number], pydantic.AfterValidator(_check_order)]
+
+
+class JointLimits(Section):
+    """Limits of one joint, or of all."""
+
+    position: Bounds | None = None
+    """Lowest and highest position [rad or m]; for commands of position, step and speed."""
+    speed: Positive | None = None
+    """Highest speed [rad/s or m/s]; for commands of position, step and speed."""
+    acceleration: Positive | None = None
+    """Highest acceleration [rad/s^2 or m/s^2]; for commands of position, step and speed."""
+    torque: Positive | None = None
+    """Highest torque or force [N m or N]; for commands of torque."""
+    rate: Positive | None = None
+    """Largest change of the command per second [1/s]; for commands of torque and action."""
+    action: Bounds | None = None
+    """Lowest and highest value of the action itself, whatever it commands."""
+
+
+class Sensor(Section):
+    """What is checked of one named observation; every observation must be finite in any case."""
+
+    range: Bounds | None = None
+    """Lowest and highest value."""
+    frozen_s: Positive | None = None
+    """Time after which a value that has not changed by a single bit is a fault [s]."""
+
+
+class Measured(Section):
+    """Which observations are the joints' own state, an element per element of the action."""
+
+    position: str | None = None
+    """Name of the observation with the joint positions."""
+
+
+class Limits(Section):
+    """Limits on the commands of a robot."""
+
+    command: Literal["position", "step", "speed", "torque", "action"] = "action"
+    """What an action commands: joint positions, steps from the present positions, speeds, torques, or anything."""
+    scale: Positive | list[Positive] | None = None
+    """Size of 1 of the action in the unit of the command; one number, or one per joint. null: the task's, or 1."""
+    offset: Number | list[Number] | None = None
+    """Command of action 0, for commands of position, torque and action. null: the task's default positions, or 0."""
+    joints: list[str] | None = None
+    """Names of the joints in the order of the action; null: the task's."""
+    limits: dict[str, JointLimits] = {}
+    """Limits by joint name; `all` is for every joint, and a joint's own are put over it. What is not said is as the
+    task's model of the robot has it."""
+    lowpass_hz: Positive | None = None
+    """Cut-off frequency of the low-pass on the command [Hz]."""
+    blend_in_s: Annotated[Number, Field(ge=0)] = 0.0
+    """Time in which the policy's command takes over after a start, a hold or an override [s]."""
+    measured: Measured = Measured()
+    """Which observations are the joints' own state."""
+    sensors: dict[str, Sensor] = {}
+    """Checks by the name of the observation."""
+    max_age_periods: Positive = 3.0
+    """Age of an observation, in control periods, beyond which it is a fault."""
+    watchdog_periods: Annotated[Number, Field(ge=0)] = 3.0
+    """Control periods without an observation after which a server stops; 0: never."""
+    on_fault: Literal["hold", "home", "stop"] = "hold"
+    """What a fault of a sensor or of the policy leads to: `hold` and `home` are left when the fault is over."""
+    home: list[Number] | None = None
+    """Joint positions to go to."""
+    safe_action: list[Number] | None = None
+    """The action that is given while holding or stopped, for commands of torque and action; null: zero."""
+    control_dt: Positive | None = None
+    """Time between two actions [s]; null: the policy's."""
+
+
+def read_limits(path: Path) -> Limits:
+    """Read a limits file; raises `ArtifactError` if it cannot be read, `RecipeError` for what is wrong in it."""
+    text = yaml_text.read_text(path)
+    content = yaml_text.load(text, str(path))
+    if not isinstance(content, dict):
+        raise RecipeError(f"{path}: a limits file is a mapping of keys to values, such as `limits: {{all: ...}}`")
+    try:
+        return Limits.model_validate(content)
+    except pydantic.ValidationError as error:
+        schema = Limits.model_json_schema()
+
+        def explain(problem: Any, place: schema_text.Place) -> str:
+            return f"{path}:{yaml_text.find_line(text, place)}: {_explain(problem, place, schema, content)}"
+
+        raise RecipeError(schema_text.explain_all(error, schema, explain)) from None
+
+
+def _explain(problem: Any, place: schema_text.Place, schema: schema_text.Schema, content: Any) -> str:
+    key, given = ".".join(str(part) for part in place), problem["input"]
+    found = re.search(r"\[(.+?)\]", schema_text.find_schema(schema, place).get("description", ""))
+    unit = found[1] if found else ""
+    if isinstance(given, str) and unit and _NUMBER_WITH_UNIT.match(given):
+        return f"{key}: write the number alone, in {unit}, got {short_repr(given)!r}"
+    return schema_text.explain(problem, place, schema, content, key=key, unit=unit)

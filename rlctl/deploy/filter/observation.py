@@ -1,0 +1,111 @@
+"""Observations as clients send them: by name in any order, or flat; and as a policy takes them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.environments.dict_spaces import SINGLE, split, split_space
+from rlctl.environments.info import EnvInfo
+from rlctl.errors import did_you_mean, short_repr
+
+Array = NDArray[Any]
+
+WHOLE = "observation"
+"""Name of an observation whose parts have no names."""
+
+
+class ObservationError(ValueError):
+    """What somebody sent is not an observation of this policy; the message says why."""
+
+
+class ObservationLayout:
+    """Where each named observation is in what a policy takes."""
+
+    def __init__(self, info: EnvInfo) -> None:
+        self.space, _ = info.spaces()
+        shape, sizes = self.space.shape or (), info.observation_sizes
+        parts = split_space(self.space)
+        self.shapes: dict[str, tuple[int, ...]] = {key: part.shape or () for key, part in parts.items()}
+        """The shape of each named observation."""
+        if SINGLE in parts:
+            # With stacked observations the names are those of one of them.
+            named = len(shape) == 1 and sum(sizes.values()) == shape[0]
+            self.shapes = {name: (size,) for name, size in sizes.items()} if named else {WHOLE: shape}
+        self._dtypes = {name: np.dtype(parts.get(name, self.space).dtype) for name in self.shapes}
+        self.slices: dict[str, slice] = {}
+        """Where each named observation is in the flat vector; pictures are not in it."""
+        self.size = 0
+        for name, part in self.shapes.items():
+            if SINGLE in parts or not _is_picture(parts[name]):
+                self.slices[name] = slice(self.size, self.size + math.prod(part))
+                self.size += math.prod(part)
+
+    def read(self, given: Any) -> Any:
+        """Return an observation as the policy takes it, from names and values or the flat vector.
+
+        Raises `ObservationError` that names what is missing, unknown, or of another size.
+        """
+        if isinstance(given, dict):
+            parts = self._read_names(given)
+            if isinstance(self.space, spaces.Dict):
+                return parts
+            return np.concatenate([parts[name].ravel() for name in self.slices]).reshape(self.space.shape or ())
+        if isinstance(self.space, spaces.Dict):
+            raise ObservationError(f"this policy takes observations by name: {', '.join(self.shapes)}")
+        return _convert(given, WHOLE, self.space.shape or (), np.dtype(self.space.dtype))
+
+    def _read_names(self, given: dict[Any, Any]) -> dict[str, Array]:
+        known = self.shapes
+        problems = []
+        if unknown := [name for name in given if name not in known]:
+            close = did_you_mean(str(unknown[0]), known)
+            problems.append(f"unknown: {_list(unknown)}{close and f' ({close.strip()})'}")
+        if missing := [name for name in known if name not in given]:
+            problems.append(f"missing: {_list(missing)}")
+        if problems:
+            raise ObservationError(f"observation names {'; '.join(problems)}")
+        return {name: _convert(given[name], name, shape, self._dtypes[name]) for name, shape in known.items()}
+
+    def flatten(self, observation: Any) -> NDArray[np.float64]:
+        """Return the numbers of an observation that are not pictures, shape (size,)."""
+        parts = split(observation)
+        if SINGLE in parts:
+            return np.asarray(parts[SINGLE], np.float64).ravel()
+        if not self.slices:
+            return np.zeros(0)
+        return np.concatenate([np.asarray(parts[key], np.float64).ravel() for key in self.slices])
+
+
+def _convert(value: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        raise ObservationError(f"observation {name!r} is not an array of numbers") from None
+    if array.dtype.kind not in "biuf":
+        raise ObservationError(f"observation {name!r} is {array.dtype}, not numbers")
+    if array.shape != shape:
+        # Only what has one axis, but for those of length 1, can be put in order: a picture on its side cannot.
+        axes, wanted = ([each for each in given if each != 1] for given in (array.shape, shape))
+        if array.size != math.prod(shape) or (axes != wanted and min(len(axes), len(wanted)) > 1):
+            raise ObservationError(f"observation {name!r} has shape {array.shape}, the policy takes {shape}")
+        array = array.reshape(shape)
+    if array.dtype != dtype:
+        with np.errstate(all="ignore"):  # what is not finite then is found by the checks of sensors
+            given, array = array, array.astype(dtype)
+        if dtype.kind in "iu" and (odd := given[given != array]).size:
+            raise ObservationError(f"observation {name!r} has {odd.flat[0]:g}, the policy takes {dtype}")
+    return array
+
+
+def _list(names: list[Any]) -> str:
+    shown = ", ".join(short_repr(name, 40) for name in names[:8])
+    return f"{shown}, ..." if len(names) > 8 else shown
+
+
+def _is_picture(space: spaces.Space[Any]) -> bool:
+    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3

@@ -1,0 +1,88 @@
+"""What a safety filter did in a step: kept as arrays, which take no time, until somebody reads the events."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.deploy.filter.bounds import Bounds
+
+Array = NDArray[np.float64]
+Kind = Literal["limit", "fault", "state"]
+
+
+@dataclasses.dataclass(frozen=True)
+class SafetyEvent:
+    """Something that the filter did: an action limited, a fault, or another state."""
+
+    time_s: float
+    kind: Kind
+    name: str
+    """Of a limit `joint.speed` and its like, of a fault what was wrong, of a state the new one."""
+    value: float | str = ""
+    limit: float | None = None
+
+    @property
+    def names(self) -> Sequence[str]:
+        """As those of an `Intervention`."""
+        return (self.name,)
+
+    def list_events(self) -> list[SafetyEvent]:
+        """As those of an `Intervention`."""
+        return [self]
+
+
+@dataclasses.dataclass(slots=True)
+class Intervention:
+    """A limit that acted in a step, on one joint or more."""
+
+    kind: ClassVar[Kind] = "limit"
+    time_s: float
+    bounds: Bounds
+    limit: str
+    wanted: Array
+    """Motion, and what the limit left of it."""
+    allowed: Array
+    ends: tuple[Array, Array]
+    """Between which the motion had to be."""
+    before: Array
+    """Motion of the step before."""
+    reference: Array | None
+    """Where the motion began."""
+    acted: NDArray[np.bool_]
+    """On which joints."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Names of the joints with the limit's: `elbow.speed`."""
+        return [f"{self.bounds.names[index]}.{self.limit}" for index in np.flatnonzero(self.acted).tolist()]
+
+    def list_events(self) -> list[SafetyEvent]:
+        """Return an event per joint, with values in the units of the limit."""
+        with np.errstate(over="ignore"):  # a policy may want anything
+            values, limits = self._convert()
+        acted = self.acted
+        return [
+            SafetyEvent(self.time_s, "limit", *each)
+            for each in zip(self.names, values[acted].tolist(), limits[acted].tolist(), strict=True)
+        ]
+
+    def _convert(self) -> tuple[Array, Array]:
+        bounds, dt = self.bounds, self.bounds.dt
+        x, allowed = self.wanted, self.allowed
+        end = np.where(x > allowed, self.ends[1], self.ends[0])
+        if self.limit in ("speed", "rate"):
+            return x / dt, end / dt
+        if self.limit == "acceleration":
+            return (x - self.before) / dt**2, (end - self.before) / dt**2
+        if self.limit == "action" and not bounds.is_value:
+            return x / bounds.factor, end / bounds.factor
+        assert self.reference is not None  # positions are bounded from there
+        value, at = self.reference + x, self.reference + allowed
+        if self.limit == "action":
+            return (value - bounds.offset) / bounds.factor, (at - bounds.offset) / bounds.factor
+        return value, at

@@ -1,0 +1,274 @@
+"""The safety filter: between a policy and a robot, the same in simulation, in a server and from Python."""
+
+from __future__ import annotations
+
+import collections
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.deploy.filter.command import Command, OutsideLimits
+from rlctl.deploy.filter.fitting import fit_limits
+from rlctl.deploy.filter.limits import Limits, read_limits
+from rlctl.deploy.filter.safety_events import Intervention, Kind, SafetyEvent
+from rlctl.deploy.filter.sensors import SensorChecks
+from rlctl.environments.info import EnvInfo
+from rlctl.errors import UsageError
+
+Array = NDArray[Any]
+State = Literal["idle", "running", "holding", "stopped"]
+
+_NO_FILE = Limits()
+_KEPT = 1000  # of the last events
+
+
+class SafetyFilter:
+    """Bounds the actions of a policy, checks its observations, and decides whether it may act.
+
+    In each control step call `observe`, then `limit` with the policy's action, or None where it could not act:
+
+        safety.observe(observation)
+        action = safety.limit(policy.predict(observation) if safety.trusts_observation else None)
+
+    States: `idle` before the first action and after `reset`; `running`; `holding` at a fault or by `hold` and `home`;
+    `stopped`, which only `resume` leaves. A fault that is over ends the holding that it caused. While holding or
+    stopped a robot is braked within its limits and kept where it is, or brought home.
+
+    `info` describes the policy's environment (`policy.info.env`), `limits` is a file or what it says; without them the
+    bounds of the policy's own actions hold. Raises `RecipeError` for limits that this policy cannot have.
+    """
+
+    def __init__(
+        self, info: EnvInfo, limits: Limits | Path | str | None = None, *, clock: Callable[[], float] = time.time
+    ) -> None:
+        if not isinstance(limits, Limits):
+            limits = _NO_FILE if limits is None else read_limits(Path(limits))
+        fitted = fit_limits(limits, info)
+        self.limits, self.layout, self.control_dt = limits, fitted.layout, fitted.control_dt
+        self._space, self._measured, self._home = fitted.space, fitted.measured, fitted.home
+        self._sensors = SensorChecks(limits, fitted.layout, fitted.control_dt)
+        self._command: Command | None = None
+        if fitted.bounds is not None:
+            self._command = Command(limits, fitted, fitted.bounds, self._limited)
+        self._clock = clock
+        self._history: collections.deque[SafetyEvent | Intervention] = collections.deque(maxlen=_KEPT)
+        self._limits_acted: dict[str, NDArray[np.int64]] = {}
+        self._counted: collections.Counter[str] = collections.Counter()
+        self.on_event: Callable[[SafetyEvent | Intervention], None] | None = None
+        """Called with each event, those of one limit in a step together."""
+        self.steps = 0
+        """Actions since the filter was made."""
+        self.state: State = "idle"
+        self.reason = ""
+        """Why it is holding or stopped."""
+        self._zeros = np.zeros(math.prod(fitted.space.shape or ()))
+        self._all_finite = b"\x01" * len(self._zeros)
+        self._fault = ""
+        self._observed = self._ordered = self._goes_home = False
+        self._manual: Array | None = None
+
+    def reset(self) -> None:
+        """Begin an episode. A stop, a hold or a way home that was ordered, and an action by hand stay."""
+        self._fault, self._observed = "", False
+        self._sensors.reset()
+        if self._command is not None:
+            self._command.reset()
+        if self.state != "stopped" and not self._ordered:
+            self._enter("idle", "")
+
+    def stop(self, reason: str = "stopped") -> None:
+        """Stop; only `resume` leaves this state."""
+        self._ordered = False
+        self._enter("stopped", reason)
+
+    def hold(self, reason: str = "hold ordered") -> None:
+        """Keep the robot where it is until `resume`; a stop stays."""
+        if self.state != "stopped":
+            self._ordered, self._goes_home = True, False
+            self._enter("holding", reason)
+
+    def home(self, reason: str = "way home ordered") -> None:
+        """Bring the robot home and keep it there until `resume`; a stop is left. Raises `UsageError` without a home."""
+        if self._home is None:
+            raise UsageError("no home is known: write home: [positions] into the limits file")
+        self._ordered = self._goes_home = True
+        self.begin_blend()
+        self._enter("holding", reason)
+
+    def resume(self) -> None:
+        """Let the policy act again, from where the robot is; a fault that is still there holds it at once."""
+        self._ordered = False
+        self._fault = ""
+        self.begin_blend()
+        self._enter("idle", "")
+
+    def override(self, action: Any | None) -> None:
+        """Give an action by hand instead of the policy's from now on; None: the policy acts again.
+
+        Both begin with a blend. The limits hold as ever, and neither a stop nor a fault is left.
+        Raises `ValueError` for what is not an action of this policy.
+        """
+        if action is not None:
+            action = np.asarray(action, np.float64).ravel()
+            if action.shape != self._zeros.shape or not np.isfinite(action).all():
+                raise ValueError(f"an action by hand has {len(self._zeros)} finite numbers")
+            if self._command is None:
+                choice = self._choose(action)
+                if not self._space.contains(choice) or (choice.ravel() != action).any():
+                    raise ValueError(f"an action by hand is one of {self._space}, not {action.tolist()}")
+        if (action is None) != (self._manual is None):
+            self.begin_blend()
+            self._record("state", "policy" if action is None else "override")
+        self._manual = action
+
+    @property
+    def events(self) -> list[SafetyEvent]:
+        """The last 1000 events, oldest first."""
+        return self.find_last_events(_KEPT)
+
+    def find_last_events(self, count: int) -> list[SafetyEvent]:
+        """Return the last events, oldest first."""
+        found: list[SafetyEvent] = []
+        for each in reversed(self._history):
+            if len(found) >= count:
+                break
+            found += reversed(each.list_events())
+        return found[:count][::-1]
+
+    @property
+    def counts(self) -> collections.Counter[str]:
+        """How often each limit acted on each joint and each fault occurred, since the filter was made."""
+        found: collections.Counter[str] = collections.Counter()
+        if self._command is not None:
+            for limit, times in self._limits_acted.items():
+                each = zip(self._command.names, times.tolist(), strict=True)
+                found.update({f"{joint}.{limit}": count for joint, count in each if count})
+        found.update(self._counted)
+        return found
+
+    @property
+    def is_overridden(self) -> bool:
+        """Whether an action by hand is given instead of the policy's."""
+        return self._manual is not None
+
+    def begin_blend(self) -> None:
+        """Let what comes next take over gradually, as after a change of the policy."""
+        if self._command is not None:
+            self._command.begin_blend()
+
+    @property
+    def control_error(self) -> float:
+        """Largest difference between where a joint is and where the last command should have brought it; or NaN."""
+        return math.nan if self._command is None else self._command.find_error()
+
+    @property
+    def trusts_observation(self) -> bool:
+        """Whether the last observation was without a fault, so that a policy may act on it."""
+        return self._observed and not self._fault
+
+    def observe(self, observation: Any, age_s: float = 0.0) -> bool:
+        """Check an observation, as the policy takes it; None: there is none. Return whether it may be used.
+
+        `age_s` is its age [s].
+        """
+        if observation is None:
+            return self.fail("missing")
+        values = self.layout.flatten(observation)
+        fault = self._sensors.check(values, age_s)
+        self._observed = True
+        if fault is not None:
+            kind, name, value, limit = fault
+            return self.fail(f"{kind} {name}", value, limit)
+        if self._measured is not None and self._command is not None:
+            self._command.measure(values[self._measured])
+        self._fault = ""
+        return True
+
+    def fail(self, what: str, value: float | str = "", limit: float | None = None) -> bool:
+        """Note a fault of the observation, which leads to what the limits say; return False."""
+        self._record("fault", what, value, limit)
+        self._fault = what
+        return False
+
+    def limit(self, action: Any | None) -> Array:
+        """Return the action that the robot gets for one that the policy wants; None: it could not act."""
+        self.steps += 1
+        wanted = self._manual if self._manual is not None else action
+        if wanted is not None and self._command is not None:
+            # A copy: a policy may write the next one into the same memory.
+            wanted = np.array(wanted, np.float64).ravel()
+        fault = self._fault or self._find_fault(wanted)
+        if self.state != "stopped" and not self._ordered:
+            self._follow(fault)
+        if self._command is None:
+            return self._choose(wanted if self.state == "running" else None)
+        try:
+            if self.state == "running" and wanted is not None:
+                return self._command.follow(wanted)
+            return self._command.rest(self._goes_home and self.state == "holding")
+        except OutsideLimits as outside:
+            self._record("limit", f"{outside.joint}.position", outside.value, outside.limit)
+            self._enter("stopped", str(outside))
+            return self._command.rest(False)
+
+    def _find_fault(self, wanted: Any | None) -> str:
+        """Say why an action cannot be taken; empty if it can."""
+        fault, value = "", ""
+        if wanted is None:
+            fault = "" if self.state == "stopped" or self._ordered else "no action"
+        elif self._command is None:
+            return ""
+        elif wanted.shape != self._zeros.shape:
+            fault, value = "action", f"shape {wanted.shape}"
+        elif np.isfinite(wanted).tobytes() != self._all_finite:
+            fault, value = "action", "not finite"
+        elif self._measured is not None and self._command.position is None:
+            fault = "no position"
+        if fault:
+            self._record("fault", fault, value)
+        return fault
+
+    def _follow(self, fault: str) -> None:
+        """Enter the state that this step's fault, or its end, leads to."""
+        if fault and self.limits.on_fault == "stop":
+            self._enter("stopped", fault)
+        elif fault:
+            self._goes_home = self.limits.on_fault == "home"
+            self._enter("holding", fault)
+        elif self.state != "running":
+            self.begin_blend()
+            self._enter("running", "")
+
+    def _choose(self, action: Any | None) -> Array:
+        """Return a choice, or the first alternative where the policy may not act."""
+        space = self._space
+        if action is None:
+            return np.full(space.shape or (), getattr(space, "start", 0), space.dtype)
+        return np.asarray(action, space.dtype).reshape(space.shape or ())
+
+    def _enter(self, state: State, reason: str) -> None:
+        if state != self.state or reason != self.reason:
+            self.state, self.reason = state, reason
+            self._record("state", state, reason)
+
+    def _limited(self, intervention: Intervention) -> None:
+        intervention.time_s = self._clock()
+        if (counts := self._limits_acted.get(intervention.limit)) is None:
+            counts = self._limits_acted[intervention.limit] = np.zeros(len(intervention.acted), np.int64)
+        np.add(counts, intervention.acted, out=counts)
+        self._keep(intervention)
+
+    def _record(self, kind: Kind, name: str, value: float | str = "", limit: float | None = None) -> None:
+        if kind != "state":
+            self._counted[name] += 1
+        self._keep(SafetyEvent(self._clock(), kind, name, value, limit))
+
+    def _keep(self, event: SafetyEvent | Intervention) -> None:
+        self._history.append(event)
+        if self.on_event is not None:
+            self.on_event(event)

@@ -1,0 +1,91 @@
+"""A log of what happened, JSON lines, bounded: files are rotated, and what repeats is counted."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import logging
+import logging.handlers
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rlctl.deploy.filter.safety_events import Intervention, SafetyEvent
+from rlctl.deploy.server.messages import as_json
+from rlctl.errors import ArtifactError
+
+_LARGEST = 10_000_000  # [bytes] of one file
+_KEPT = 3
+_REPEAT_S = 1.0
+_MOST_NAMES = 1000
+
+
+class EventLog:
+    """Writes events as JSON lines; without a file nowhere.
+
+    The same limit or fault of a client is written at most once a second, with the number of times since.
+    Raises `ArtifactError` for a file that cannot be written.
+    """
+
+    def __init__(self, file: Path | None, *, largest: int = _LARGEST) -> None:
+        self._handler: _Handler | None = None
+        self._repeated: dict[tuple[int, str], tuple[float, int]] = {}
+        if file is None:
+            return
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            self._handler = _Handler(file, maxBytes=largest, backupCount=_KEPT, encoding="utf-8")
+        except OSError as error:
+            raise ArtifactError(f"{file}: the log cannot be written: {error.strerror or error}") from None
+
+    def write(self, kind: str, client: int | None = None, *, time_s: float | None = None, **fields: Any) -> None:
+        """Write what happened, now or at `time_s`."""
+        if self._handler is None:
+            return
+        at = datetime.datetime.fromtimestamp(time.time() if time_s is None else time_s, datetime.UTC)
+        line = {"time": at.isoformat(timespec="milliseconds"), "kind": kind, "client": client, **fields}
+        text = json.dumps(as_json({key: value for key, value in line.items() if value not in (None, "")}))
+        self._handler.emit(logging.LogRecord("rlctl", logging.INFO, "", 0, text, None, None))
+
+    def write_event(self, client: int, event: SafetyEvent | Intervention) -> None:
+        """Write what a safety filter did."""
+        if self._handler is None:
+            return
+        counts = dict.fromkeys(event.names, 1) if event.kind == "state" else self._count(client, event.names)
+        if counts:
+            for each in event.list_events():
+                if (count := counts.get(each.name)) is not None:
+                    place = {"name": each.name, "value": each.value, "limit": each.limit}
+                    self.write(each.kind, client, time_s=each.time_s, **place, count=count)
+
+    def _count(self, client: int, names: Sequence[str]) -> dict[str, int]:
+        """Return how often each event occurred since it was written, of those that are to be written again."""
+        due, now = {}, time.monotonic()
+        for name in names:
+            written, waiting = self._repeated.get((client, name), (-_REPEAT_S, 0))
+            if now - written < _REPEAT_S:
+                self._repeated[client, name] = written, waiting + 1
+                continue
+            if len(self._repeated) >= _MOST_NAMES:
+                self._repeated.clear()
+            self._repeated[client, name] = now, 0
+            due[name] = waiting + 1
+        return due
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._handler is not None:
+            self._handler.close()
+
+
+class _Handler(logging.handlers.RotatingFileHandler):
+    _warned = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        # A full disk does not end a server, nor does it fill the terminal.
+        if not self._warned:
+            self._warned = True
+            error = sys.exception()
+            print(f"warning: {self.baseFilename}: the log cannot be written any more: {error}", file=sys.stderr)

@@ -1,0 +1,176 @@
+"""What a server answers over HTTP, and to whom: actions as JSON, orders, another policy, metrics, and the live page."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import tempfile
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from aiohttp import web
+from aiohttp.typedefs import Middleware
+
+from rlctl.deploy.server import messages
+from rlctl.deploy.server.serve import LOOPBACK
+from rlctl.deploy.server.server import PolicyServer
+from rlctl.errors import RlctlError
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+_LARGEST_POLICY = 64 * 2**20  # [bytes]
+_BODY_TIMEOUT_S = 10.0
+_ORDERS = ("stop", "home", "hold", "resume")
+
+
+def make_app(server: PolicyServer) -> web.Application:
+    """Return the web application of a server."""
+    return _Routes(server).make_app()
+
+
+class _Routes:
+    def __init__(self, server: PolicyServer) -> None:
+        self.server = server
+        self.page = (Path(__file__).parent / "page.html").read_text("utf-8")
+
+    def make_app(self) -> web.Application:
+        check = make_access_check(self.server.settings.host, self.server.api_key, self._note_refused)
+        app = web.Application(middlewares=[check], client_max_size=_LARGEST_POLICY)
+        app.add_routes(
+            [
+                web.get("/", self._serve_root),
+                web.get("/healthz", _answer_health),
+                web.get("/metadata", self._serve_metadata),
+                web.get("/metrics", self._serve_metrics),
+                web.get("/live", self._serve_live),
+                web.post("/act", self._serve_act),
+                web.post("/override", self._serve_override),
+                web.post("/policy", self._serve_policy),
+                *(web.post(f"/{order}", self._serve_order) for order in _ORDERS),
+            ]
+        )
+        app.cleanup_ctx.append(self._watch)
+        return app
+
+    def _note_refused(self) -> None:
+        self.server.measurements.refused += 1
+
+    async def _watch(self, app: web.Application) -> Any:
+        tasks = [asyncio.create_task(self.server.check_watchdogs()), asyncio.create_task(self.server.write_recording())]
+        yield
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        self.server.close()
+
+    async def _serve_root(self, request: web.Request) -> web.StreamResponse:
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            return await self.server.serve_client(request)
+        policy = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
+        return web.Response(text=self.page, content_type="text/html", headers={"Content-Security-Policy": policy})
+
+    async def _serve_act(self, request: web.Request) -> web.Response:
+        begin, server = time.perf_counter(), self.server
+        try:
+            content = messages.parse_json(await _read_body(request, server.largest_message))
+        except messages.MessageError as error:
+            server.measurements.errors += 1
+            return _refuse(400, str(error))
+        answer = server.posting.answer(content)
+        server.measure(server.posting, answer, time.perf_counter() - begin)
+        return web.json_response(messages.as_json(answer), status=400 if "error" in answer else 200)
+
+    async def _serve_order(self, request: web.Request) -> web.Response:
+        order = request.path[1:]
+        try:
+            clients = self.server.give_order(order)
+        except RlctlError as error:
+            return _refuse(409, str(error))
+        return web.json_response({"order": order, "clients": clients})
+
+    async def _serve_override(self, request: web.Request) -> web.Response:
+        """Take an action by hand for all clients, `{"action": [...]}`; null gives them back to the policy."""
+        try:
+            content = messages.parse_json(await _read_body(request, 64 * 1024))
+            if not isinstance(content, dict) or list(content) != ["action"]:
+                raise ValueError('write {"action": [numbers]}, or null to end it')
+            self.server.override(content["action"])
+        except (ValueError, TypeError) as error:
+            return _refuse(400, str(error))
+        return web.json_response({"overridden": content["action"] is not None})
+
+    async def _serve_policy(self, request: web.Request) -> web.Response:
+        """Take another policy, whose file is the body."""
+        content = await _read_body(request, _LARGEST_POLICY)
+        name = Path(request.query.get("name", "")).name
+        # The format of safetensors begins with the length of its header, in JSON.
+        suffix = ".safetensors" if content[8:9] == b"{" else ".onnx"
+        with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
+            file = Path(folder) / (name if name.endswith(suffix) and len(name) < 100 else f"uploaded{suffix}")
+            await asyncio.to_thread(file.write_bytes, content)
+            try:
+                await self.server.replace_policy(file)
+            except RlctlError as error:
+                return _refuse(422, str(error).replace(f"{folder}/", ""))
+        policy = self.server.policy
+        return web.json_response({"policy": policy.file.name, "training_steps": policy.info.training_steps})
+
+    async def _serve_metadata(self, request: web.Request) -> web.Response:
+        return web.json_response(messages.as_json(self.server.metadata))
+
+    async def _serve_metrics(self, request: web.Request) -> web.Response:
+        self.server.measure_spread()
+        server = self.server
+        text = server.measurements.format_prometheus(server.count_states(), server.count_interventions())
+        return web.Response(text=text, content_type="text/plain", charset="utf-8")
+
+    async def _serve_live(self, request: web.Request) -> web.Response:
+        return web.json_response(messages.as_json(self.server.describe()))
+
+
+async def _answer_health(request: web.Request) -> web.Response:
+    return web.Response(text="OK\n")
+
+
+async def _read_body(request: web.Request, largest: int) -> bytes:
+    """Read a body of at most `largest` bytes that arrives in time."""
+    try:
+        async with asyncio.timeout(_BODY_TIMEOUT_S):
+            return await request.clone(client_max_size=largest).read()
+    except TimeoutError:
+        raise web.HTTPRequestTimeout from None
+
+
+def _refuse(status: int, text: str) -> web.Response:
+    return web.json_response({"error": text}, status=status)
+
+
+def make_access_check(host: str, key: str | None, on_refused: Callable[[], None]) -> Middleware:
+    """Return what refuses requests without the key (`Authorization: Api-Key KEY`), and those of other sites' pages."""
+
+    @web.middleware
+    async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+        if (problem := _find_problem(request, host in LOOPBACK, key)) is None:
+            return await handler(request)
+        on_refused()
+        return web.Response(status=problem[0], text=f"{problem[1]}\n")
+
+    return check
+
+
+def _find_problem(request: web.Request, is_local: bool, key: str | None) -> tuple[int, str] | None:
+    host = request.headers.get("Host", "")
+    # A name that somebody lets point to this machine would open it to the pages of that name.
+    if is_local and urlsplit(f"//{host}").hostname not in LOOPBACK:
+        return 403, "this server answers to localhost only"
+    origin = request.headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc != host:
+        return 403, "requests of other sites are refused"
+    page = request.path == "/" and request.headers.get("Upgrade", "").lower() != "websocket"
+    if key is None or request.path == "/healthz" or page:
+        return None
+    if hmac.compare_digest(request.headers.get("Authorization", "").encode(), f"Api-Key {key}".encode()):
+        return None
+    return 401, "this server needs a key: Authorization: Api-Key KEY"

@@ -1,0 +1,130 @@
+"""One client of a server: its episode, its filter, and the answer to each of its requests."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.deploy.filter.limits import Limits
+from rlctl.deploy.filter.observation import WHOLE, ObservationError
+from rlctl.deploy.filter.safety_filter import SafetyFilter
+from rlctl.deploy.server.served_policy import ServedPolicy
+from rlctl.errors import RlctlError, short_repr
+
+_LONGEST_AGE_S = 1e9
+
+
+class Session:
+    """An episode after the other of one client.
+
+    `policy` returns what is to act; another one than before acts from the next whole step on, blended in.
+    """
+
+    def __init__(self, number: int, policy: Callable[[], ServedPolicy], limits: Limits | None) -> None:
+        self.number = number
+        self._policy = policy
+        self._served = policy()
+        self._actor = self._served.make_actor()
+        self.safety = SafetyFilter(self._served.info.env, limits)
+        periods, dt = self.safety.limits.watchdog_periods, self.safety.control_dt
+        self._patience_s = periods * dt if periods and dt else None
+        self._last_s: float | None = None
+        self._by_watchdog = False
+        self.action: NDArray[Any] | None = None
+        """The last action."""
+        self.observation: Any = None
+        """The last observation, as the policy takes it."""
+
+    def check_watchdog(self, now_s: float) -> None:
+        """Stop if no observation came for too long while running; `now_s` is of `time.monotonic`."""
+        if self._patience_s is None or self._last_s is None or self.safety.state != "running":
+            return
+        if (waited := now_s - self._last_s) > self._patience_s:
+            self._by_watchdog = True
+            self.safety.stop(f"watchdog: no observation for {waited:.3g} s; POST /resume, or send reset: true")
+
+    def answer(self, request: Any) -> dict[str, Any]:
+        """Return the answer to a request: the action, always within limits, the state, and what was wrong."""
+        now = time.monotonic()
+        self.check_watchdog(now)
+        self._last_s = now
+        self._adopt_policy()
+        error = ""
+        wanted = None
+        infer_s = 0.0
+        try:
+            observation, age_s = self._read(request)
+        except ObservationError as problem:
+            error = str(problem)
+            self.safety.fail("observation", short_repr(error, 200))
+        else:
+            self.observation = observation
+            if self.safety.observe(observation, age_s):
+                begin = time.perf_counter()
+                try:
+                    wanted = self._actor.predict(observation)
+                except (RlctlError, ValueError, ArithmeticError) as problem:
+                    error = f"the policy cannot act: {short_repr(str(problem), 200)}"
+                infer_s = time.perf_counter() - begin
+        self.action = action = self.safety.limit(wanted)
+        answer: dict[str, Any] = {
+            "actions": action.reshape(1, -1) if action.ndim < 2 else action[None],
+            "server_timing": {"infer_ms": infer_s * 1000.0},
+            "state": self.safety.state,
+        }
+        if self.safety.reason:
+            answer["reason"] = self.safety.reason
+        if error:
+            answer["error"] = error
+        return answer
+
+    def _read(self, request: Any) -> tuple[Any, float]:
+        """Return the observation of a request and its age; begin an episode where it says so."""
+        if not isinstance(request, dict):
+            raise ObservationError("a request is a map: observations by name, or observation: the flat vector")
+        fields = dict(request)
+        reset, age_s = fields.pop("reset", False), fields.pop("age_s", 0.0)
+        if not isinstance(reset, bool | int | np.bool_):
+            raise ObservationError(f"reset is {short_repr(reset)}, not true or false")
+        if reset:
+            self.reset()
+        is_number = isinstance(age_s, int | float | np.number) and not isinstance(age_s, bool)
+        if not is_number or abs(age_s) > _LONGEST_AGE_S:
+            raise ObservationError(f"age_s is {short_repr(age_s)}, not a number of seconds")
+        layout = self.safety.layout
+        if WHOLE in fields and WHOLE not in layout.shapes:
+            if others := [short_repr(name) for name in fields if name != WHOLE]:
+                raise ObservationError(f"doubled: {WHOLE} and {', '.join(others[:8])}; send names or the flat vector")
+            return layout.read(fields[WHOLE]), float(age_s)
+        return layout.read(fields), float(age_s)
+
+    def _adopt_policy(self) -> None:
+        if (policy := self._policy()) is not self._served:
+            self._served, self._actor = policy, policy.make_actor()
+            self.safety.begin_blend()
+
+    def reset(self) -> None:
+        """Begin an episode: forget the recurrent state. Of stops only that of the watchdog is left."""
+        if self._by_watchdog and self.safety.state == "stopped":
+            self.safety.resume()
+        self._by_watchdog = False
+        self._actor.reset()
+        self.safety.reset()
+
+    def order(self, what: str) -> None:
+        """Follow an operator: stop, home, hold or resume."""
+        self._by_watchdog = False  # what a person has ordered, a client does not leave
+        {
+            "stop": lambda: self.safety.stop("stopped by hand"),
+            "home": lambda: self.safety.home("sent home by hand"),
+            "hold": lambda: self.safety.hold("held by hand"),
+            "resume": self._resume,
+        }[what]()
+
+    def _resume(self) -> None:
+        self._last_s = None
+        self.safety.resume()

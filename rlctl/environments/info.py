@@ -1,0 +1,191 @@
+"""What a policy file says of its environment, as plain data: spaces, names, units, timing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pydantic
+from gymnasium import spaces
+
+from rlctl.environments.dict_spaces import format_space
+from rlctl.environments.spec import LARGEST_SPACE
+from rlctl.errors import ArtifactError, UsageError, short_repr
+from rlctl.joints import Joints
+
+_ONE_HOT = 10
+"""How many elements of a Box an alternative of a discrete space counts for."""
+
+
+class EnvInfo(pydantic.BaseModel):
+    """Describes an environment; kept in every policy file, ONNX file and run."""
+
+    observation_space: dict[str, Any]
+    action_space: dict[str, Any]
+    observation_sizes: dict[str, int] = {}
+    """Size per observation name, in the order of the flat observation; empty where names are not known."""
+    observation_units: dict[str, str] = {}
+    action_meaning: str = ""
+    control_dt: float | None = None
+    """Time between two actions [s]."""
+    reward_weights: dict[str, float] = {}
+    events: dict[str, bool] = {}
+    """Random changes that the task offers, and whether each acts."""
+    has_success: bool = False
+    has_compute_reward: bool = False
+    """Whether it can compute the reward of a step for another goal than the wanted one."""
+    max_steps: int | None = None
+    robot: str = ""
+    joints: Joints | None = None
+    """What the action moves, where the task says so."""
+
+    def spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        """Return the observation and the action space."""
+        return space_from_json(self.observation_space), space_from_json(self.action_space)
+
+    def find_difference(self, other: EnvInfo, whose: str = "the environment's") -> str | None:
+        """Say how the spaces of `other` differ from these, in a few words; None if they do not."""
+        for name in ("observation", "action"):
+            ours, theirs = getattr(self, f"{name}_space"), getattr(other, f"{name}_space")
+            if ours != theirs:
+                own, foreign = (format_space(space_from_json(each), 120) for each in (ours, theirs))
+                return f"its {name} space is {own}, {whose} is {foreign}"
+        return None
+
+
+def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
+    """Describe an environment; for a task with its names, units and timing."""
+    from rlctl.environments.time_feature import find_time_feature
+    from rlctl.environments.time_limit import find_time_limit
+    from rlctl.task.env import TaskEnv
+
+    inner = env.unwrapped
+    common: dict[str, Any] = {
+        "observation_space": space_to_json(env.observation_space),
+        "action_space": space_to_json(env.action_space),
+        "has_compute_reward": callable(getattr(inner, "compute_reward", None)),
+    }
+    if isinstance(inner, TaskEnv):
+        task, time = inner.task, find_time_feature(env)
+        sizes = inner.observation_sizes
+        return EnvInfo(
+            **common,
+            observation_sizes=sizes if time is None else time.extend_sizes(sizes),
+            observation_units=dict(task.observation_units),
+            action_meaning=task.action_meaning,
+            control_dt=task.control_dt,
+            reward_weights=inner.reward_weights,
+            events={name: name in inner.events for name in task.events},
+            has_success=inner.has_success,
+            max_steps=inner.max_steps,
+            robot=task.robot,
+            joints=task.describe_joints(),
+        )
+    return EnvInfo(**common, max_steps=find_time_limit(env))
+
+
+def describe_randomization(events: Mapping[str, bool]) -> str:
+    """Return whether and by what an environment was randomised; empty for one that offers no events."""
+    if acting := [name for name, acts in events.items() if acts]:
+        return f"randomised by {', '.join(acting)}"
+    return "not randomised" if events else ""
+
+
+def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
+    """Return a space as plain data; raises `UsageError` for a kind or a size that no policy here can handle."""
+    if isinstance(space, spaces.Box | spaces.MultiBinary) and math.prod(space.shape or ()) > LARGEST_SPACE:
+        raise UsageError(
+            f"a space of {math.prod(space.shape or ()):,} elements; at most {LARGEST_SPACE:,} are supported"
+        )
+    if isinstance(space, spaces.Box):
+        return {
+            "type": "Box",
+            "low": _encode_bounds(space.low),
+            "high": _encode_bounds(space.high),
+            "shape": list(space.shape),
+            "dtype": str(space.dtype),
+        }
+    if isinstance(space, spaces.Discrete):
+        return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1:
+        return {"type": "MultiDiscrete", "nvec": space.nvec.tolist()}
+    if isinstance(space, spaces.MultiBinary):
+        return {"type": "MultiBinary", "n": space.n if isinstance(space.n, int) else list(space.n)}
+    if isinstance(space, spaces.Dict):
+        return {"type": "Dict", "spaces": {key: space_to_json(value) for key, value in space.spaces.items()}}
+    raise UsageError(
+        f"the space {short_repr(space)} is not supported; "
+        "Box, Discrete, MultiDiscrete of one axis, MultiBinary, Dict are"
+    )
+
+
+def _encode_bounds(values: Any) -> Any:
+    # One number where all are equal: images have many thousand bounds. Text, because JSON has no infinity.
+    flat = values.ravel()
+    same = flat.size > 0 and bool((flat == flat[0]).all())  # np.unique would import numpy.ma, in every worker
+    return repr(float(flat[0])) if same else [repr(float(v)) for v in flat]
+
+
+def _decode_bounds(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+    if isinstance(value, str):
+        return np.full(shape, np.float64(value).astype(dtype))
+    return np.array([float(v) for v in value]).reshape(shape).astype(dtype)
+
+
+def space_from_json(data: dict[str, Any]) -> spaces.Space[Any]:
+    """Return the space that `space_to_json` wrote; raises `ArtifactError` if it is not one, before it takes memory."""
+    try:
+        if (count := _count_elements(data)) > LARGEST_SPACE:
+            raise ValueError(f"{count:,} elements, at most {LARGEST_SPACE:,} are supported")
+        return _build(data)
+    except (KeyError, TypeError, ValueError, AttributeError, AssertionError, OverflowError, RecursionError) as error:
+        raise ArtifactError(f"not a space: {short_repr(str(error) or error)}") from None
+
+
+def _count_elements(data: dict[str, Any]) -> int:
+    if data["type"] == "Dict":
+        return sum(_count_elements(each) for each in data["spaces"].values())
+    if data["type"] == "Box":
+        return math.prod(_check_shape(data["shape"]))
+    if data["type"] == "MultiBinary":
+        return math.prod(_check_shape(data["n"]))
+    # Networks want them one-hot, as numbers of eight bytes, for a whole batch.
+    alternatives = [data["n"]] if data["type"] == "Discrete" else data["nvec"]
+    return _ONE_HOT * sum(_check_whole(each) for each in alternatives)
+
+
+def _build(data: dict[str, Any]) -> spaces.Space[Any]:
+    match data["type"]:
+        case "Box":
+            shape, dtype = _check_shape(data["shape"]), np.dtype(data["dtype"])
+            if dtype.kind not in "biuf":
+                raise ValueError(f"a Box of {dtype}")
+            low, high = (_decode_bounds(data[end], shape, dtype) for end in ("low", "high"))
+            return spaces.Box(low, high, shape, dtype.type)
+        case "Discrete":
+            return spaces.Discrete(_check_whole(data["n"]), start=_check_whole(data["start"]))
+        case "MultiDiscrete":
+            return spaces.MultiDiscrete(data["nvec"])
+        case "MultiBinary":
+            shape = _check_shape(data["n"])
+            return spaces.MultiBinary(list(shape) if isinstance(data["n"], list) else shape[0])
+        case "Dict":
+            # Pairs: a mapping would be sorted by key, and the order is part of the space.
+            return spaces.Dict([(key, _build(value)) for key, value in data["spaces"].items()])
+    raise ValueError(f"no type {short_repr(data['type'])}")
+
+
+def _check_whole(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TypeError(f"expected a whole number, got {short_repr(value)}")
+    return value
+
+
+def _check_shape(sizes: Any) -> tuple[int, ...]:
+    shape = tuple(_check_whole(size) for size in (sizes if isinstance(sizes, list) else [sizes]))
+    if min(shape, default=0) < 0:
+        raise ValueError(f"shape {short_repr(list(shape))}")
+    return shape

@@ -1,0 +1,130 @@
+"""Code of plugins: importing it and calling it, so that whatever it does becomes an error of one line."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+from rlctl import errors
+from rlctl.errors import TaskError, UsageError
+
+
+def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
+    """Run a plugin's code; whatever it raises, `SystemExit` included, becomes a `TaskError`."""
+    try:
+        return call()
+    except (errors.RlctlError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        where = ""
+        frames = traceback.extract_tb(error.__traceback__)
+        own = frames and Path(frames[-1].filename).parent == Path(__file__).parent
+        if frames and not own and not frames[-1].filename.startswith("<frozen"):  # a syntax error names its place
+            where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})"
+        raise TaskError(
+            f"task {task!r}: {doing}{errors.describe_exception(error)}{where}",
+            details=errors.format_plugin_traceback(error) or None,
+        ) from error
+
+
+def find_module_file(module: str) -> Path | None:
+    """Find a module's file; unlike `find_spec` on a dotted name this imports no parent package."""
+    head, *rest = module.split(".")
+    try:
+        spec = importlib.util.find_spec(head)
+        for depth, _ in enumerate(rest, start=2):
+            if spec is None:
+                return None
+            name = ".".join(module.split(".")[:depth])
+            path = spec.submodule_search_locations
+            found = (finder.find_spec(name, path) for finder in sys.meta_path if hasattr(finder, "find_spec"))
+            spec = next((each for each in found if each is not None), None)
+    except (ImportError, ValueError):
+        return None
+    return Path(spec.origin) if spec and spec.origin and spec.has_location else None
+
+
+def import_module(task: str, name: str) -> Any:
+    """Import an installed module, or one below the current folder; raises `TaskError` for what it raises."""
+    if find_module_file(name) is None and name not in sys.modules:
+        raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
+    with _survive_import(task):
+        return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
+
+
+def import_file(task: str, file: Path) -> Any:
+    """Import a file as a module, once; its folder can be imported from, after all others."""
+    file = _find_loaded(file.expanduser())
+    if not file.is_file():
+        raise UsageError(f"task {task!r}: no file {file}")
+    path = str(file)
+    for loaded, known in list(sys.modules.items()):
+        if getattr(known, "__file__", None) == path and loaded != "__main__":
+            return known
+    folder = str(file.parent)
+    if folder not in sys.path:
+        sys.path.append(folder)  # last: a neighbour called torch.py must not be taken for torch
+    name = file.stem
+    while name in sys.modules or name in sys.stdlib_module_names:
+        name = f"rlctl_task_{name}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise UsageError(f"task {task!r}: {file} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    loader = spec.loader
+    try:
+        with _survive_import(task):
+            call_plugin(task, lambda: loader.exec_module(module), doing="import failed: ")
+    except BaseException:
+        sys.modules.pop(name, None)
+        raise
+    return module
+
+
+@contextlib.contextmanager
+def _survive_import(task: str) -> Iterator[None]:
+    """Make `os._exit` an exception while a module is imported, and cancel an alarm that it leaves behind.
+
+    Either would end the process without a word.
+    """
+    leave, process = os._exit, os.getpid()
+
+    def refuse(status: int) -> NoReturn:
+        if os.getpid() != process:  # a process that the module forked may end so
+            leave(status)
+        raise SystemExit(f"os._exit({status})")
+
+    os._exit = refuse
+    unhandled = signal.getsignal(signal.SIGALRM) == signal.SIG_DFL
+    if in_main := unhandled and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGALRM, _raise_alarm)
+    try:
+        yield
+    finally:
+        os._exit = leave
+        if in_main and signal.getsignal(signal.SIGALRM) == _raise_alarm:
+            if signal.setitimer(signal.ITIMER_REAL, 0.0)[0]:
+                print(f"warning: task {task!r}: its module sets an alarm; cancelled", file=sys.stderr)
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+
+
+def _raise_alarm(number: int, frame: FrameType | None) -> NoReturn:
+    raise TimeoutError("an alarm that the module sets goes off while it is imported")
+
+
+def _find_loaded(file: Path) -> Path:
+    """Return a file's whole path, even if the working directory is not the one any more in which it was loaded."""
+    loaded = (getattr(module, "__file__", None) or "" for module in list(sys.modules.values()))
+    before = None if file.exists() else next((path for path in loaded if Path(path).match(str(file))), None)
+    return Path(before or file).resolve()

@@ -1,0 +1,271 @@
+"""What an environment is made from, and making it."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+import os
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from annotated_types import Ge, Le
+
+from rlctl.environments import named_task
+from rlctl.environments.plugin_code import call_plugin
+from rlctl.environments.registry import is_task, load
+from rlctl.errors import RecipeError, TaskError, did_you_mean, short_repr
+
+if TYPE_CHECKING:
+    import gymnasium
+
+
+LARGEST_SPACE = 10_000_000
+"""Elements that the observations or the actions of an environment may have: a full-HD picture has 6 million."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvSpec:
+    """Everything an environment is made from; plain data.
+
+    Embedded wherever a file or a message names an environment: policies, episodes, messages to workers.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}  # in the models that embed it
+
+    task: str
+    """As the user wrote it; see `rlctl.environments.registry`."""
+    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Keyword arguments of the task's constructor."""
+    reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Weights that differ from the task's."""
+    randomize: bool = False
+    """Whether all events of the task act."""
+    events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    """Events that act, with the parameters that differ from the task's."""
+    frame_stack: Annotated[int, Ge(1)] = 1
+    """How many of the last observations make one."""
+    time_feature: bool = False
+    """Whether the part of the episode that is left is observed."""
+    stage: Annotated[int, Ge(0)] = 0
+    """Stage of the curriculum, from 1; 0 where there is none."""
+    level: Annotated[float, Ge(0), Le(1)] = 1.0
+    """How far the ranges of events that widen have done so, in [0, 1]."""
+    named_by: str = dataclasses.field(default="", compare=False)
+    """The kind of file that names the task; empty where a person did. A file may name environments only."""
+
+    def constructor(self) -> Callable[..., Any]:
+        """Import what makes the environment; raises `ArtifactError` if a file names it and it is not an environment."""
+        return named_task.load(self.task, self.named_by) if self.named_by else load(self.task)
+
+    def make(self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None) -> gymnasium.Env[Any, Any]:
+        """Build the environment; raises `UsageError` for what the user typed, `TaskError` for what it does."""
+        constructor = self.constructor()
+        if is_task(constructor):
+            env = self._make_task_env(constructor, render_mode)
+        else:
+            for key in ("reward_weights", "randomize", "events", "level"):
+                if getattr(self, key) != getattr(EnvSpec(self.task), key):
+                    raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
+            env = self._make_plain_env(constructor, render_mode)
+        try:
+            if self.time_feature:
+                from rlctl.environments.time_feature import TimeFeature
+
+                env = TimeFeature(env)
+            return _stack_frames(env, self.frame_stack) if self.frame_stack > 1 else env
+        except RecipeError:
+            env.close()
+            raise
+
+    def _make_task_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
+        from rlctl.task.env import TaskEnv
+        from rlctl.task.events import EventSettings
+        from rlctl.task.task import check_parameters
+
+        check_parameters(constructor)
+        parameters = _check_parameters(constructor, self.parameters)
+        env: TaskEnv = call_plugin(
+            self.task,
+            lambda: TaskEnv(
+                constructor(**parameters),
+                render_mode=render_mode,
+                reward_weights=self.reward_weights,
+                events=EventSettings(self.randomize, self.events),
+            ),
+        )
+        env.set_level(self.level)
+        return env
+
+    def _make_plain_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
+        import gymnasium
+
+        parameters = dict(self.parameters)
+        _check_keywords(self.task, constructor, parameters)
+        if render_mode is not None:
+            parameters["render_mode"] = render_mode
+            try:
+                _check_keywords(self.task, constructor, parameters)
+            except RecipeError:
+                raise RecipeError(f"{self.task} takes no render_mode") from None
+        env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
+        if hasattr(env, "num_envs") and not isinstance(env, gymnasium.Env):
+            raise TaskError(
+                f"{self.task}: {type(env).__name__} is a vectorised environment\n"
+                "Give a single one: rlctl steps n_envs of them side by side"
+            )
+        if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
+            raise TaskError(
+                f"{self.task}: {type(env).__name__} is neither a Gymnasium environment (reset, step, spaces) "
+                "nor a subclass of rlctl.task.Task"
+            )
+        return env
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvChanges:
+    """What a user changes in an environment that a policy or a recipe names: `--set` of the verbs."""
+
+    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    randomize: bool | None = None
+    """True: all events act. False: only those in `events`, and those that are part of the task. None: as it is."""
+    events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+
+    def apply(self, spec: EnvSpec) -> EnvSpec:
+        """Return `spec` with the changes put over it."""
+        return dataclasses.replace(
+            spec,
+            parameters=merge(spec.parameters, self.parameters),
+            reward_weights=merge(spec.reward_weights, self.reward_weights),
+            randomize=spec.randomize if self.randomize is None else self.randomize,
+            events=merge({} if self.randomize is False else spec.events, self.events),
+        )
+
+    def __bool__(self) -> bool:
+        return self != UNCHANGED
+
+
+UNCHANGED = EnvChanges()
+
+
+def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `below` with the values of `above` put over it, mapping by mapping."""
+    result = dict(below)
+    for key, value in above.items():
+        known = result.get(key)
+        both = isinstance(known, Mapping) and isinstance(value, Mapping)
+        result[key] = merge(known, value) if both else value  # type: ignore[arg-type]
+    return result
+
+
+def make(
+    task: str,
+    *,
+    render_mode: Literal["human", "rgb_array"] | None = None,
+    randomize: bool = False,
+    events: Mapping[str, Mapping[str, Any]] | None = None,
+    **parameters: Any,
+) -> gymnasium.Env[Any, Any]:
+    """Return the Gymnasium environment of a task; keywords are the task's parameters.
+
+    `randomize` lets all events of the task act, `events` those that it names, with the parameters it gives:
+    `events={"mass": {"factor": (0.9, 1.1)}}`.
+    """
+    return EnvSpec(task, parameters, randomize=randomize, events=events or {}).make(render_mode)
+
+
+def make_several(spec: EnvSpec, count: int) -> list[gymnasium.Env[Any, Any]]:
+    """Build environments; a constructor that changes the working directory does not change it for the next."""
+    load(spec.task)
+    folder = os.getcwd()
+    envs = []
+    for _ in range(count):
+        os.chdir(folder)
+        envs.append(spec.make())
+    return envs
+
+
+def _check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
+    known = read_parameters(constructor) if parameters else None
+    if known is None or any(each.kind is each.VAR_KEYWORD for each in known.values()):
+        return
+    for key in parameters:
+        is_of_gymnasium = key == "max_episode_steps" and hasattr(constructor, "gymnasium_id")
+        if key not in known and not is_of_gymnasium:
+            raise _unknown_parameter(task, key, list(known))
+
+
+def read_parameters(constructor: Any) -> Mapping[str, inspect.Parameter] | None:
+    """Return the parameters of a plain environment by name, of a Gymnasium id those of what it stands for.
+
+    None where they are not known.
+    """
+    if hasattr(constructor, "gymnasium_id"):
+        import gymnasium
+        from gymnasium.envs.registration import load_env_creator
+
+        spec = gymnasium.registry.get(constructor.gymnasium_id)
+        if spec is None or spec.entry_point is None:
+            return None
+        constructor = spec.entry_point if callable(spec.entry_point) else load_env_creator(spec.entry_point)
+    return inspect.signature(constructor).parameters
+
+
+def _unknown_parameter(task: str, key: str, known: list[str]) -> RecipeError:
+    return RecipeError(
+        f"task.{key}: {task} has no parameter {key!r}.{did_you_mean(key, known)} It has: {', '.join(known) or 'none'}."
+    )
+
+
+def _check_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Check the parameters of a `Task` against its fields: names and types."""
+    import typing
+
+    import pydantic
+
+    fields = task.parameters()
+    hints = call_plugin(task.__name__, lambda: typing.get_type_hints(task)) if given else {}
+    checked = {}
+    for key, value in given.items():
+        if key not in fields:
+            raise _unknown_parameter(task.__name__, key, list(fields))
+        _check_number(key, hints[key], value)
+        try:
+            checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
+        except pydantic.ValidationError as error:
+            problem = error.errors()[0]["msg"].removeprefix("Input ")
+            raise RecipeError(f"task.{key}: {problem}, got {short_repr(repr(value))}") from None
+    return checked
+
+
+def _check_number(key: str, hint: Any, value: Any) -> None:
+    """Raise `RecipeError` for what pydantic would make a number of: text and bools; and for what is none."""
+    if hint in (int, float) and isinstance(value, bool | str):
+        raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
+    if isinstance(value, float) and math.isnan(value):
+        raise RecipeError(f"task.{key}: expected a number, got nan")
+
+
+def _stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any, Any]:
+    """Observe the last `frames` observations, oldest first, along the last axis."""
+    import numpy as np
+    from gymnasium import spaces
+    from gymnasium.wrappers import FrameStackObservation, TransformObservation
+
+    space = env.observation_space
+    if not isinstance(space, spaces.Box) or len(space.shape) not in (1, 3):
+        raise RecipeError(f"frame_stack: only flat and image observations can be stacked, this task has {space}")
+    if (count := math.prod(space.shape) * frames) > LARGEST_SPACE:
+        raise RecipeError(f"frame_stack: {frames:,} makes {count:,} elements; at most {LARGEST_SPACE:,} are supported")
+    # Gymnasium stacks along a new first axis; networks want vectors and images of the same rank.
+    stacked = spaces.Box(
+        np.concatenate([space.low] * frames, axis=-1),
+        np.concatenate([space.high] * frames, axis=-1),
+        dtype=space.dtype.type,
+    )
+    wrapped = FrameStackObservation(env, frames)
+    flat: gymnasium.Env[Any, Any] = TransformObservation(
+        wrapped, lambda stack: np.concatenate(list(stack), axis=-1), stacked
+    )
+    return flat

@@ -1,0 +1,81 @@
+"""The time feature: a policy observes how much of the episode is left, as the locomotion agents of rl-zoo3 do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from rlctl.environments.time_limit import find_time_limit
+from rlctl.errors import RecipeError
+from rlctl.task.env import TaskEnv
+
+NAME = "time_left"
+"""Its name among the observations of a task."""
+_KEY = "observation"  # of a Dict space: the entry that has it
+
+
+class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Appends the part of the time limit that is left to a flat observation: 1 at the reset, 0 at the limit.
+
+    Of a Dict space, to its entry `observation`. Equal to sb3-contrib's `TimeFeatureWrapper`, which imports torch.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        inner = env.unwrapped
+        limit = inner.max_steps if isinstance(inner, TaskEnv) else find_time_limit(env)
+        if not limit:
+            raise RecipeError(f"time_feature: {type(inner).__name__} has no time limit, so no time is left")
+        self._limit = limit
+        self._steps = 0
+        space = env.observation_space
+        if isinstance(space, spaces.Dict) and _KEY in space.spaces:
+            parts = {**space.spaces, _KEY: _append_bounds(space[_KEY])}
+            self.observation_space = spaces.Dict(list(parts.items()))
+        else:
+            self.observation_space = _append_bounds(space)
+
+    def extend_sizes(self, sizes: dict[str, int]) -> dict[str, int]:
+        """Return the sizes of the observations of a task, by name, with the time."""
+        if isinstance(self.observation_space, spaces.Dict):
+            return {**sizes, _KEY: sizes[_KEY] + 1}
+        return {**sizes, NAME: 1}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        self._steps = 0
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._append(observation), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step."""
+        self._steps += 1
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._append(observation), reward, terminated, truncated, info
+
+    def _append(self, observation: Any) -> Any:
+        if isinstance(self.observation_space, spaces.Dict):
+            return {**observation, _KEY: self._extend(observation[_KEY], self.observation_space[_KEY])}
+        return self._extend(observation, self.observation_space)
+
+    def _extend(self, observation: Any, space: spaces.Space[Any]) -> Any:
+        return np.append(observation, 1 - self._steps / self._limit).astype(space.dtype)
+
+
+def _append_bounds(space: spaces.Space[Any]) -> spaces.Box:
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.dtype.kind != "f":
+        raise RecipeError(f"time_feature: only flat observations of real numbers can have it, this task has {space}")
+    low, high = (np.append(bounds, end).astype(space.dtype) for bounds, end in ((space.low, 0), (space.high, 1)))
+    return spaces.Box(low, high, dtype=space.dtype.type)
+
+
+def find_time_feature(env: gymnasium.Env[Any, Any]) -> TimeFeature | None:
+    """Return the wrapper of an environment that adds the time; None without."""
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, TimeFeature):
+            return env
+        env = env.env
+    return None

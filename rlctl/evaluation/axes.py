@@ -1,0 +1,171 @@
+"""What `--vary` names: an event or a parameter of a task, and the values that it takes."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rlctl.environments.registry import is_task
+from rlctl.environments.spec import EnvChanges, EnvSpec, read_parameters
+from rlctl.errors import UsageError, did_you_mean, short_repr
+from rlctl.run.robustness import Axis
+from rlctl.task.events import Event, Limits, set_color
+from rlctl.task.events.ranges import read_range
+from rlctl.task.task import Task
+
+ALL = "all"
+MOST_CELLS = 1_000_000
+_VALUES = 5  # of an event with `--vary all`
+_WIDER = 2.0  # how much wider than its range an event is varied with `--vary all`
+_FORM = "write NAME=LOWEST:HIGHEST:VALUES, for example --vary mass=0.6:1.4:9"
+
+
+def read_axes(texts: Sequence[str], spec: EnvSpec) -> list[list[Axis]]:
+    """Return the axes of each map that `--vary` asks for: one map, or with `all` one per event of the task.
+
+    Raises `UsageError` for a name that the task does not have, or values that it cannot take.
+    """
+    task = spec.constructor()
+    if list(texts) == [ALL]:
+        return [[axis] for axis in _vary_all(task, spec)]
+    if ALL in texts or len(texts) > 2:
+        raise UsageError("--vary: give one or two things to vary together, or only `all`, for each event alone")
+    axes = [_read_axis(text, task, spec) for text in texts]
+    if len({axis.setting for axis in axes}) < len(axes):
+        raise UsageError(f"--vary: {axes[0].setting} is there twice")
+    return [axes]
+
+
+def count_cells(maps: Iterable[Sequence[Axis]]) -> int:
+    """Return how many cells maps of these axes have; raises `UsageError` for more than can be kept."""
+    cells = sum(math.prod(len(axis.values) for axis in axes) for axes in maps)
+    if cells > MOST_CELLS:
+        raise UsageError(f"--vary: {cells:,} cells; at most {MOST_CELLS:,} are possible")
+    return cells
+
+
+def change(axis: Axis, value: float) -> EnvChanges:
+    """Return the change of the environment that puts an axis at one of its values."""
+    kind, _, rest = axis.setting.partition(".")
+    if kind == "events":
+        event, _, parameter = rest.partition(".")
+        return EnvChanges(events={event: {parameter: value}})
+    return EnvChanges(parameters={rest: int(value) if value.is_integer() and axis.whole else value})
+
+
+def _read_axis(text: str, task: Any, spec: EnvSpec) -> Axis:
+    name, equals, values = text.partition("=")
+    parts = values.split(":")
+    try:
+        if not equals or len(parts) != 3:
+            raise ValueError
+        low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
+    except ValueError:
+        raise UsageError(f"--vary {short_repr(text)!r}: {_FORM}") from None
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise UsageError(f"--vary {text}: {low:g} to {high:g} is no range; {_FORM}")
+    if count < 2:
+        raise UsageError(f"--vary {text}: {count} value; to evaluate at one, use --set; {_FORM}")
+    if count > MOST_CELLS:
+        raise UsageError(f"--vary {text}: at most {MOST_CELLS:,} values are possible")
+    name = name.strip()
+    events: Mapping[str, Event] = task.events if is_task(task) else {}
+    event, _, parameter = name.removeprefix("events.").partition(".")
+    if event in events:
+        return _vary_event(name, event, parameter, events[event], (low, high, count), spec)
+    return _vary_parameter(name, task, (low, high, count), spec)
+
+
+def _vary_event(
+    name: str, key: str, parameter: str, event: Event, span: tuple[float, float, int], spec: EnvSpec
+) -> Axis:
+    ranges = event.ranges
+    if not ranges or (parameter and parameter not in ranges):
+        close = did_you_mean(parameter, ranges)
+        raise UsageError(f"--vary {name}: event {key!r} draws {', '.join(ranges) or 'nothing'}.{close}")
+    parameter = parameter or next(iter(ranges))
+    limits = ranges[parameter]
+    read_range(f"--vary {name}", list(span[:2]), Limits(limits.low, limits.high, limits.above), UsageError)
+    acts = spec.randomize or event.enabled or key in spec.events
+    return Axis(
+        name=name,
+        setting=f"events.{key}.{parameter}",
+        values=_spread(span, limits.whole),
+        nominal=None if acts else event.nominal(parameter),
+        whole=limits.whole,
+    )
+
+
+def _spread(span: tuple[float, float, int], whole: bool) -> list[float]:
+    values = np.linspace(*span).round(12).tolist()
+    return sorted({float(round(value)) for value in values}) if whole else values
+
+
+def _vary_parameter(name: str, task: Any, span: tuple[float, float, int], spec: EnvSpec) -> Axis:
+    parameter = name.removeprefix("task.")
+    if is_task(task):
+        numbers = _find_numbers(task)
+        if parameter not in numbers:
+            known = [*task.events, *numbers]
+            offered = ", ".join(known) or "nothing that can be varied"
+            raise UsageError(
+                f"--vary {name}: {spec.task} has no event or number of that name.{did_you_mean(parameter, known)} "
+                f"It has: {offered}."
+            )
+        whole = numbers[parameter] is int
+        nominal = task.parameters()[parameter].default
+    else:
+        declared = (read_parameters(task) or {}).get(parameter)
+        nominal = None if declared is None else declared.default
+        whole = declared is not None and _is_whole(declared, _spread(span, whole=False))
+    nominal = spec.parameters.get(parameter, nominal)
+    return Axis(
+        name=name,
+        setting=f"task.{parameter}",
+        values=_spread(span, whole),
+        nominal=float(nominal) if isinstance(nominal, int | float) else None,
+        whole=whole,
+    )
+
+
+def _is_whole(declared: inspect.Parameter, values: Sequence[float]) -> bool:
+    """Say whether it takes whole numbers: by its type, or where it has none if its default and `values` are whole."""
+    if declared.annotation is not declared.empty:
+        return declared.annotation in (int, "int")
+    return type(declared.default) is int and all(value.is_integer() for value in values)
+
+
+def _find_numbers(task: type[Task]) -> dict[str, Any]:
+    hints = typing.get_type_hints(task)
+    return {name: hints[name] for name in task.parameters() if hints[name] in (int, float)}
+
+
+def _vary_all(task: Any, spec: EnvSpec) -> list[Axis]:
+    """Return an axis per event: its range, twice as wide."""
+    if not is_task(task) or not task.events:
+        raise UsageError(f"--vary all: {spec.task} offers no events; name one of its parameters")
+    # A colour changes only what a camera sees; who trains on pictures can name it.
+    events = {name: event for name, event in task.events.items() if event.ranges and event.function is not set_color}
+    spans = {name: _widen(event) for name, event in events.items()}
+    return [
+        _vary_event(name, name, "", event, spans[name], spec)
+        for name, event in events.items()
+        if spans[name][0] < spans[name][1]
+    ]
+
+
+def _widen(event: Event) -> tuple[float, float, int]:
+    """Return the range of an event's first parameter, twice as far from nominal, or from its middle."""
+    parameter, limits = next(iter(event.ranges.items()))
+    low, high = read_range(parameter, event.parameters.get(parameter, 0.0), limits).at(1.0)
+    middle = event.nominal(parameter)
+    middle = (low + high) / 2 if middle is None else middle
+    lowest, highest = middle - _WIDER * max(middle - low, 0.0), middle + _WIDER * max(high - middle, 0.0)
+    if lowest < limits.low or (limits.above and lowest == limits.low):
+        lowest = low / 2 if limits.above else limits.low
+    return lowest, min(highest, limits.high), _VALUES

@@ -1,0 +1,179 @@
+"""`rlctl eval --push`: from which horizontal push at mid-episode on a policy fails."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import UsageError
+from rlctl.evaluation.statistics import summarize
+from rlctl.policy.shipped import Interval
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.run.robustness import PushLevel, PushTest
+
+if TYPE_CHECKING:
+    from rlctl.evaluation.vary import CellPlayer
+
+_DURATION_S = 0.1
+_FIRST_SPEED = 0.25  # [m/s], by which the smallest push would change the speed of the whole robot
+_DOUBLINGS = 6  # up to 16 m/s
+_BISECTIONS = 4
+_RESAMPLES = 2000
+
+
+@dataclasses.dataclass(frozen=True)
+class PushedBody:
+    """What is pushed, and when."""
+
+    body: str
+    link: str | None
+    mass: float
+    """Of the whole body [kg]."""
+    duration_s: float
+    max_steps: int
+    """Of an episode."""
+    every_s: float
+    """More than half an episode [s], so that an interval event acts once, in its middle."""
+
+    def parameters(self, impulse: float) -> dict[str, object]:
+        """Return the parameters of the event `push`, in a direction that follows from the episode's seed."""
+        force = impulse / self.duration_s
+        where = {"body": self.body, "link": self.link, "every_s": self.every_s}
+        return {**where, "force": [force, force], "duration_s": [self.duration_s, self.duration_s]}
+
+
+def find_pushed(spec: EnvSpec) -> PushedBody:
+    """Build the world and find the base, or the trunk on rails, of its robot.
+
+    Raises `UsageError` for a robot that is fixed to the world, and for a plain environment.
+    """
+    from rlctl.task.env import TaskEnv
+
+    with contextlib.closing(spec.make()) as env:
+        inner = env.unwrapped
+        if not isinstance(inner, TaskEnv):
+            raise UsageError(
+                f"--push: {spec.task} is a plain Gymnasium environment; only the worlds of tasks are known"
+            )
+        bodies = list(inner.sim.bodies.values())
+        robots = [body for body in bodies if body.joint_names] or bodies
+        found = [(body, link) for body in robots if (link := body.find_trunk()) is not None]
+        if not found:
+            names = ", ".join(body.name for body in robots)
+            raise UsageError(f"--push: {spec.task} has no base that could be pushed: {names} is fixed to the world")
+        body, link = max(found, key=lambda each: each[0].total_mass())
+        dt, steps = inner.task.control_dt, inner.max_steps
+        return PushedBody(
+            body=body.name,
+            link=None if link == body.base_name else link,
+            mass=body.total_mass(),
+            duration_s=max(1, round(_DURATION_S / dt)) * dt,
+            max_steps=steps,
+            every_s=(steps // 2 + 1) * dt,
+        )
+
+
+def measure_push(player: CellPlayer, spec: EnvSpec, unpushed: Sequence[EpisodeResult]) -> PushTest:
+    """Push with twice the impulse until half of the episodes fail, then bisect, always with the same episodes."""
+    pushed = find_pushed(spec)
+    has_success = any(result.success is not None for result in unpushed)
+
+    def judge(results: Sequence[EpisodeResult]) -> NDArray[np.bool_]:
+        return np.array(
+            [result.success if has_success else result.length >= pushed.max_steps for result in results], bool
+        )
+
+    held = {0.0: judge(unpushed)}
+    outcomes = {0.0: summarize(unpushed)}
+
+    def fails(impulse: float) -> bool:
+        results = player.play(spec, pushed.parameters(impulse))
+        held[impulse], outcomes[impulse] = judge(results), summarize(results)
+        return float(held[impulse].mean()) <= 0.5
+
+    if held[0.0].mean() > 0.5:
+        _search(fails, _FIRST_SPEED * pushed.mass)
+    impulses = sorted(held)
+    threshold, interval = find_threshold(impulses, np.array([held[impulse] for impulse in impulses]))
+    measure: Literal["success", "upright"] = "success" if has_success else "upright"
+    return PushTest(
+        body=pushed.body,
+        link=pushed.link,
+        duration_s=pushed.duration_s,
+        mass=pushed.mass,
+        measure=measure,
+        levels=[
+            PushLevel(**outcomes[impulse].model_dump(), impulse=impulse, held=float(held[impulse].mean()))
+            for impulse in impulses
+        ],
+        threshold=threshold,
+        threshold_interval=interval,
+        verdict=_judge(pushed, measure, held, threshold, interval),
+    )
+
+
+def _search(fails: Callable[[float], bool], first: float) -> None:
+    low, high = 0.0, first
+    for _ in range(_DOUBLINGS + 1):
+        if fails(high):
+            break
+        low, high = high, 2 * high
+    else:
+        return
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if fails(middle) else (middle, high)
+
+
+def find_threshold(impulses: Sequence[float], held: NDArray[np.bool_]) -> tuple[float | None, Interval | None]:
+    """Return the impulse at which half of the episodes fail, and its 95 % interval; None where they never do.
+
+    `held`, shape (impulses, episodes), says which went well. The rate is made to fall with the impulse (isotonic
+    regression) and is a straight line between two of them; the interval resamples episodes (percentile bootstrap).
+    """
+    threshold = _cross(impulses, held.mean(axis=1))
+    if threshold is None or held[0].mean() <= 0.5:
+        return None, None
+    rng = np.random.default_rng(0)  # the same episodes give the same interval
+    episodes = held.shape[1]
+    samples = [held[:, rng.integers(episodes, size=episodes)].mean(axis=1) for _ in range(_RESAMPLES)]
+    crossings = [impulses[-1] if (found := _cross(impulses, rates)) is None else found for rates in samples]
+    low, high = np.percentile(crossings, [2.5, 97.5])
+    return threshold, (float(low), float(high))
+
+
+def _cross(impulses: Sequence[float], rates: NDArray[np.float64]) -> float | None:
+    from scipy.optimize import isotonic_regression
+
+    falling = isotonic_regression(rates, increasing=False).x
+    if falling[-1] > 0.5:
+        return None
+    return float(np.interp(-0.5, -falling, impulses))  # which needs rising values
+
+
+def _judge(
+    pushed: PushedBody,
+    measure: str,
+    held: dict[float, NDArray[np.bool_]],
+    threshold: float | None,
+    interval: Interval | None,
+) -> str:
+    goes_well = "succeed" if measure == "success" else "last until the time limit"
+    if held[0.0].mean() <= 0.5:
+        return f"cannot tell: without a push {held[0.0].mean():.0%} of the episodes {goes_well}"
+    largest = max(held)
+    if threshold is None or interval is None:
+        if measure == "upright" and all(each.all() for each in held.values()):
+            return "cannot tell: this task reports no success, and no episode ended early"
+        return f"more than half of the episodes {goes_well} with every push tried, up to {largest:.3g} N s"
+    return (
+        f"half of the episodes fail from a push of {threshold:.3g} N s on (95 % interval {interval[0]:.3g} to "
+        f"{interval[1]:.3g}), which alone would change the speed of its {pushed.mass:.3g} kg by "
+        f"{threshold / pushed.mass:.2g} m/s"
+    )

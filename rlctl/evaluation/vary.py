@@ -1,0 +1,159 @@
+"""`rlctl eval --vary` and `--push`: how robust a policy is, with the same episodes in every cell."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import shlex
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rlctl import output
+from rlctl.environments.registry import is_task
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.evaluation import axes as axes_of
+from rlctl.evaluation.evaluate import NO_GATES, EvalRequest, Gates, LoadedPolicy, find_player, start_workers
+from rlctl.evaluation.push import measure_push
+from rlctl.evaluation.statistics import summarize
+from rlctl.policy.acting import Exploration
+from rlctl.policy.policy import collect_versions
+from rlctl.rollout.collect import play_episodes
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.rollout.workers import Workers
+from rlctl.run import robustness
+from rlctl.run.robustness import Axis, Cell, Robustness, RobustnessMap
+
+ASK_ABOVE_S = 600.0
+"""A measurement that takes longer than this [s] is begun only after asking."""
+
+
+class CellPlayer:
+    """Plays the same episodes in one environment after the other, in workers that stay."""
+
+    def __init__(self, workers: Workers, policy: LoadedPolicy, request: EvalRequest) -> None:
+        self.workers = workers
+        self._policy = policy
+        self._seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
+        self._exploration = Exploration(stochastic=not request.deterministic)
+        self._has_events = is_task(workers.spec.constructor())
+
+    def play(self, spec: EnvSpec, push: dict[str, object] | None = None) -> list[EpisodeResult]:
+        """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`."""
+        workers = self.workers
+        if spec.parameters != workers.spec.parameters:
+            workers.rebuild(spec)
+            self._policy.give_to(workers)
+        if self._has_events:
+            workers.set_events(spec, push)
+        return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration)]
+
+
+def measure_robustness(
+    request: EvalRequest, vary: Sequence[str] = (), *, push: bool = False, yes: bool = False, gates: Gates = NO_GATES
+) -> Robustness:
+    """Measure a policy in every cell of the maps that `vary` asks for, and with pushes, and keep the result in its run.
+
+    `vary` is `NAME=LOWEST:HIGHEST:VALUES`, one or two, or `all`; `yes` begins a long measurement without asking.
+    Random changes that the policy was trained with do not act, unless the request's own changes say so.
+    """
+    if request.changes.randomize is None:
+        request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
+    found, policy, spec = find_player(request)
+    maps = axes_of.read_axes(vary, spec) if vary else []
+    cells = axes_of.count_cells(maps)  # raises for too many, before one is played
+    with start_workers(spec, request) as workers:
+        policy.give_to(workers)
+        player = CellPlayer(workers, policy, request)
+        start = time.monotonic()
+        episodes = player.play(spec)
+        nominal = summarize(episodes)
+        gates.check_possible(nominal.success_rate is not None)
+        _ask(cells, time.monotonic() - start, yes)
+        with output.show_progress("varying", cells) as show:
+            done = itertools.count(1)
+            measured = [_play_map(player, spec, axes, lambda: show(next(done))) for axes in maps]
+        pushed = measure_push(player, spec, episodes) if push else None
+    result = Robustness(
+        task=spec.task,
+        parameters=dict(spec.parameters),
+        reward_weights=dict(spec.reward_weights),
+        events={name: dict(each) for name, each in spec.events.items()},
+        policy_file=str(found.file),
+        algo=policy.info.algo,
+        training_steps=policy.info.training_steps,
+        episodes=request.episodes,
+        seed=request.seed,
+        deterministic=request.deterministic,
+        nominal=nominal,
+        maps=measured,
+        push=pushed,
+        command=shlex.join(["rlctl", *sys.argv[1:]]),
+        versions=collect_versions(),
+    )
+    if found.run is not None and request.task in (None, policy.info.spec.task):
+        _keep(found.run.robustness_file, result)
+    return result
+
+
+def _play_map(player: CellPlayer, spec: EnvSpec, axes: list[Axis], on_cell: Callable[[], None]) -> RobustnessMap:
+    places = list(itertools.product(*(axis.values for axis in axes)))
+    specs = [_apply(axes, values, spec) for values in places]
+    cells: dict[int, Cell] = {}
+    # Another parameter of the task means other worlds: cells that share it are played one after the other.
+    for index in sorted(range(len(places)), key=lambda index: sorted(specs[index].parameters.items(), key=repr)):
+        outcome = summarize(player.play(specs[index]))
+        cells[index] = Cell(
+            **outcome.model_dump(), values=list(places[index]), nominal=_is_nominal(axes, places[index])
+        )
+        on_cell()
+    return RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(places))])
+
+
+def _apply(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> EnvSpec:
+    for axis, value in zip(axes, values, strict=True):
+        spec = axes_of.change(axis, value).apply(spec)
+    return spec
+
+
+def _is_nominal(axes: Sequence[Axis], values: Sequence[float]) -> bool:
+    pairs = zip(axes, values, strict=True)
+    return all(axis.nominal is not None and abs(axis.nominal - value) < 1e-9 for axis, value in pairs)
+
+
+def _ask(cells: int, seconds: float, yes: bool) -> None:
+    """Say how long many cells will take and ask whether to begin; raises `UsageError` where nobody can be asked."""
+    total = cells * seconds
+    if yes or total <= ASK_ABOVE_S:
+        return
+    duration = output.format_duration(total)
+    expected = f"{cells:,} cells will take about {duration}: the nominal one took {seconds:.1f} s"
+    refusal = f"--vary: {expected}; take fewer values or --episodes, or begin all the same: --yes"
+    if not output.confirm(f"{expected}; begin?", refusal):
+        raise UsageError("--vary: not begun")
+
+
+def _keep(file: Path, result: Robustness) -> None:
+    """Write the result into its run, with what was measured before of the same policy in the same way."""
+    with contextlib.suppress(ArtifactError):
+        before = robustness.read(file)
+        measured = {"nominal", "maps", "push", "command", "versions"}
+        if before.model_dump(mode="json", exclude=measured) == result.model_dump(mode="json", exclude=measured):
+            kept = {"maps": result.maps or before.maps, "push": result.push or before.push}
+            result = result.model_copy(update=kept)
+    try:
+        robustness.write(file, result)
+    except OSError as error:
+        output.err().print(f"warning: {file}: not written: {error.strerror}")
+
+
+def check_gates(result: Robustness, gates: Gates) -> None:
+    """Raise `AnswerIsNo` if the worst cell of all maps misses a gate; without maps, the nominal one."""
+    found = result.find_worst()
+    where, outcome = ("nominal", result.nominal) if found is None else (found[0].name_cell(found[1]), found[1])
+    if missed := gates.list_missed(outcome.success_rate, outcome.success_interval, outcome.mean_return):
+        raise AnswerIsNo(f"gate missed in the worst cell, {where}: " + "; ".join(missed))

@@ -1,0 +1,174 @@
+"""A policy as one ONNX graph: from raw observations to the action the environment takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import onnx
+from gymnasium import spaces
+
+from rlctl.environments.dict_spaces import SINGLE, split_space
+from rlctl.exporting.layers import BATCH, Graph, concatenate, emit, emit_lstm, unsupported
+from rlctl.joints import Joints
+from rlctl.policy.layers import Lstm, Normalize, OneHot
+from rlctl.policy.network import Network, Tensors
+from rlctl.policy.onnx_file import METADATA_KEY
+from rlctl.policy.onnx_policy import ACTION, SINGLE_INPUT, STATE_INPUTS, STATE_OUTPUTS
+from rlctl.policy.policy import PolicyInfo
+
+_STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of the step before"
+
+
+def build(info: PolicyInfo, tensors: Tensors) -> onnx.ModelProto:
+    """Write a policy file as ONNX: normalisation, the deterministic actor, and SB3's clip or unscaling of its action.
+
+    Raises `UsageError` for what has no translation.
+    """
+    graph, network = Graph(), Network(info, tensors)
+    observation_space, action_space = info.env.spaces()
+    inputs = {key: _add_input(graph, info, key, part) for key, part in split_space(observation_space).items()}
+    value = concatenate(graph, [_emit_part(graph, inputs[key], network, key) for key in network.parts])
+    state: tuple[str, ...] = ()
+    if (lstm := network.lstm) is not None:
+        hidden, cell = (graph.input(name, np.float32, _find_state_shape(lstm), _STATE_MEANING) for name in STATE_INPUTS)
+        value, state = emit_lstm(graph, value, (hidden, cell), lstm)
+    value = emit(graph, value, [*network.trunk, *network.head])
+    if isinstance(action_space, spaces.Box):
+        # Where tanh ends the network there was noise before it, of which a deterministic action has none.
+        value = graph.add("Tanh", value) if network.ends_with_tanh else value
+        value, dtype = _emit_continuous(graph, value, action_space, network.is_squashed)
+    else:
+        value, dtype = _emit_discrete(graph, value, action_space), np.dtype(np.int64)
+    shape: tuple[int | str, ...] = (BATCH, *(action_space.shape or ()))
+    graph.output(value, ACTION, dtype, shape, info.env.action_meaning or "action, as the environment takes it")
+    for name, part in zip(STATE_OUTPUTS, state, strict=False):
+        assert lstm is not None  # which has the state
+        graph.output(part, name, np.float32, _find_state_shape(lstm), "LSTM state for the next step")
+    return graph.model(metadata(info), _describe(info))
+
+
+def _find_state_shape(lstm: Lstm) -> tuple[int, str, int]:
+    return len(lstm.layers), BATCH, lstm.state.shape[2]
+
+
+def _add_input(graph: Graph, info: PolicyInfo, key: str, space: spaces.Space[Any]) -> tuple[str, Any]:
+    """Add the input of a part of the observation; return its name and dtype."""
+    name = SINGLE_INPUT if key == SINGLE else key
+    if space.shape is None or space.dtype is None:
+        raise unsupported(f"observation {name!r}, a {type(space).__name__} space,")
+    meaning = _describe_input(info) if key == SINGLE else f"observation {key!r}"
+    return graph.input(name, space.dtype, (BATCH, *space.shape), meaning), space.dtype
+
+
+def _describe_input(info: PolicyInfo) -> str:
+    sizes, units = info.env.observation_sizes, info.env.observation_units
+    parts = [
+        f"{name} ({size}) [{units[name]}]" if name in units else f"{name} ({size})" for name, size in sizes.items()
+    ]
+    return ", ".join(parts) or "observation"
+
+
+def _emit_part(graph: Graph, source: tuple[str, Any], network: Network, key: str) -> str:
+    """From a part of the observation to its features."""
+    (value, dtype), layers = source, network.parts[key]
+    if dtype != np.float32 and not isinstance(layers[0], Normalize | OneHot):
+        value = graph.cast(value, np.float32)
+    return emit(graph, value, layers)
+
+
+def _emit_continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool) -> tuple[str, np.dtype[Any]]:
+    if not np.issubdtype(space.dtype, np.floating):
+        raise unsupported(f"an action of type {space.dtype}")
+    # As numpy promotes it in SB3: float32 stays, bounds in float64 make the action float64.
+    dtype = np.result_type(np.float32, space.dtype)
+    if len(space.shape) != 1:
+        value = graph.add("Reshape", value, graph.constant("action/shape", np.array([-1, *space.shape])))
+    if squashed:
+        one, half = graph.constant("action/one", np.float32(1.0)), graph.constant("action/half", np.float32(0.5))
+        value = graph.add("Mul", graph.add("Add", value, one), half)
+    if dtype != np.float32:
+        value = graph.cast(value, dtype)
+    low, high = space.low.astype(dtype), space.high.astype(dtype)
+    if squashed:
+        value = graph.add("Mul", value, graph.constant("action/range", (space.high - space.low).astype(dtype)))
+        return graph.add("Add", value, graph.constant("action/low", low)), dtype
+    value = graph.add("Max", value, graph.constant("action/low", low))
+    return graph.add("Min", value, graph.constant("action/high", high)), dtype
+
+
+def _emit_discrete(graph: Graph, value: str, space: spaces.Space[Any]) -> str:
+    """The most likely, or most valuable, choice. Counted from 0: SB3 takes no notice of a space's `start`."""
+    if isinstance(space, spaces.Discrete):
+        return graph.add("ArgMax", value, axis=1, keepdims=0)
+    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1:
+        sizes = graph.constant("action/sizes", space.nvec.astype(np.int64))
+        parts = graph.add_with_outputs("Split", [value, sizes], len(space.nvec), axis=1)
+        chosen = [graph.add("ArgMax", part, axis=1, keepdims=1) for part in parts]
+        return graph.add("Concat", *chosen, axis=1)
+    if isinstance(space, spaces.MultiBinary):
+        # SB3 rounds the probability, which is one half where the logit is zero, and rounds halves to zero.
+        return graph.cast(graph.add("Greater", value, graph.constant("action/zero", np.float32(0.0))), np.int64)
+    raise unsupported(f"an action of {space}")
+
+
+def metadata(info: PolicyInfo) -> dict[str, str]:
+    """Return the metadata of a policy's ONNX file.
+
+    Under `rlctl` the whole description as JSON. The other keys repeat what somebody needs who runs the file
+    elsewhere: lists are separated by commas, in the order of the observation's or the action's elements.
+    """
+    env = info.env
+    plain = {
+        "task": info.spec.task,
+        "algorithm": info.algo,
+        "training_steps": str(info.training_steps),
+        "observation_names": ",".join(env.observation_sizes),
+        "observation_sizes": ",".join(str(size) for size in env.observation_sizes.values()),
+        "observation_units": ",".join(env.observation_units.get(name, "") for name in env.observation_sizes),
+        "frame_stack": str(info.spec.frame_stack),
+        "action_meaning": env.action_meaning,
+        **_format_bounds(info),
+        **_format_joints(info.env.joints),
+        "control_dt": "" if env.control_dt is None else f"{env.control_dt!r} s",
+        "robot": env.robot,
+        "state": "state_h and state_c: zeros when an episode begins" if info.algo == "recurrent_ppo" else "",
+        "versions": ", ".join(f"{name} {version}" for name, version in info.versions.items()),
+    }
+    return {METADATA_KEY: info.model_dump_json(), **{key: value for key, value in plain.items() if value.strip(",")}}
+
+
+def _format_joints(joints: Joints | None) -> dict[str, str]:
+    """Return the keys that the controllers of mjlab and BeyondMimic read, and in that form: values and commas."""
+    if joints is None:
+        return {}
+    numbers = {
+        "default_joint_pos": joints.default_positions,
+        "action_scale": joints.action_scale,
+        "joint_stiffness": joints.stiffness,
+        "joint_damping": joints.damping,
+        "joint_pos_lower": joints.low,
+        "joint_pos_upper": joints.high,
+        "joint_max_velocity": joints.max_speed,
+        "joint_max_effort": joints.max_torque,
+    }
+    names = {"joint_names": ",".join(joints.names)}
+    return names | {key: ",".join(f"{value:.9g}" for value in values) for key, values in numbers.items()}
+
+
+def _format_bounds(info: PolicyInfo) -> dict[str, str]:
+    space = info.env.spaces()[1]
+    if not isinstance(space, spaces.Box):
+        return {"action_space": str(space)}
+    return {
+        "action_low": ",".join(f"{value:.9g}" for value in space.low.ravel().tolist()),
+        "action_high": ",".join(f"{value:.9g}" for value in space.high.ravel().tolist()),
+    }
+
+
+def _describe(info: PolicyInfo) -> str:
+    """Return a sentence on the graph, for those who open the file in a viewer."""
+    return (
+        f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps: raw observations in, "
+        "deterministic action out; normalisation and the action's bounds are inside"
+    )

@@ -1,0 +1,226 @@
+"""The layers of a network as the statements of a C function for one observation."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.policy.layers import Activation, BatchRenorm, Clip, Layer, Linear, Lstm, Normalize, OneHot
+from rlctl.policy.network import Network
+
+_PER_LINE = 8
+_ACTIVATIONS = {
+    "tanh": "hyperbolic_tangent({x})",
+    "relu": "relu({x})",
+    "elu": "elu({x})",
+    "silu": "{x} * sigmoid({x})",
+}
+_FUNCTIONS = {
+    # expf is several times as fast as tanhf; the difference of the two is below 2e-7.
+    "hyperbolic_tangent": "static float hyperbolic_tangent(float x)\n{\n"
+    "    return 1.0f - 2.0f / (expf(2.0f * x) + 1.0f);\n}\n",
+    "sigmoid": "static float sigmoid(float x)\n{\n    return 1.0f / (1.0f + expf(-x));\n}\n",
+    "relu": "static float relu(float x)\n{\n    return x < 0.0f ? 0.0f : x;\n}\n",
+    "elu": "static float elu(float x)\n{\n    return x < 0.0f ? expm1f(x) : x;\n}\n",
+    # Comparisons that are false for NaN, so that it is passed on and not turned into a bound.
+    "bound": "static double bound(double x, double low, double high)\n{\n"
+    "    return x < low ? low : x > high ? high : x;\n}\n",
+    "find_largest": """static int find_largest(const float *values, int count)
+{
+    int largest = 0;
+    for (int i = 1; i < count; ++i) {
+        if (values[i] > values[largest]) {
+            largest = i;
+        }
+    }
+    return largest;
+}
+""",
+    # Weights lie input by input: the inner loop has independent sums, which compilers make SIMD instructions of.
+    "apply_linear": """static void apply_linear(const float *restrict weight, const float *restrict input, int inputs,
+                         float *restrict output, int outputs)
+{
+    int i = 0;
+    for (; i + 4 <= inputs; i += 4) {
+        const float *row = weight + (long)i * outputs;
+        const float a = input[i], b = input[i + 1], c = input[i + 2], d = input[i + 3];
+        for (int j = 0; j < outputs; ++j) {
+            output[j] += (a * row[j] + b * row[outputs + j]) + (c * row[2 * outputs + j] + d * row[3 * outputs + j]);
+        }
+    }
+    for (; i < inputs; ++i) {
+        const float *row = weight + (long)i * outputs;
+        for (int j = 0; j < outputs; ++j) {
+            output[j] += input[i] * row[j];
+        }
+    }
+}
+""",
+    # Gates in the order input, forget, cell, output.
+    "apply_gates": """static void apply_gates(const float *gates, int count, float *hidden, float *cell)
+{
+    for (int i = 0; i < count; ++i) {
+        const float kept = sigmoid(gates[count + i]) * cell[i];
+        cell[i] = kept + sigmoid(gates[i]) * hyperbolic_tangent(gates[2 * count + i]);
+        hidden[i] = sigmoid(gates[3 * count + i]) * hyperbolic_tangent(cell[i]);
+    }
+}
+""",
+}
+"""Functions that a source file gets if it calls them, in the order in which they stand there."""
+
+
+class CWriter:
+    """Writes a network, layer by layer. A value is the name of a C array of floats and its size."""
+
+    def __init__(self) -> None:
+        self.statements: list[str] = []
+        self.constants: list[str] = []
+        """Definitions of the arrays that the statements use."""
+        self._numbers: Counter[str] = Counter()
+
+    def find_functions(self) -> list[str]:
+        """Return the definitions of the functions that the statements call."""
+        text = "\n".join(self.statements)
+        if "apply_gates(" in text:
+            text += "sigmoid(hyperbolic_tangent("
+        return [function for name, function in _FUNCTIONS.items() if re.search(rf"\b{name}\(", text)]
+
+    def loop(self, count: int, statement: str) -> None:
+        """Add a statement for every `i` below `count`."""
+        self.statements += [f"for (int i = 0; i < {count}; ++i) {{", f"    {statement}", "}"]
+
+    def write(self, network: Network, sizes: dict[str, int], source: str) -> tuple[str, int]:
+        """Write everything up to the head; `sizes` are the elements of each part of the observation in `source`.
+
+        Returns the head's value.
+        """
+        counts = {key: _count_features(network.parts[key][0], size) for key, size in sizes.items()}
+        value, start, feature = self._declare("features", sum(counts.values())), 0, 0
+        for key, size in sizes.items():
+            self._write_part(network.parts[key][0], source, start, size, value, feature)
+            start, feature = start + size, feature + counts[key]
+        if network.lstm is not None:
+            value, feature = self._write_lstm(network.lstm, value, feature)
+        return self._write_layers([*network.trunk, *network.head], value, feature)
+
+    def _write_part(self, layer: Layer, source: str, start: int, size: int, target: str, feature: int) -> None:
+        """Write a part of the observation as features: one-hot, normalised or as it is."""
+        if isinstance(layer, OneHot):
+            for number, count in enumerate(layer.sizes.ravel().tolist()):
+                element = f"{target}[{_offset(feature)}]"
+                self.loop(count, f"{element} = (int){source}[{start + number}] == i ? 1.0f : 0.0f;")
+                feature += count
+            return
+        value = f"{source}[{_offset(start)}]"
+        if isinstance(layer, Normalize):
+            # In float64, as `Normalize` computes it.
+            deviation = self.constant("deviation", np.sqrt(layer.variance + layer.epsilon), "double")
+            value = f"({value} - {self.constant('mean', layer.mean, 'double')}) / {deviation}"
+            if np.isfinite(layer.clip):
+                value = f"bound({value}, {write_number(-layer.clip, 'double')}, {write_number(layer.clip, 'double')})"
+            value = f"(float)({value})"
+        self.loop(size, f"{target}[{_offset(feature)}] = {value};")
+
+    def _write_layers(self, layers: Iterable[Layer], value: str, size: int) -> tuple[str, int]:
+        for layer in layers:
+            x = f"{value}[i]"
+            if isinstance(layer, Linear):
+                source, inputs, size = value, size, len(layer.bias)
+                value = self._declare("layer", size)
+                self.loop(size, f"{value}[i] = {self.constant('bias', layer.bias)};")
+                self._add_linear(layer.weight, source, inputs, value)
+            elif isinstance(layer, BatchRenorm):
+                deviation = self.constant("deviation", np.sqrt(layer.variance + layer.epsilon))
+                centred = f"({x} - {self.constant('mean', layer.mean)}) / {deviation}"
+                scale, bias = self.constant("scale", layer.scale), self.constant("bias", layer.bias)
+                self.loop(size, f"{x} = {centred} * {scale} + {bias};")
+            elif isinstance(layer, Clip):
+                self.loop(size, f"{x} = (float)bound({x}, {-layer.limit!r}, {layer.limit!r});")
+            else:
+                assert isinstance(layer, Activation)  # images, which have other layers, are refused before
+                self.loop(size, f"{x} = {_ACTIVATIONS[layer.name].format(x=x)};")
+        return value, size
+
+    def _write_lstm(self, lstm: Lstm, value: str, size: int) -> tuple[str, int]:
+        count = lstm.state.shape[2]
+        for number, layer in enumerate(lstm.layers):
+            hidden, cell = (f"state->{member} + {number * count}" for member in ("hidden", "cell"))
+            gates = self._declare("gates", 4 * count)
+            bias = np.sum(layer.biases, axis=0) if layer.biases else np.zeros(4 * count)
+            self.loop(4 * count, f"{gates}[i] = {self.constant('bias', bias)};")
+            self._add_linear(layer.of_input, value, size, gates)
+            self._add_linear(layer.of_hidden, hidden, count, gates)
+            self.statements.append(f"apply_gates({gates}, {count}, {hidden}, {cell});")
+            value, size = hidden, count
+        return value, size
+
+    def write_action(self, network: Network, value: str, size: int, space: spaces.Space[Any], kind: str) -> None:
+        """Write the action of C type `kind` from the head's value: bounded or scaled, or the most likely choices."""
+        if isinstance(space, spaces.MultiBinary):
+            self.loop(size, f"action[i] = {value}[i] > 0.0f;")
+        elif not isinstance(space, spaces.Box):
+            counts = space.nvec.tolist() if isinstance(space, spaces.MultiDiscrete) else [size]
+            for index, count in enumerate(counts):
+                offset = sum(counts[:index])
+                self.statements.append(f"action[{index}] = find_largest({value} + {offset}, {count});")
+        else:
+            low, high = space.low.ravel(), space.high.ravel()
+            x = f"{value}[i]"
+            if network.ends_with_tanh:
+                self.loop(size, f"{x} = hyperbolic_tangent({x});")
+            lowest = self.constant("low", low, kind)
+            if network.is_squashed:
+                x = f"({x} + 1.0f) * 0.5f * {self.constant('range', high - low, kind)} + {lowest}"
+            else:
+                x = f"({kind})bound({x}, {lowest}, {self.constant('high', high, kind)})"
+            self.loop(size, f"action[i] = {x};")
+
+    def constant(self, name: str, values: NDArray[Any], kind: str = "float") -> str:
+        """Return the element `i` of a constant array; one number where all elements are the same."""
+        flat = values.ravel()
+        if (flat == flat[0]).all():
+            return write_number(flat[0], kind)
+        return f"{self._define(name, flat, kind)}[i]"
+
+    def _define(self, name: str, values: NDArray[Any], kind: str = "float") -> str:
+        name = self._number(name)
+        numbers = [write_number(each, kind) for each in values]
+        rows = [", ".join(numbers[low : low + _PER_LINE]) for low in range(0, len(numbers), _PER_LINE)]
+        body = ",\n    ".join(rows)
+        self.constants.append(f"static const {kind} {name}[{len(values)}] = {{\n    {body},\n}};\n")
+        return name
+
+    def _add_linear(self, weight: NDArray[Any], source: str, inputs: int, target: str) -> None:
+        constant = self._define("weight", weight.T.ravel())
+        self.statements.append(f"apply_linear({constant}, {source}, {inputs}, {target}, {len(weight)});")
+
+    def _declare(self, name: str, size: int) -> str:
+        name = self._number(name)
+        self.statements.append(f"float {name}[{size}];")
+        return name
+
+    def _number(self, name: str) -> str:
+        self._numbers[name] += 1
+        return f"{name}_{self._numbers[name]}"
+
+
+def _count_features(layer: Layer, size: int) -> int:
+    return int(layer.sizes.sum()) if isinstance(layer, OneHot) else size
+
+
+def _offset(offset: int) -> str:
+    return f"{offset} + i" if offset else "i"
+
+
+def write_number(value: Any, kind: str) -> str:
+    """Return a number as C reads it back, bit for bit."""
+    if np.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    return f"{np.float32(value)!s}f" if kind == "float" else repr(float(value))

@@ -1,0 +1,251 @@
+"""Builds one ONNX graph, node by node, of layers with their present weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import helper, numpy_helper
+
+from rlctl.errors import UsageError
+from rlctl.policy.layers import (
+    Activation,
+    BatchRenorm,
+    Clip,
+    Convolution,
+    Flatten,
+    Layer,
+    Linear,
+    Lstm,
+    LstmLayer,
+    Normalize,
+    OneHot,
+    ScaleImage,
+)
+from rlctl.version import __version__
+
+OPSET = 17
+"""Read by onnxruntime 1.12 and newer."""
+IR_VERSION = 8
+"""The one that belongs to the opset; the onnx package would write its newest, which older runtimes refuse."""
+BATCH = "batch"
+"""Name of the dynamic dimension."""
+
+
+class Graph:
+    """A graph that grows by `add`; values are known by their names.
+
+    Inputs and outputs have the names a caller sees. Everything inside starts with a slash, so the two never meet.
+    """
+
+    def __init__(self) -> None:
+        self._nodes: list[onnx.NodeProto] = []
+        self._constants: dict[str, onnx.TensorProto] = {}
+        self._inputs: list[onnx.ValueInfoProto] = []
+        self._outputs: list[onnx.ValueInfoProto] = []
+
+    def input(self, name: str, dtype: Any, shape: Sequence[int | str], meaning: str) -> str:
+        """Add an input; raises `UsageError` if its name is taken, as a dict observation may have any key."""
+        if not name or name.startswith("/") or name in (each.name for each in self._inputs):
+            raise UsageError(f"export: an observation cannot be named {name!r} in an ONNX file")
+        self._inputs.append(helper.make_tensor_value_info(name, _find_type(dtype), list(shape), meaning))
+        return name
+
+    def constant(self, name: str, value: Any) -> str:
+        """Add a constant array and return its name."""
+        array: NDArray[Any] = np.asarray(value)
+        name = f"/{name}"
+        self._constants[name] = numpy_helper.from_array(np.array(array, order="C"), name)
+        return name
+
+    def add(self, operator: str, *inputs: str, **attributes: Any) -> str:
+        """Add a node with one output and return the output's name."""
+        return self.add_with_outputs(operator, inputs, 1, **attributes)[0]
+
+    def add_with_outputs(self, operator: str, inputs: Sequence[str], count: int, **attributes: Any) -> list[str]:
+        """Add a node and return the names of its outputs; an input named "" is left out."""
+        name = f"/{operator}_{len(self._nodes)}"
+        outputs = [name if count == 1 else f"{name}.{index}" for index in range(count)]
+        self._nodes.append(helper.make_node(operator, list(inputs), outputs, name=name, **attributes))
+        return outputs
+
+    def cast(self, value: str, dtype: Any) -> str:
+        """Add a conversion to a numpy dtype."""
+        return self.add("Cast", value, to=_find_type(dtype))
+
+    def output(self, value: str, name: str, dtype: Any, shape: Sequence[int | str], meaning: str) -> None:
+        """Make a value an output, under a name."""
+        if name in (each.name for each in self._inputs):
+            raise UsageError(f"export: an observation cannot be named {name!r} in an ONNX file, an output is")
+        for node in self._nodes:
+            for names in (node.input, node.output):
+                names[:] = [name if each == value else each for each in names]
+        self._outputs.append(helper.make_tensor_value_info(name, _find_type(dtype), list(shape), meaning))
+
+    def model(self, metadata: Mapping[str, str], meaning: str) -> onnx.ModelProto:
+        """Return the checked model; raises onnx's `ValidationError` if the graph makes no sense."""
+        graph = helper.make_graph(
+            self._nodes, "policy", self._inputs, self._outputs, list(self._constants.values()), meaning
+        )
+        model = helper.make_model(
+            graph,
+            producer_name="rlctl",
+            producer_version=__version__,
+            opset_imports=[helper.make_opsetid("", OPSET)],
+            ir_version=IR_VERSION,
+        )
+        helper.set_model_props(model, dict(metadata))
+        onnx.checker.check_model(model, full_check=True)
+        return model
+
+
+def unsupported(what: str) -> UsageError:
+    """Return the error for a part of a policy that has no translation."""
+    return UsageError(f"export: {what} cannot be written as ONNX yet")
+
+
+def _find_type(dtype: Any) -> int:
+    return int(helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
+
+
+def emit(graph: Graph, value: str, layers: Iterable[Layer]) -> str:
+    """Apply layers one after the other to a value of shape (batch, ...) and return the result."""
+    for layer in layers:
+        value = _EMIT[type(layer)](graph, value, layer)
+    return value
+
+
+def concatenate(graph: Graph, parts: list[str]) -> str:
+    """Join values of shape (batch, size)."""
+    return graph.add("Concat", *parts, axis=1) if len(parts) > 1 else parts[0]
+
+
+def _emit_linear(graph: Graph, value: str, layer: Linear) -> str:
+    weight, bias = (graph.constant(f"{layer.name}.{part}", getattr(layer, part)) for part in ("weight", "bias"))
+    return graph.add("Gemm", value, weight, bias, transB=1)
+
+
+def _emit_convolution(graph: Graph, value: str, layer: Convolution) -> str:
+    weight, bias = (graph.constant(f"{layer.name}.{part}", getattr(layer, part)) for part in ("weight", "bias"))
+    return graph.add(
+        "Conv", value, weight, bias, kernel_shape=list(layer.weight.shape[2:]), strides=[layer.stride, layer.stride]
+    )
+
+
+def _emit_batch_renorm(graph: Graph, value: str, layer: BatchRenorm) -> str:
+    # Step by step as sb3-contrib computes it: folded into one multiplication and addition, a mean that is large
+    # against its deviation would cost digits.
+    value = graph.add("Sub", value, graph.constant(f"{layer.name}.ra_mean", layer.mean))
+    deviation = graph.constant(f"{layer.name}.deviation", np.sqrt(layer.variance + layer.epsilon))
+    value = graph.add("Mul", graph.add("Div", value, deviation), graph.constant(f"{layer.name}.scale", layer.scale))
+    return graph.add("Add", value, graph.constant(f"{layer.name}.bias", layer.bias))
+
+
+def _emit_normalize(graph: Graph, value: str, layer: Normalize) -> str:
+    # In float64, as `Normalize` computes it.
+    value = graph.cast(value, np.float64)
+    value = graph.add("Sub", value, graph.constant(f"{layer.name}/mean", np.float64(layer.mean)))
+    deviation = np.sqrt(np.float64(layer.variance) + layer.epsilon)
+    value = graph.add("Div", value, graph.constant(f"{layer.name}/deviation", deviation))
+    low, high = (graph.constant(f"{layer.name}/{end}", np.float64(at * layer.clip)) for end, at in _ENDS.items())
+    return graph.cast(graph.add("Clip", value, low, high), np.float32)
+
+
+_ENDS = {"low": -1, "high": 1}
+
+
+def _emit_one_hot(graph: Graph, value: str, layer: OneHot) -> str:
+    levels = graph.constant(f"{layer.name}/levels", np.array([0.0, 1.0], np.float32))
+    if layer.sizes.ndim == 0:
+        return graph.add("OneHot", value, graph.constant(f"{layer.name}/depth", np.int64(layer.sizes)), levels)
+    parts = []
+    for index, size in enumerate(layer.sizes.tolist()):
+        column = graph.add("Gather", value, graph.constant(f"{layer.name}/{index}", np.int64(index)), axis=1)
+        depth = graph.constant(f"{layer.name}/{index}/depth", np.int64(size))
+        parts.append(graph.add("OneHot", column, depth, levels))
+    return concatenate(graph, parts)
+
+
+def _emit_scale_image(graph: Graph, value: str, layer: ScaleImage) -> str:
+    if layer.channels_last:
+        value = graph.add("Transpose", value, perm=[0, 3, 1, 2])
+    return graph.add("Div", value, graph.constant(layer.name, np.float32(255.0)))
+
+
+def _emit_clip(graph: Graph, value: str, layer: Clip) -> str:
+    low, high = (graph.constant(f"{layer.name}.{end}", np.float32(at * layer.limit)) for end, at in _ENDS.items())
+    return graph.add("Clip", value, low, high)
+
+
+def _emit_activation(graph: Graph, value: str, layer: Activation) -> str:
+    if layer.name == "silu":
+        return graph.add("Mul", value, graph.add("Sigmoid", value))
+    operator, attributes = _OPERATORS[layer.name]
+    return graph.add(operator, value, **attributes)
+
+
+_OPERATORS: dict[str, tuple[str, dict[str, float]]] = {
+    "tanh": ("Tanh", {}),
+    "relu": ("Relu", {}),
+    "elu": ("Elu", {"alpha": 1.0}),
+}
+_EMIT: dict[type[Layer], Callable[[Graph, str, Any], str]] = {
+    Linear: _emit_linear,
+    Convolution: _emit_convolution,
+    BatchRenorm: _emit_batch_renorm,
+    Normalize: _emit_normalize,
+    OneHot: _emit_one_hot,
+    ScaleImage: _emit_scale_image,
+    Flatten: lambda graph, value, layer: graph.add("Flatten", value, axis=1),
+    Clip: _emit_clip,
+    Activation: _emit_activation,
+}
+
+
+def emit_lstm(graph: Graph, value: str, state: tuple[str, str], lstm: Lstm) -> tuple[str, tuple[str, str]]:
+    """Apply one step of an LSTM to a value of shape (batch, size).
+
+    `state` names the hidden and the cell state, each of shape (layers, batch, hidden). Returns the value, of shape
+    (batch, hidden), and the next state.
+    """
+    time, count = graph.constant(f"{lstm.name}.time", np.array([0])), len(lstm.layers)
+    before = [graph.add_with_outputs("Split", [part], count, axis=0) if count > 1 else [part] for part in state]
+    sequence = graph.add("Unsqueeze", value, time)
+    after: list[list[str]] = [[], []]
+    for number, layer in enumerate(lstm.layers):
+        outputs, hidden, cell = graph.add_with_outputs(
+            "LSTM",
+            [
+                sequence,
+                *_add_lstm_constants(graph, layer, f"{lstm.name}.{number}"),
+                "",
+                *(part[number] for part in before),
+            ],
+            3,
+            hidden_size=lstm.state.shape[2],
+        )
+        sequence = graph.add("Squeeze", outputs, graph.constant(f"{lstm.name}.direction", np.array([1])))
+        after[0].append(hidden)
+        after[1].append(cell)
+    joined = [graph.add("Concat", *parts, axis=0) if count > 1 else parts[0] for parts in after]
+    return graph.add("Squeeze", sequence, time), (joined[0], joined[1])
+
+
+def _add_lstm_constants(graph: Graph, layer: LstmLayer, name: str) -> list[str]:
+    """Input weights, recurrent weights and biases of a layer, with a leading dimension for ONNX's directions."""
+    weights = [_reorder_gates(each) for each in (layer.of_input, layer.of_hidden)]
+    biases = [_reorder_gates(each) for each in layer.biases] or [np.zeros(len(weights[0]), np.float32)] * 2
+    return [
+        graph.constant(f"{name}.weight_ih", weights[0][None]),
+        graph.constant(f"{name}.weight_hh", weights[1][None]),
+        graph.constant(f"{name}.bias", np.concatenate(biases)[None]),
+    ]
+
+
+def _reorder_gates(values: NDArray[Any]) -> NDArray[Any]:
+    """From torch's order of gates, input forget cell output, to ONNX's, input output forget cell."""
+    i, f, c, o = np.split(values, 4)
+    return np.concatenate([i, o, f, c])

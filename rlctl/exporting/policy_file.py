@@ -1,0 +1,97 @@
+"""`rlctl export RUN --policy FILE`: the actor alone, with where it is from and what it scores."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from rich.filesize import decimal as format_bytes
+
+from rlctl import output
+from rlctl.environments.task_version import identify_task
+from rlctl.errors import UsageError
+from rlctl.evaluation.evaluate import EvalRequest
+from rlctl.evaluation.score import describe_score, measure_score
+from rlctl.policy.network import select_actor_tensors
+from rlctl.policy.policy import PolicyInfo, read_info, read_policy, save_policy
+from rlctl.policy.shipped import Provenance
+from rlctl.rollout.baselines import BASELINES
+from rlctl.run import lookup
+from rlctl.run.lookup import FoundPolicy
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyFileReport:
+    """A policy file that was written."""
+
+    path: Path
+    info: PolicyInfo
+    provenance: Provenance
+    size: int
+    """[bytes]"""
+
+
+def export_actor(run: str | None, *, checkpoint: str, target: Path, episodes: int = 100) -> PolicyFileReport:
+    """Measure a run's policy and write its actor, with that score, recipe, task version and commit.
+
+    Zero and random actions are measured on the same episodes. A policy file that was written so is measured anew, as
+    its task is now. Raises `UsageError` for any other policy without a run.
+    """
+    if target.suffix != ".safetensors":
+        raise UsageError(f"--policy {target}: the name of a policy file ends in .safetensors")
+    found = lookup.find_policy(run, checkpoint)
+    output.print_notes(found.notes)
+    origin = _find_origin(found)
+    info, tensors = read_policy(found.file)
+    spec = found.locate(info.spec)
+    request = EvalRequest(run=str(found.file), episodes=episodes)
+    provenance = Provenance(
+        **origin,
+        **identify_task(spec.task),
+        score=measure_score(request),
+        baselines={name: measure_score(dataclasses.replace(request, baseline=name, spec=spec)) for name in BASELINES},
+    )
+    info = info.model_copy(update={"provenance": provenance})
+    save_policy(target, info, select_actor_tensors(info, tensors))
+    return PolicyFileReport(target, info, provenance, target.stat().st_size)
+
+
+def _find_origin(found: FoundPolicy) -> dict[str, Any]:
+    """Return which training a policy is from, as `Provenance` has it."""
+    if found.run is not None:
+        return {
+            "run": "/".join(found.run.path.resolve().parts[-2:]),
+            "git_commit": found.run.status().get("git_commit"),
+            "recipe": found.run.recipe().model_dump(mode="json", by_alias=True),
+        }
+    before = read_info(found.file).provenance if found.file.suffix == ".safetensors" else None
+    if before is None:
+        raise UsageError(f"{found.file}: no recipe is known of this policy; give the run that it is from")
+    return before.model_dump(include={"run", "git_commit", "recipe"})
+
+
+def show(report: PolicyFileReport, json: str | None) -> None:
+    """Print a report, or JSON alone for `-`."""
+    if json is not None and output.write_result_json(json, as_json(report)):
+        return
+    out, info, provenance = output.out(), report.info, report.provenance
+    out.print(f"exported {report.path} ({format_bytes(report.size)}): the actor of {provenance.run}")
+    out.print(f"{info.algo} for {info.spec.task}, step {info.training_steps:,}")
+    for name, score in {"policy": provenance.score, **provenance.baselines}.items():
+        out.print(f"{name:8} {describe_score(score)}")
+    out.print(
+        f"{output.format_count(provenance.score.episodes, 'episode')}, seed {provenance.score.seed}; 95 % intervals"
+    )
+
+
+def as_json(report: PolicyFileReport) -> dict[str, Any]:
+    """Return a report as plain data."""
+    return {
+        "path": report.path,
+        "bytes": report.size,
+        "task": report.info.spec.task,
+        "algo": report.info.algo,
+        "training_steps": report.info.training_steps,
+        **report.provenance.model_dump(),
+    }

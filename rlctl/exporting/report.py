@@ -1,0 +1,106 @@
+"""What an export reports: the file, how it was verified, what goes in and comes out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rlctl import output
+from rlctl.exporting.verify import MAX_DIFFERENCE, Agreement, ClosedLoop, Latency
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExportReport:
+    """A file that was exported, and how it was verified."""
+
+    path: Path
+    policy: Path
+    task: str
+    algo: str
+    training_steps: int
+    size: int
+    """[bytes]"""
+    written: str
+    """What was written, for people."""
+    interface: list[tuple[str, str]]
+    """What goes in and comes out, for people: a word and a text each."""
+    next: str
+    """A command to go on with."""
+    details: Mapping[str, Any]
+    """What is known of a file of this format alone."""
+    agreement: Agreement | None = None
+    closed_loop: ClosedLoop | None = None
+    latency: Latency | None = None
+    not_verified: str = ""
+    """Why it was not verified; empty if it was."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what is written as JSON."""
+        result = {**dataclasses.asdict(self), **self.details, "verified": not self.not_verified}
+        for name in ("written", "interface", "next", "details"):
+            del result[name]
+        if self.agreement and self.latency:
+            result |= {name: getattr(self.agreement, name) for name in ("max_difference", "observations")}
+            result["latency"]["speedup"] = self.latency.speedup
+        return result
+
+    def list_rows(self) -> list[tuple[str, str]]:
+        """Return the lines of the report: a word and a text each."""
+        policy = f"{self.algo} for {self.task}, {self.training_steps:,} steps, from {self.policy}"
+        rows = [("exported", self.written), ("policy", policy), *self.interface]
+        if self.not_verified or not (self.agreement and self.closed_loop and self.latency):
+            return [*rows, ("not verified", self.not_verified), ("next", self.next)]
+        latency = self.latency
+        times = f"{latency.exported_us:.1f} us for one observation; SB3 {latency.sb3_us:.1f} us, {latency.speedup:.1f}x"
+        return [
+            *rows,
+            ("verified", format_agreement(self.agreement)),
+            ("closed loop", format_closed_loop(self.closed_loop)),
+            ("latency", times),
+            ("next", self.next),
+        ]
+
+
+def show(reports: list[ExportReport], json: str | None) -> None:
+    """Print the reports of one policy, or write them as JSON to a file or, for `-`, to stdout.
+
+    The JSON of one format is an object; of several it is one object per format, by the suffix of its file.
+    """
+    if json is not None:
+        by_format = {each.path.suffix[1:]: each.as_json() for each in reports}
+        if output.write_result_json(json, by_format if len(reports) > 1 else reports[0].as_json()):
+            return
+    from rich.text import Text
+
+    for number, report in enumerate(reports):
+        if number:
+            output.out().print()
+        rows = [(Text(name, style="bold"), text) for name, text in report.list_rows()]
+        output.print_table(("", ""), rows, left=("",))
+
+
+def format_agreement(agreement: Agreement) -> str:
+    """Return the comparison on observations, in a line."""
+    sizes = " and ".join(str(size) for size in agreement.batch_sizes)
+    text = (
+        f"max |difference| {agreement.max_difference:.1e} (limit {MAX_DIFFERENCE:.0e}) "
+        f"on {agreement.observations:,} observations, batches of {sizes}"
+    )
+    if agreement.beyond_limit:
+        text += f"; {agreement.beyond_limit:,} actions beyond the limit"
+    if agreement.near_ties:
+        text += f"; {agreement.near_ties:,} near-ties chosen differently"
+    return text
+
+
+def format_closed_loop(loop: ClosedLoop) -> str:
+    """Return the comparison of whole episodes, in a line."""
+    episodes = output.format_count(loop.episodes, "episode")
+    text = (
+        f"{episodes}: success same in {loop.same_success}, length in {loop.same_length}, "
+        f"return within {loop.max_return_difference:.1e} "
+        f"(mean {loop.mean_return:.5g} and {loop.mean_return_exported:.5g})"
+    )
+    return f"{text}; the policy itself differs as much with other last bits" if loop.magnified else text

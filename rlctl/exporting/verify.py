@@ -1,0 +1,284 @@
+"""Is the exported file the policy? Compared on real rollouts, observation by observation and in closed loop; timed."""
+
+from __future__ import annotations
+
+import dataclasses
+import operator
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.environments.dict_spaces import map_parts, stack, take_row
+from rlctl.policy.c_policy import CPolicy
+from rlctl.policy.onnx_policy import OnnxPolicy
+from rlctl.policy.policy import Policy
+from rlctl.rollout.collect import Episode, play_episodes
+from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.rollout.workers import Workers
+
+if TYPE_CHECKING:
+    from rlctl.policy.torch_policy import TorchPolicy
+
+MAX_DIFFERENCE = 1e-5
+"""Largest |difference| of an action element; relative to the element where that is larger than 1."""
+MAX_RETURN_DIFFERENCE = 1e-3
+"""Largest difference of an episode's return, relative."""
+MIN_OBSERVATIONS = 1000
+EPISODES = 20
+"""Episodes played in closed loop by each of the two policies."""
+_LAST_BITS = 2.0**-21
+"""Relative; of a 32-bit number the last three bits, about as much as another order of additions makes in a network."""
+_REPETITIONS = 300
+_WARM_UP = 30
+_CALLS = 10  # of a C function within one measurement
+
+
+@dataclasses.dataclass
+class Agreement:
+    """How close two policies came on the same observations."""
+
+    observations: int = 0
+    max_difference: float = 0.0
+    """Largest |difference| of an action element, in the action's own units."""
+    beyond_limit: int = 0
+    """Actions that differ by more than the limit; for discrete actions, that differ at all."""
+    near_ties: int = 0
+    """Discrete actions that differ because their logits agree within the limit: either choice is right."""
+    batch_sizes: list[int] = dataclasses.field(default_factory=lambda: [1])
+    """How many observations the exported policy was given at once."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether no action differs by more than the limit."""
+        return self.beyond_limit == 0
+
+
+class Comparison:
+    """Collects how far apart actions are. `add` right after the torch policy has acted: its logits are looked at."""
+
+    def __init__(self, torch_policy: TorchPolicy) -> None:
+        self.found = Agreement()
+        self._space = torch_policy.action_space
+        self._logits: NDArray[np.float32]
+        if not isinstance(self._space, spaces.Box):
+            network: Any = torch_policy.network
+            head = network.q_net.q_net[-1] if torch_policy.info.algo == "dqn" else network.action_net
+            self._hook = head.register_forward_hook(self._keep_logits)
+
+    def _keep_logits(self, module: Any, inputs: Any, output: Any) -> None:
+        self._logits = output.detach().cpu().numpy()
+
+    def add(self, expected: NDArray[Any], actions: NDArray[Any]) -> None:
+        """Compare two arrays of actions, shape (rows, ...)."""
+        difference = np.abs(expected.astype(np.float64) - actions).reshape(len(expected), -1)
+        # Written so that NaN is beyond the limit.
+        limit = MAX_DIFFERENCE * np.maximum(1.0, np.abs(expected)).reshape(difference.shape)
+        differs = ~(difference <= limit).all(axis=1)
+        if not isinstance(self._space, spaces.Box):
+            for row in np.flatnonzero(differs).tolist():
+                if self._is_near_tie(row, expected[row], actions[row]):
+                    self.found.near_ties += 1
+                    differs[row], difference[row] = False, 0.0
+        self.found.max_difference = max(self.found.max_difference, float(difference.max()))
+        self.found.beyond_limit += int(differs.sum())
+
+    def _is_near_tie(self, row: int, expected: NDArray[Any], action: NDArray[Any]) -> bool:
+        return all(
+            margin <= MAX_DIFFERENCE * max(1.0, size)
+            for margin, size in _list_margins(self._space, self._logits[row], expected, action)
+        )
+
+    def close(self) -> None:
+        """Stop looking at logits."""
+        if not isinstance(self._space, spaces.Box):
+            self._hook.remove()
+
+
+def _list_margins(
+    space: spaces.Space[Any], logits: NDArray[np.float32], expected: NDArray[Any], action: NDArray[Any]
+) -> list[tuple[float, float]]:
+    """By how much, per choice, the logit of the expected one is ahead, and the size of that logit."""
+    if isinstance(space, spaces.MultiBinary):  # against a logit of zero, which is a probability of one half
+        wrong = np.flatnonzero(expected != action)
+        return [(abs(float(logits[index])), 0.0) for index in wrong]
+    sizes = space.nvec if isinstance(space, spaces.MultiDiscrete) else [len(logits)]
+    groups = np.split(logits, np.cumsum(sizes)[:-1])
+    choices = zip(groups, np.atleast_1d(expected), np.atleast_1d(action), strict=True)
+    return [(float(group[ours] - group[theirs]), abs(float(group[ours]))) for group, ours, theirs in choices]
+
+
+@dataclasses.dataclass(frozen=True)
+class ClosedLoop:
+    """The same episodes, played once with each policy."""
+
+    episodes: int
+    same_success: int
+    same_length: int
+    max_return_difference: float
+    """Relative to the larger of the episode's own return and the mean size of a return."""
+    mean_return: float
+    mean_return_exported: float
+    magnified: bool = False
+    """Whether the policy's own episodes come out as differently when the last bits of its weights change."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether every episode had the same success and length, and a return within the limit."""
+        same = self.same_success == self.same_length == self.episodes
+        return same and self.max_return_difference <= MAX_RETURN_DIFFERENCE
+
+
+@dataclasses.dataclass(frozen=True)
+class Latency:
+    """Median time for one observation [us]."""
+
+    exported_us: float
+    """With everything: normalisation, network, bounds. An ONNX file on onnxruntime, called from Python; C alone."""
+    sb3_us: float
+    """SB3's `policy.predict` of an observation that is normalised already."""
+
+    @property
+    def speedup(self) -> float:
+        """How many times as fast as SB3 the file is."""
+        return self.sb3_us / self.exported_us
+
+
+def verify(
+    torch_policy: TorchPolicy,
+    exported: Policy,
+    tensors: Mapping[str, NDArray[Any]],
+    file: Path,
+    workers: Workers,
+    min_observations: int = MIN_OBSERVATIONS,
+) -> tuple[Agreement, ClosedLoop]:
+    """Play the same episodes with both; on every observation of either, ask torch and the exported policy.
+
+    `tensors` are the policy file's; `file` is the exported one, an ONNX file or a compiled library.
+    Rollouts go on until `min_observations` were compared. Where all actions agree and the episodes do not, the policy
+    plays them with other last bits. Raises `TaskError` if the environment fails.
+    """
+    comparison = Comparison(torch_policy)
+    seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
+    workers.set_policy(torch_policy.info, dict(tensors))
+    expected = play_episodes(workers, seeds, record=True)
+    _compare_actions(torch_policy, exported, expected, comparison)
+    if isinstance(exported, OnnxPolicy):
+        _compare_batch(torch_policy, exported, expected, comparison)
+    played = EPISODES
+    while comparison.found.observations < min_observations:
+        missing = min_observations / comparison.found.observations - 1.0
+        total = played + max(1, round(1.1 * missing * played))
+        more = play_episodes(workers, episode_seeds(0, Stream.VERIFY, total)[played:], record=True)
+        _compare_actions(torch_policy, exported, more, comparison)
+        played = total
+    workers.set_other_policy(str(file.resolve()))
+    done = play_episodes(workers, seeds, record=True)
+    compared = comparison.found.observations
+    _compare_actions(torch_policy, exported, done, comparison)
+    comparison.found.observations = compared  # those of one policy's rollouts are counted
+    comparison.close()
+    loop = compare_episodes(expected, done)
+    if comparison.found.agrees and not loop.agrees:
+        loop = dataclasses.replace(loop, magnified=_magnifies_rounding(torch_policy, tensors, workers, expected))
+    return comparison.found, loop
+
+
+def _magnifies_rounding(
+    torch_policy: TorchPolicy, tensors: Mapping[str, NDArray[Any]], workers: Workers, expected: Sequence[Episode]
+) -> bool:
+    """Say whether an environment repeats itself, but not for a policy whose weights have other last bits.
+
+    Contacts do that to a robot within some hundred steps; its episodes cannot tell whether a policy is the same.
+    """
+    seeds = [episode.result.seed for episode in expected]
+    workers.set_policy(torch_policy.info, dict(tensors))
+    again = compare_episodes(expected, play_episodes(workers, seeds))
+    if again.max_return_difference > 0.0 or not again.agrees:
+        return False
+    workers.set_policy(torch_policy.info, {name: _change_last_bits(values) for name, values in tensors.items()})
+    return not compare_episodes(expected, play_episodes(workers, seeds)).agrees
+
+
+def _change_last_bits(values: NDArray[Any]) -> NDArray[Any]:
+    return (values * (1.0 + _LAST_BITS)).astype(values.dtype) if values.dtype.kind == "f" else values
+
+
+def _compare_actions(
+    torch_policy: TorchPolicy, exported: Policy, episodes: Sequence[Episode], comparison: Comparison
+) -> None:
+    """Ask both policies on all observations of some episodes."""
+    for episode in episodes:
+        assert episode.trajectory is not None  # recorded
+        observations, length = episode.trajectory.observations, len(episode.trajectory.actions)
+        torch_policy.reset()
+        exported.reset()
+        rows = 1 if torch_policy.is_recurrent else length
+        for low in range(0, length, rows):
+            some = map_parts(operator.itemgetter(slice(low, low + rows)), observations)
+            actions = [exported.predict(take_row(some, row)) for row in range(rows)]
+            comparison.add(torch_policy.act(some), np.stack(actions))
+        comparison.found.observations += length
+
+
+def _compare_batch(
+    torch_policy: TorchPolicy, exported: OnnxPolicy, episodes: Sequence[Episode], comparison: Comparison
+) -> None:
+    """Ask both policies on the first observations of some episodes, all at once."""
+    first = stack([take_row(each.trajectory.observations, 0) for each in episodes if each.trajectory is not None])
+    torch_policy.reset()
+    comparison.add(torch_policy.act(first), exported.start_episodes(first))
+    comparison.found.batch_sizes.append(len(episodes))
+
+
+def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> ClosedLoop:
+    """Compare episodes of the same seeds."""
+    pairs = [(ours.result, theirs.result) for ours, theirs in zip(expected, done, strict=True)]
+    returns = np.array([[ours.total_reward, theirs.total_reward] for ours, theirs in pairs])
+    # A return that happens to cancel out to nearly nothing is no measure of its own difference.
+    scale = np.maximum(np.abs(returns).max(axis=1), np.abs(returns).mean())
+    difference = np.abs(returns[:, 0] - returns[:, 1])
+    relative = np.divide(difference, scale, out=np.zeros_like(difference), where=scale > 0)
+    return ClosedLoop(
+        episodes=len(pairs),
+        same_success=sum(ours.success == theirs.success for ours, theirs in pairs),
+        same_length=sum(ours.length == theirs.length for ours, theirs in pairs),
+        max_return_difference=float(relative.max()),
+        mean_return=float(returns[:, 0].mean()),
+        mean_return_exported=float(returns[:, 1].mean()),
+    )
+
+
+def measure_latency(torch_policy: TorchPolicy, exported: Policy) -> Latency:
+    """Time both policies on one observation."""
+    space = torch_policy.observation_space
+    space.seed(0)
+    observation = space.sample()
+    normalized: Any = torch_policy.normalize(observation)
+    exported.reset()
+    return Latency(
+        exported_us=_measure_exported(exported, observation),
+        sb3_us=_measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True)),
+    )
+
+
+def _measure_exported(exported: Policy, observation: Any) -> float:
+    if isinstance(exported, CPolicy):
+        return _measure_median_us(lambda: exported.repeat(observation, _CALLS)) / _CALLS
+    return _measure_median_us(lambda: exported.predict(observation))
+
+
+def _measure_median_us(call: Callable[[], Any]) -> float:
+    for _ in range(_WARM_UP):
+        call()
+    times = []
+    for _ in range(_REPETITIONS):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times) * 1e6

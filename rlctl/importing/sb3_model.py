@@ -1,0 +1,259 @@
+"""Reads what Stable-Baselines3 and rl-zoo3 save, model.zip and vecnormalize.pkl, without unpickling anything."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import dataclasses
+import io
+import json
+import math
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
+from rlctl.errors import ArtifactError, UsageError, short_repr
+from rlctl.importing import pickle_data
+from rlctl.importing.pickle_data import Call, Name, NotPlainData, Persistent, read_array, read_dtype, read_plain
+from rlctl.storage import untrusted
+
+LARGEST_MEMBER = 500_000_000
+"""Bytes that a member of the archive may have unpacked."""
+
+_POLICIES = {
+    "stable_baselines3.sac": "sac",
+    "stable_baselines3.td3": "td3",
+    "stable_baselines3.dqn": "dqn",
+    "stable_baselines3.common.policies": "ppo",
+    "sb3_contrib.tqc": "tqc",
+    "sb3_contrib.crossq": "crossq",
+    "sb3_contrib.common.recurrent": "recurrent_ppo",
+}
+"""Module of the policy class -> algorithm; a model does not name its algorithm."""
+_SAME_POLICY = ({"ppo", "a2c"}, {"td3", "ddpg"})
+_ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu"}
+_EXTRACTORS = frozenset({"FlattenExtractor", "NatureCNN", "CombinedExtractor"})
+_TRAINING_ONLY = frozenset({"optimizer_class", "optimizer_kwargs"})
+_STORAGES = {
+    "DoubleStorage": "f8", "FloatStorage": "f4", "HalfStorage": "f2", "LongStorage": "i8", "IntStorage": "i4",
+    "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedModel:
+    """A model of Stable-Baselines3 or sb3-contrib."""
+
+    algo: str
+    observation_space: spaces.Space[Any]
+    """As the network sees it: images with channels first."""
+    action_space: spaces.Space[Any]
+    policy_kwargs: dict[str, Any]
+    """Plain data; the activation by its name in recipes."""
+    tensors: dict[str, NDArray[Any]]
+    """The policy's state, by SB3's names."""
+    training_steps: int
+    version: str
+    """Of Stable-Baselines3."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedNormalization:
+    """The observation statistics of a `VecNormalize`, by key of a dict observation, "" for any other."""
+
+    mean: dict[str, NDArray[np.float64]]
+    var: dict[str, NDArray[np.float64]]
+    clip: float
+
+
+def read_model(path: Path, algo: str | None = None) -> SavedModel:
+    """Read a model.zip; raises `ArtifactError` for what is not one, is too large, or holds what is not read.
+
+    `algo` is for models whose algorithm does not follow from the file: A2C beside PPO, DDPG beside TD3. Any other
+    than the file's raises `UsageError`.
+    """
+    with _explain_errors(path, "a model"), untrusted.open_file(path) as file, zipfile.ZipFile(file) as archive:
+        data = json.loads(_read_member(archive, "data"))
+        if not isinstance(data, dict):
+            raise NotPlainData("its data is not a mapping")
+        found = _find_algorithm(data)
+        if algo not in (None, found) and {algo, found} not in _SAME_POLICY:
+            raise UsageError(f"--algo {algo}: {path} is a model of {found}")
+        return SavedModel(
+            algo=algo or found,
+            observation_space=read_space(_decode(data, "observation_space")),
+            action_space=read_space(_decode(data, "action_space")),
+            policy_kwargs=_read_policy_kwargs(data),
+            tensors=read_tensors(_read_member(archive, "policy.pth")),
+            training_steps=int(data.get("num_timesteps") or 0),
+            version=_read_member(archive, _VERSION).decode().strip() if _VERSION in archive.namelist() else "",
+        )
+
+
+@contextlib.contextmanager
+def _explain_errors(path: Path, what: str) -> Iterator[None]:
+    """Make `ArtifactError` of whatever reading a file raises that nobody has checked."""
+    try:
+        yield
+    except NotPlainData as error:
+        raise ArtifactError(f"{path}: it holds what is not read from {what}: {error}") from None
+    except zipfile.BadZipFile:
+        raise ArtifactError(f"{path}: not a zip archive, so not {what} of Stable-Baselines3") from None
+    except (KeyError, ValueError, TypeError, AttributeError, OSError, RecursionError, NotImplementedError) as error:
+        raise ArtifactError(f"{path}: not {what} of Stable-Baselines3, or damaged: {error}") from None
+
+
+_VERSION = "_stable_baselines3_version"
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> bytes:
+    try:
+        member = archive.getinfo(name)
+    except KeyError:
+        raise NotPlainData(f"no {name!r} in it; there is: {', '.join(archive.namelist()[:8])}") from None
+    if member.file_size > LARGEST_MEMBER:
+        raise NotPlainData(f"{name!r} would take {member.file_size:,} bytes, at most {LARGEST_MEMBER:,} are read")
+    with archive.open(member) as stream:
+        return stream.read(member.file_size)
+
+
+def _decode(data: Mapping[str, Any], key: str) -> Any:
+    """Return an entry of the model's data: plain JSON, or the value its pickle describes."""
+    entry = data.get(key)
+    if isinstance(entry, dict) and ":serialized:" in entry:
+        return pickle_data.read(base64.b64decode(entry[":serialized:"]))
+    return entry
+
+
+def _find_algorithm(data: Mapping[str, Any]) -> str:
+    policy = _decode(data, "policy_class")
+    if not isinstance(policy, Name):
+        raise NotPlainData("a policy class of its own")
+    algo = next((algo for module, algo in _POLICIES.items() if policy.module.startswith(module)), None)
+    if algo is None:
+        raise NotPlainData(f"policy class {policy}")
+    if algo == "ppo" and "n_epochs" not in data:
+        return "a2c"
+    if algo == "td3" and data.get("policy_delay") == 1 and not data.get("target_noise_clip"):
+        return "ddpg"
+    return algo
+
+
+def _read_policy_kwargs(data: Mapping[str, Any]) -> dict[str, Any]:
+    given = _decode(data, "policy_kwargs") or {}
+    kwargs: dict[str, Any] = {"use_sde": True} if data.get("use_sde") else {}
+    for key, value in given.items():
+        if key in _TRAINING_ONLY:
+            continue
+        if key == "activation_fn":
+            if not isinstance(value, Name) or value.qualname not in _ACTIVATIONS:
+                raise NotPlainData(f"activation_fn {value}; read are: {', '.join(_ACTIVATIONS)}")
+            kwargs[key] = _ACTIVATIONS[value.qualname]
+        elif key == "features_extractor_class":
+            if not isinstance(value, Name) or value.qualname not in _EXTRACTORS:
+                raise NotPlainData(f"a features extractor of its own: {value}")
+        else:
+            kwargs[key] = read_plain(value)
+    return kwargs
+
+
+def read_space(value: Any) -> spaces.Space[Any]:
+    """Return the space that a pickle of gymnasium, or of the old gym, describes."""
+    kind, state = _split_object(value, "gym.spaces.", "gymnasium.spaces.")
+    if kind == "Box":
+        shape = tuple(state["_shape"] if "_shape" in state else state["shape"])
+        dtype = read_dtype(state["dtype"])
+        low, high = (read_array(state[name]).reshape(shape).astype(dtype) for name in ("low", "high"))
+        return spaces.Box(low, high, shape, dtype.type)
+    if kind == "Discrete":
+        return spaces.Discrete(int(read_array(state["n"])), start=int(read_array(state.get("start", 0))))
+    if kind == "MultiDiscrete":
+        return spaces.MultiDiscrete(read_array(state["nvec"]))
+    if kind == "MultiBinary":
+        return spaces.MultiBinary(read_array(state["n"]).tolist())
+    if kind == "Dict":
+        parts = state["spaces"].items
+        return spaces.Dict([(str(k), read_space(v)) for k, v in (parts() if callable(parts) else parts.items())])
+    raise NotPlainData(f"a space of the kind {kind}")
+
+
+def _split_object(value: Any, *modules: str) -> tuple[str, dict[str, Any]]:
+    """Return the class name and the attributes of an object of certain modules."""
+    if not isinstance(value, Call) or not str(value.function).startswith(modules) or not isinstance(value.state, dict):
+        given, module = getattr(value, "function", value), modules[-1].rstrip(".")
+        raise NotPlainData(f"{short_repr(given)} where an object of {module} is expected")
+    return value.function.qualname, value.state
+
+
+def read_normalization(path: Path) -> SavedNormalization | None:
+    """Read a vecnormalize.pkl; None if it does not normalise observations. Raises `ArtifactError` as `read_model`."""
+    with _explain_errors(path, "a VecNormalize"):
+        content = untrusted.read_bytes(path, LARGEST_MEMBER)
+        kind, state = _split_object(pickle_data.read(content), "stable_baselines3.common.vec_env.vec_normalize.")
+        if kind != "VecNormalize":
+            raise NotPlainData(f"{kind} where VecNormalize is expected")
+        if not state.get("norm_obs", True):
+            return None
+        epsilon = float(state.get("epsilon", 1e-8))
+        if epsilon != 1e-8:
+            raise NotPlainData(f"an epsilon of {epsilon:g}, Stable-Baselines3's own is 1e-08")
+        statistics = state["obs_rms"]
+        parts = statistics if isinstance(statistics, dict) else {"": statistics}
+        fields = {
+            key: _split_object(each, "stable_baselines3.common.running_mean_std.")[1] for key, each in parts.items()
+        }
+        return SavedNormalization(
+            mean={key: read_array(each["mean"]).astype(np.float64) for key, each in fields.items()},
+            var={key: read_array(each["var"]).astype(np.float64) for key, each in fields.items()},
+            clip=float(state["clip_obs"]),
+        )
+
+
+def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
+    """Return the tensors, by name, of a state dict that `torch.save` wrote (torch 1.6 or newer: a zip archive)."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        prefix = next(
+            (name.removesuffix("data.pkl") for name in archive.namelist() if name.endswith("/data.pkl")), None
+        )
+        if prefix is None:
+            raise NotPlainData("policy.pth without data.pkl: written by a torch older than 1.6")
+        order = _read_member(archive, f"{prefix}byteorder") if f"{prefix}byteorder" in archive.namelist() else b"little"
+        if order != b"little":
+            raise NotPlainData("tensors of a big-endian machine")
+        state = pickle_data.read(_read_member(archive, f"{prefix}data.pkl"))
+        entries = state.items if isinstance(state, Call) else state
+        tensors: dict[str, NDArray[Any]] = {}
+        left = LARGEST_MEMBER
+        for name, value in dict(entries).items():
+            tensors[str(name)] = tensor = _read_tensor(value, archive, prefix)
+            if (left := left - tensor.nbytes) < 0:  # many names may share one storage
+                raise NotPlainData(f"tensors of more than {LARGEST_MEMBER:,} bytes")
+        return tensors
+
+
+def _read_tensor(value: Any, archive: zipfile.ZipFile, prefix: str) -> NDArray[Any]:
+    if isinstance(value, Call) and str(value.function) == "torch._utils._rebuild_parameter":
+        value = value.arguments[0]
+    if not isinstance(value, Call) or str(value.function) != "torch._utils._rebuild_tensor_v2":
+        raise NotPlainData(f"{getattr(value, 'function', type(value).__name__)} where a tensor is expected")
+    storage, offset, shape, strides = value.arguments[:4]
+    if not isinstance(storage, Persistent):
+        raise NotPlainData("a tensor without storage")
+    _, kind, key, *_ = storage.content
+    dtype = np.dtype(_STORAGES[kind.qualname])
+    numbers = np.frombuffer(_read_member(archive, f"{prefix}data/{key}"), dtype)
+    last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
+    if min((offset, *shape, *strides), default=0) < 0 or (0 not in shape and last >= numbers.size):
+        raise NotPlainData("a tensor that reaches out of its storage")
+    if 0 in shape:
+        return np.zeros(shape, dtype)
+    if math.prod(shape) > numbers.size:  # strides of 0 repeat numbers without end
+        raise NotPlainData("a tensor larger than its storage")
+    steps = [stride * dtype.itemsize for stride in strides]
+    return as_strided(numbers[offset:], shape, steps).copy()

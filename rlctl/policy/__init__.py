@@ -1,0 +1,1 @@
+"""Policy files, and policies that act; NumPy, no torch but in `torch_policy`."""

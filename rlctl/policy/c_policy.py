@@ -1,0 +1,89 @@
+"""Policies exported as C, compiled into a shared library and called through ctypes: how an export is verified."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.environments.dict_spaces import SINGLE, split, split_space
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.policy.policy import Policy, PolicyInfo
+
+LIBRARY_SUFFIX = ".so"
+
+
+def observation_type(info: PolicyInfo) -> np.dtype[Any]:
+    """Return the type of the C function's observation: float, or double where the environment observes in float64."""
+    types = [part.dtype for part in split_space(info.env.spaces()[0]).values()]
+    return np.dtype(np.float64 if np.float64 in types else np.float32)
+
+
+def action_type(info: PolicyInfo) -> np.dtype[Any]:
+    """Return the type of the C function's action: as the environment takes it, int for choices."""
+    space = info.env.spaces()[1]
+    return np.result_type(np.float32, space.dtype) if isinstance(space, spaces.Box) else np.dtype(np.intc)
+
+
+class CPolicy(Policy):
+    """A policy in a shared library that `rlctl.exporting.c_source` has compiled. Deterministic."""
+
+    def __init__(self, info: PolicyInfo, library: ctypes.CDLL) -> None:
+        super().__init__(info)
+        self.library = library
+        self._act = library.rlctl_act
+        self._act.argtypes, self._act.restype = [ctypes.c_void_p] * 3, None
+        library.rlctl_repeat.argtypes, library.rlctl_repeat.restype = [*[ctypes.c_void_p] * 3, ctypes.c_long], None
+        library.rlctl_state_size.restype = ctypes.c_size_t
+        self._keys = list(split_space(self.observation_space))
+        size = sum(math.prod(part.shape or ()) for part in split_space(self.observation_space).values())
+        # C gets one observation and stacks frames by itself: the newest is the last.
+        self._observation = np.zeros(size // info.spec.frame_stack, observation_type(info))
+        self._frames = info.spec.frame_stack
+        self._action = np.zeros(math.prod(self.action_space.shape or ()), action_type(info))
+        # Opaque, and a multiple of four bytes.
+        self._memory = np.zeros(library.rlctl_state_size() // 4, np.float32)
+        self._pointers = tuple(each.ctypes.data for each in (self._observation, self._memory, self._action))
+        self._shape = self.action_space.shape or ()
+        self._dtype = self._action.dtype if isinstance(self.action_space, spaces.Box) else np.dtype(np.int64)
+
+    @classmethod
+    def load(cls, path: Path) -> CPolicy:
+        """Load a library whose description is the JSON file beside it; raises `ArtifactError` if it does not load."""
+        try:
+            info = PolicyInfo.model_validate(json.loads(path.with_suffix(".json").read_text()))
+            return cls(info, ctypes.CDLL(str(path)))
+        except OSError as error:
+            raise ArtifactError(f"{path}: the compiled policy does not load: {error}") from None
+
+    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
+        """Return the action for one observation; a policy that remembers does so until `reset`."""
+        if not deterministic:
+            raise UsageError("an exported policy cannot sample: only its deterministic action is in the C file")
+        self._fill(split(observation))
+        self._act(*self._pointers)
+        return self._action.reshape(self._shape).astype(self._dtype)
+
+    def reset(self) -> None:
+        """Begin an episode: forget the recurrent state and earlier frames."""
+        self._memory[:] = 0.0
+
+    def repeat(self, observation: Any, count: int) -> None:
+        """Act `count` times on one observation, within C."""
+        self._fill(split(observation))
+        self.library.rlctl_repeat(*self._pointers, count)
+
+    def _fill(self, parts: dict[str, Any]) -> None:
+        if self._frames > 1:
+            value = np.reshape(parts[SINGLE], (self._frames, -1))[-1]
+        elif len(parts) > 1:
+            value = np.concatenate([parts[key] for key in self._keys], axis=None)
+        else:
+            value = np.ravel(parts[self._keys[0]])
+        self._observation[:] = value

@@ -1,0 +1,198 @@
+"""The network that acts, read from a policy file: from one raw observation to the parameters of the action.
+
+Its layers follow from the names of the file's tensors, which are those of SB3's `state_dict`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+from gymnasium import spaces
+
+from rlctl.environments.dict_spaces import split_space
+from rlctl.errors import UsageError
+from rlctl.policy import layers
+from rlctl.policy.layers import Activation, Array, Layer, Linear, apply
+from rlctl.policy.policy import PolicyInfo
+
+Tensors = Mapping[str, Array]
+
+_BATCH_RENORM_EPSILON = 1e-3
+_SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq")
+DETERMINISTIC = ("td3", "ddpg")
+"""Algorithms whose policy has no distribution to sample from."""
+_ACTOR_CRITIC = (*_SQUASHED_GAUSSIAN, *DETERMINISTIC)
+_RELU_BY_DEFAULT = (*_ACTOR_CRITIC, "dqn")
+_NATURE_STRIDES = {"0": 4, "2": 2, "4": 1}
+"""Strides of the convolutions of SB3's NatureCNN, the only one here, by their index."""
+
+
+def select_actor_tensors(info: PolicyInfo, tensors: Tensors) -> dict[str, Array]:
+    """Return the tensors of a policy file that acting needs: the actor's and the normalisation's."""
+    prefixes = ("normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(info.algo)))
+    return {name: value for name, value in tensors.items() if name.startswith(prefixes)}
+
+
+def _list_prefixes(algo: str) -> tuple[str, ...]:
+    if algo in _ACTOR_CRITIC:
+        return ("actor.",)
+    if algo == "dqn":
+        return ("q_net.",)
+    return ("pi_features_extractor.", "mlp_extractor.policy_net.", "action_net.", "log_std", "lstm_actor.")
+
+
+class Network:
+    """The layers of an actor: of the parts of an observation, then an LSTM if it has one, trunk and head.
+
+    Raises `UsageError` for a layer that is not known.
+    """
+
+    def __init__(self, info: PolicyInfo, tensors: Tensors) -> None:
+        algo, read = info.algo, _Reader(info, tensors)
+        owner = "actor." if algo in _ACTOR_CRITIC else "q_net." if algo == "dqn" else "pi_"
+        extractor = f"{owner}features_extractor"
+        self.parts = {
+            key: read.features(key, space, f"{extractor}.extractors.{key}" if key else extractor)
+            for key, space in split_space(info.env.spaces()[0]).items()
+        }
+        """Layers from each part of a raw observation to its features."""
+        self.lstm = read.lstm("lstm_actor") if algo == "recurrent_ppo" else None
+        self.trunk, self.head = _read_actor(algo, read)
+        """The head's result is the mean of the action, the action of TD3 and DDPG, logits, or values."""
+        self.is_squashed = algo in _ACTOR_CRITIC or bool(info.policy_kwargs.get("squash_output"))
+        """Whether actions in a Box are in [-1, 1], and scaled to its bounds."""
+        self.ends_with_tanh = self.is_squashed and algo not in DETERMINISTIC  # of these the head does
+        """Whether tanh comes after the head, and after noise that is added to its result."""
+        name = "actor.log_std" if algo in _SQUASHED_GAUSSIAN else "log_std"
+        self.log_std = read.tensors.get(name)
+        """Parameter of PPO's and gSDE's noise; None where there is none, or a layer computes it."""
+        self._log_std_layer = read.linear(name) if f"{name}.weight" in read.tensors else None
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Compute what follows from the numbers alone, again after they have changed."""
+        for part in self.parts.values():
+            for layer in part:
+                layer.prepare()
+        self._std = None if self.log_std is None else np.exp(self.log_std)
+
+    def compute_latent(self, observation: object) -> Array:
+        """Return what the head starts from; a recurrent network goes one step on."""
+        parts = self.parts
+        if "" in parts:
+            value = apply(parts[""], observation)
+        else:
+            value = np.concatenate([apply(part, observation[key]) for key, part in parts.items()])  # type: ignore[index]
+        if self.lstm is not None:
+            value = self.lstm.step(value)
+        return apply(self.trunk, value)
+
+    def compute_std(self, latent: Array) -> Array:
+        """Return the standard deviation: of a layer, or the parameter."""
+        if self._log_std_layer is not None:
+            deviation: Array = np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
+            return deviation
+        assert self._std is not None  # only Gaussian heads ask
+        return self._std
+
+
+def _read_actor(algo: str, read: _Reader) -> tuple[list[Layer], list[Layer]]:
+    if algo in _SQUASHED_GAUSSIAN:
+        trunk = read.sequence("actor.latent_pi", end=read.activation)
+        if "actor.mu.weight" in read.tensors:
+            return trunk, [read.linear("actor.mu")]
+        limit = float(read.info.policy_kwargs.get("clip_mean", 2.0))
+        return trunk, [read.linear("actor.mu.0"), layers.Clip("actor.mu.1", limit)]
+    if algo in DETERMINISTIC:
+        return [], read.sequence("actor.mu", end=Activation("tanh"))
+    if algo == "dqn":
+        return [], read.sequence("q_net.q_net")
+    return read.sequence("mlp_extractor.policy_net", end=read.activation), [read.linear("action_net")]
+
+
+class _Reader:
+    """Makes layers of the tensors of a policy file."""
+
+    def __init__(self, info: PolicyInfo, tensors: Tensors) -> None:
+        self.info = info
+        self.tensors = {name.removeprefix("policy/"): value for name, value in tensors.items()}
+        name = info.policy_kwargs.get("activation_fn", "relu" if info.algo in _RELU_BY_DEFAULT else "tanh")
+        if name not in layers.ACTIVATIONS:
+            known = ", ".join(layers.ACTIVATIONS)
+            raise UsageError(f"a network with activation {name!r} cannot be played; known: {known}")
+        self.activation = Activation(name)
+
+    def features(self, key: str, space: spaces.Space[object], extractor: str) -> list[Layer]:
+        """Return the layers from a raw observation to its features: normalised, one-hot, convolved or flat."""
+        if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+            sizes = space.n if isinstance(space, spaces.Discrete) else space.nvec
+            return [layers.OneHot(f"one_hot/{key}", np.asarray(sizes))]
+        found: list[Layer] = []
+        if key in self.info.normalized_keys:
+            name, clip = f"normalize/{key}", float(self.info.clip_observation or np.inf)
+            found.append(layers.Normalize(name, self.tensors[f"{name}/mean"], self.tensors[f"{name}/var"], clip))
+        if not _is_image(space):
+            return [*found, layers.Flatten("flatten")]
+        shape, relu = space.shape or (), Activation("relu")
+        # Channels last, as SB3 decides.
+        found.append(layers.ScaleImage(f"image/{key}", min(range(3), key=lambda axis: shape[axis]) != 0))
+        found += self.sequence(f"{extractor}.cnn", end=relu, activation=relu)
+        return [*found, layers.Flatten("flatten"), *self.sequence(f"{extractor}.linear", end=relu, activation=relu)]
+
+    def sequence(self, prefix: str, end: Layer | None = None, activation: Layer | None = None) -> list[Layer]:
+        """Return the layers of a `torch.nn.Sequential`; `end` follows its last linear layer.
+
+        Layers without tensors have no names: between two that have some there is an activation.
+        """
+        pattern = re.compile(rf"{re.escape(prefix)}\.(\d+)\.")
+        indices = sorted({int(found[1]) for name in self.tensors if (found := pattern.match(name))})
+        result: list[Layer] = []
+        before = -1
+        for index in indices:
+            if index > before + 1:
+                result.append(activation or self.activation)
+            result.append(self._layer(f"{prefix}.{index}"))
+            before = index
+        if end is not None and indices and f"{prefix}.{indices[-1]}.weight" in self.tensors:
+            result.append(end)
+        return result
+
+    def linear(self, name: str) -> Linear:
+        """Return a fully connected layer."""
+        return Linear(name, self.tensors[f"{name}.weight"], self.tensors[f"{name}.bias"])
+
+    def _layer(self, name: str) -> Layer:
+        if f"{name}.ra_mean" in self.tensors:
+            epsilon = np.float32(self.info.policy_kwargs.get("batch_norm_eps", _BATCH_RENORM_EPSILON))
+            mean, variance = (self.tensors[f"{name}.{part}"] for part in ("ra_mean", "ra_var"))
+            scale, bias = (self.tensors[f"{name}.{part}"] for part in ("scale", "bias"))
+            return layers.BatchRenorm(name, mean, variance, scale, bias, epsilon)
+        dimensions = self.tensors[f"{name}.weight"].ndim if f"{name}.weight" in self.tensors else 0
+        if dimensions == 2:
+            return self.linear(name)
+        if dimensions == 4:
+            stride = _NATURE_STRIDES[name.rpartition(".")[2]]
+            return layers.Convolution(name, self.tensors[f"{name}.weight"], self.tensors[f"{name}.bias"], stride)
+        raise UsageError(f"layer {name} of this network cannot be played: neither linear, convolution nor batch renorm")
+
+    def lstm(self, name: str) -> layers.Lstm:
+        """Return an LSTM."""
+        if f"{name}.weight_ih_l0_reverse" in self.tensors or f"{name}.weight_hr_l0" in self.tensors:
+            raise UsageError("an LSTM with two directions or a projection cannot be played")
+        found: list[layers.LstmLayer] = []
+        while f"{name}.weight_ih_l{len(found)}" in self.tensors:
+            of_input, of_hidden = (self.tensors[f"{name}.{kind}_l{len(found)}"] for kind in ("weight_ih", "weight_hh"))
+            names = [f"{name}.{kind}_l{len(found)}" for kind in ("bias_ih", "bias_hh")]
+            found.append(
+                layers.LstmLayer(of_input, of_hidden, [self.tensors[each] for each in names if each in self.tensors])
+            )
+        return layers.Lstm(name, found)
+
+
+def _is_image(space: spaces.Space[object]) -> bool:
+    """Say whether SB3 takes a space for an image."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) != 3:
+        return False
+    return bool((space.low == 0).all() and (space.high == 255).all())

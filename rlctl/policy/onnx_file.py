@@ -1,0 +1,69 @@
+"""ONNX files of rlctl: sealed by a sha256 when they are written, and checked before a runtime reads them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rlctl.storage import files
+
+if TYPE_CHECKING:
+    import onnx
+
+METADATA_KEY = "rlctl"
+"""Where an exported file keeps its description."""
+DIGEST_KEY = "sha256"
+"""Where it keeps the sha256 of all its bytes, with zeros in the place of the digest."""
+
+_ZEROS = b"0" * 64
+
+
+def encode(model: onnx.ModelProto) -> bytes:
+    """Return the bytes of a model, with their sha256 in its metadata."""
+    for index, entry in enumerate(model.metadata_props):
+        if entry.key == DIGEST_KEY:
+            del model.metadata_props[index]
+            break
+    entry = model.metadata_props.add()
+    entry.key, entry.value = DIGEST_KEY, _ZEROS.decode()
+    content: bytes = model.SerializeToString()
+    if content.count(_ZEROS) != 1:
+        raise ValueError("it has 64 zeros as text, which is where the sha256 goes")
+    return content.replace(_ZEROS, files.digest(content).encode())
+
+
+def check(content: bytes) -> None:
+    """Raise `ValueError` for what is not as rlctl wrote it, or holds more than a policy needs.
+
+    Loops, branches and functions need not end; a tensor in another file would read what the sender names.
+    """
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        model = onnx.ModelProto.FromString(content)
+    except DecodeError:
+        raise ValueError("cut off, or not ONNX") from None
+    if model.functions or model.training_info:
+        raise ValueError("it has functions, which no policy needs")
+    attributes = [attribute for node in model.graph.node for attribute in node.attribute]
+    if any(each.graphs or each.HasField("g") for each in attributes):
+        raise ValueError("it has loops or branches, which no policy needs")
+    if model.graph.sparse_initializer or any(
+        each.sparse_tensors or each.HasField("sparse_tensor") for each in attributes
+    ):
+        raise ValueError("it has sparse tensors, which no policy needs")
+    inside = [tensor for each in attributes for tensor in (each.t, *each.tensors)]
+    for tensor in (*model.graph.initializer, *inside):
+        if tensor.external_data or tensor.data_location != onnx.TensorProto.DEFAULT:
+            raise ValueError("a tensor of it is in another file")
+    metadata = {each.key: each.value for each in model.metadata_props}
+    if METADATA_KEY in metadata:
+        _check_digest(content, metadata.get(DIGEST_KEY, ""))
+
+
+def _check_digest(content: bytes, digest: str) -> None:
+    if not digest:
+        raise ValueError("its metadata has no sha256, which every export of rlctl has; export it again")
+    digest = str(digest)  # of text that is damaged, protobuf returns the bytes
+    if files.digest(content.replace(digest.encode(), _ZEROS)) != digest:
+        raise ValueError("its sha256 is not the one it was exported with")

@@ -1,0 +1,209 @@
+"""SB3's own networks, and policies on them: what exports are compared with. Imports torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sb3_contrib
+import stable_baselines3
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.vec_env import VecTransposeImage
+
+from rlctl.environments.dict_spaces import Observations, join, split
+from rlctl.errors import ArtifactError, short_repr
+from rlctl.policy.layers import Normalize
+from rlctl.policy.network import select_actor_tensors
+from rlctl.policy.policy import Policy, PolicyInfo, read_policy
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "ppo": stable_baselines3.PPO,
+    "a2c": stable_baselines3.A2C,
+    "sac": stable_baselines3.SAC,
+    "td3": stable_baselines3.TD3,
+    "ddpg": stable_baselines3.DDPG,
+    "dqn": stable_baselines3.DQN,
+    "tqc": sb3_contrib.TQC,
+    "crossq": sb3_contrib.CrossQ,
+    "recurrent_ppo": sb3_contrib.RecurrentPPO,
+}
+
+ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
+    "tanh": torch.nn.Tanh,
+    "relu": torch.nn.ReLU,
+    "elu": torch.nn.ELU,
+    "silu": torch.nn.SiLU,
+}
+
+# Of no use to a policy that is run, and no plain data.
+_NOT_KEPT = frozenset(
+    {
+        "observation_space",
+        "action_space",
+        "lr_schedule",
+        "optimizer_class",
+        "optimizer_kwargs",
+        "features_extractor_class",
+        "normalize_images",
+        "dist_kwargs",
+    }
+)
+
+
+def pin_threads() -> None:
+    """Let torch use one thread: the last bit of a result depends on how many, and small networks gain nothing."""
+    torch.set_num_threads(1)
+
+
+def policy_name(algo: str, observation_space: spaces.Space[Any]) -> str:
+    """Return SB3's name of the policy for an observation space."""
+    kind = "Mlp"
+    if isinstance(observation_space, spaces.Dict):
+        kind = "MultiInput"
+    elif is_image_space(observation_space):
+        kind = "Cnn"
+    return f"{kind}{'Lstm' if algo == 'recurrent_ppo' else ''}Policy"
+
+
+def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """Return the observation space as SB3's networks see it: images with channels first."""
+    if isinstance(space, spaces.Dict):
+        # Pairs, because from a plain dict Gymnasium would sort the keys, and the network takes them in their order.
+        return spaces.Dict([(key, network_space(value)) for key, value in space.spaces.items()])
+    if isinstance(space, spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
+        return VecTransposeImage.transpose_space(space)
+    return space
+
+
+def describe_network(policy: BasePolicy) -> dict[str, Any]:
+    """Return the constructor's arguments of a network as plain data, for `build_network`."""
+    described = {}
+    for name, value in {**policy._get_constructor_parameters(), **_list_left_out(policy)}.items():
+        if name in _NOT_KEPT or value is None:
+            continue
+        if name == "activation_fn":
+            value = next(known for known, cls in ACTIVATIONS.items() if cls is value)
+        described[name] = value
+    return described
+
+
+def _list_left_out(policy: BasePolicy) -> dict[str, Any]:
+    """Arguments that change a network and that its own `_get_constructor_parameters` leaves out."""
+    left_out: dict[str, Any] = {}
+    if hasattr(policy, "share_features_extractor"):
+        left_out["share_features_extractor"] = policy.share_features_extractor
+    if isinstance(policy, RecurrentActorCriticPolicy):
+        left_out |= {
+            "lstm_hidden_size": policy.lstm_actor.hidden_size,
+            "n_lstm_layers": policy.lstm_actor.num_layers,
+            "shared_lstm": policy.shared_lstm,
+            "enable_critic_lstm": policy.enable_critic_lstm,
+            "lstm_kwargs": policy.lstm_kwargs,
+        }
+    return left_out
+
+
+def build_network(info: PolicyInfo) -> BasePolicy:
+    """Build an untrained network from a policy's description."""
+    observation_space, action_space = info.env.spaces()
+    if info.algo not in ALGORITHMS:
+        raise ArtifactError(f"policy for an unknown algorithm {info.algo!r}")
+    cls = ALGORITHMS[info.algo].policy_aliases.get(info.policy)
+    if cls is None:
+        raise ArtifactError(f"policy of an unknown kind {info.policy!r} for {info.algo}")
+    kwargs = dict(info.policy_kwargs)
+    if "activation_fn" in kwargs:
+        kwargs["activation_fn"] = ACTIVATIONS[kwargs["activation_fn"]]
+    return cls(
+        network_space(observation_space),
+        action_space,
+        lr_schedule=lambda _: 0.0,
+        optimizer_class=_NoOptimizer,
+        **kwargs,
+    )
+
+
+class _NoOptimizer:
+    """Stands where SB3 puts an optimiser: a policy that is run needs none, and torch's imports its compiler (0.8 s)."""
+
+    def __init__(self, parameters: Any, **settings: Any) -> None:
+        del parameters, settings
+
+
+_NOTHING = np.zeros(0)
+
+
+class TorchPolicy(Policy):
+    """A policy file on the network it was trained with. Deterministic."""
+
+    def __init__(self, info: PolicyInfo, network: BasePolicy, tensors: Mapping[str, NDArray[Any]]) -> None:
+        super().__init__(info)
+        self.network = network
+        clip = float(info.clip_observation or np.inf)
+        self._normalize = {
+            key: Normalize("", tensors[f"normalize/{key}/mean"], tensors[f"normalize/{key}/var"], clip)
+            for key in info.normalized_keys
+        }
+        self.is_recurrent = info.algo == "recurrent_ppo"
+        self._state: Any = None
+        network.set_training_mode(False)
+
+    @classmethod
+    def load(cls, path: Path) -> TorchPolicy:
+        """Read a policy file; raises `ArtifactError` if it is not one or does not fit together."""
+        info, tensors = read_policy(path)
+        try:
+            return cls._build(info, tensors)
+        except ArtifactError as error:
+            raise ArtifactError(f"{path}: {error}") from None
+        except Exception as error:  # whatever torch and SB3 raise for a description that nobody has checked
+            raise ArtifactError(
+                f"{path}: its tensors do not fit its description: {short_repr(str(error), 200)}"
+            ) from None
+
+    @classmethod
+    def _build(cls, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> TorchPolicy:
+        """Build the network that a description asks for, and try it."""
+        network = build_network(info)
+        prefix = "policy/"
+        state = {
+            name[len(prefix) :]: torch.from_numpy(value.copy())
+            for name, value in tensors.items()
+            if name.startswith(prefix)
+        }
+        mismatch = network.load_state_dict(state, strict=False)
+        # A shipped policy has no critic, and to act takes none.
+        missing = select_actor_tensors(info, dict.fromkeys((prefix + name for name in mismatch.missing_keys), _NOTHING))
+        if missing or mismatch.unexpected_keys:
+            raise ValueError(f"tensors missing: {list(missing)}, unknown: {mismatch.unexpected_keys}")
+        policy = cls(info, network, tensors)
+        policy.try_once()
+        return policy
+
+    def normalize(self, observations: Observations) -> Observations:
+        """Return observations, one or several, as the network gets them."""
+        parts = split(observations)
+        normalized: Observations = join({**parts, **{key: each(parts[key]) for key, each in self._normalize.items()}})
+        return normalized
+
+    def act(self, observations: Observations) -> NDArray[Any]:
+        """Return the actions for several observations; a recurrent policy remembers as many states."""
+        actions, self._state = self.network.predict(self.normalize(observations), self._state, deterministic=True)
+        return actions
+
+    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
+        """Return the action for one observation; a recurrent policy remembers."""
+        parts = self.read_observation(observation)
+        return np.asarray(self.act(join({key: part[None] for key, part in parts.items()}))[0])
+
+    def reset(self) -> None:
+        """Begin an episode: forget the recurrent state."""
+        self._state = None

@@ -1,0 +1,214 @@
+"""The parameters of every algorithm, `algo_kwargs`: SB3's names, with the type and range of each.
+
+Names and defaults are compared with SB3's signatures by a test; `docs/recipe.md` is made from these models.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from rlctl.recipe.quantities import Number, NumberAfter, Section, Switch, Whole
+
+ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
+
+_Fraction = Annotated[Number, Field(ge=0, le=1)]
+_PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
+_NotNegative = Annotated[Number, Field(ge=0)]
+_Positive = Annotated[Number, Field(gt=0)]
+_ClipRange = Annotated[Number, Field(gt=0, le=10)]
+_Count = Annotated[Whole, Field(ge=1, le=10**9)]
+_CountFrom0 = Annotated[Whole, Field(ge=0, le=10**9)]
+_Minibatch = Annotated[Whole, Field(ge=2, le=10**9)]
+
+_Schedule = _PositiveFraction | Annotated[str, NumberAfter("lin_", _PositiveFraction)]
+_ClipSchedule = _ClipRange | Annotated[str, NumberAfter("lin_", _ClipRange)]
+_PositiveSchedule = _Positive | Annotated[str, NumberAfter("lin_", _Positive)]
+_EntropyCoefficient = _NotNegative | Literal["auto"] | Annotated[str, NumberAfter("auto_", _Positive)]
+
+
+def decide_by(rule: str) -> dict[str, Any]:
+    """Return the `json_schema_extra` of a parameter that rlctl chooses where a recipe does not: by which rule."""
+    return {"default_text": f"{rule} *rlctl*"}
+
+
+_ROLLOUT = decide_by("4096 / n_envs, from 16 to 2048")
+_MINIBATCH = decide_by("128, or the whole rollout where that is smaller")
+
+
+class Parameters(Section):
+    """Parameters by SB3's names; those that a recipe leaves out are not passed on."""
+
+
+class _Learning(Parameters):
+    learning_rate: _Schedule = 3e-4
+    """Step size of the optimiser; `lin_3e-4` falls from 3e-4 to zero over the training."""
+    gamma: _PositiveFraction = 0.99
+    """Discount per step."""
+
+
+class _OnPolicy(_Learning):
+    n_steps: _Count = Field(2048, json_schema_extra=_ROLLOUT)
+    """Steps per environment and rollout."""
+    gae_lambda: _Fraction = 0.95
+    """Bias against variance of the advantage estimate (GAE); 1 is the Monte Carlo return."""
+    ent_coef: _NotNegative = 0.0
+    """Weight of the entropy in the loss."""
+    vf_coef: _NotNegative = 0.5
+    """Weight of the value function in the loss."""
+    max_grad_norm: _Positive = 0.5
+    """Gradients are clipped to this norm."""
+    normalize_advantage: Switch = True
+    """Whether to normalise the advantages of a minibatch."""
+    use_sde: Switch = False
+    """State-dependent exploration (gSDE)."""
+    sde_sample_freq: _Count | Literal[-1] = -1
+    """Steps between new gSDE noise; -1: once per rollout."""
+
+
+class Ppo(_OnPolicy):
+    """Proximal policy optimisation."""
+
+    batch_size: _Minibatch = Field(64, json_schema_extra=_MINIBATCH)
+    """Minibatch size."""
+    n_epochs: _Count = 10
+    """Passes over each rollout."""
+    clip_range: _ClipSchedule = 0.2
+    """How far the ratio of new to old probability may leave 1."""
+    clip_range_vf: _PositiveSchedule | None = None
+    """The same for the value function; null: not clipped."""
+    target_kl: _Positive | None = None
+    """Ends an update when the policy has moved this far; null: never."""
+
+
+class RecurrentPpo(Ppo):
+    """PPO with an LSTM."""
+
+    n_steps: _Count = Field(128, json_schema_extra=_ROLLOUT)
+    batch_size: _Minibatch = Field(128, json_schema_extra=_MINIBATCH)
+
+
+class A2c(_OnPolicy):
+    """Advantage actor-critic."""
+
+    learning_rate: _Schedule = 7e-4
+    n_steps: _Count = 5
+    gae_lambda: _Fraction = 1.0
+    normalize_advantage: Switch = False
+    rms_prop_eps: _PositiveFraction = 1e-5
+    """Epsilon of RMSProp."""
+    use_rms_prop: Switch = True
+    """Whether to use RMSProp instead of Adam."""
+
+
+class _OffPolicy(_Learning):
+    buffer_size: Annotated[Whole, Field(ge=1, le=10**15)] = Field(
+        1_000_000, json_schema_extra=decide_by("total_timesteps, from 1,000 to 1,000,000")
+    )
+    """Transitions in the replay buffer."""
+    learning_starts: _CountFrom0 = 100
+    """Steps of random actions before the first update."""
+    batch_size: _Minibatch = 256
+    """Transitions per gradient step."""
+    train_freq: _Count = Field(1, json_schema_extra=decide_by("1"))
+    """Steps of each environment between updates."""
+    gradient_steps: _Count | Literal[-1] = Field(1, json_schema_extra=decide_by("-1"))
+    """Gradient steps per update; -1: as many as environment steps were taken."""
+    n_steps: _Count = 1
+    """Steps of the n-step return."""
+
+
+class _Continuous(_OffPolicy):
+    action_noise: _NotNegative | None = None
+    """Standard deviation of normal noise on actions scaled to [-1, 1]; null: none."""
+
+
+class _MaximumEntropy(_Continuous):
+    ent_coef: _EntropyCoefficient = "auto"
+    """Weight of the entropy; `auto` learns it, `auto_0.1` from 0.1 on."""
+    target_entropy: Number | Literal["auto"] = "auto"
+    """Entropy that `ent_coef: auto` aims at; `auto`: minus the number of action elements."""
+    use_sde: Switch = False
+    """State-dependent exploration (gSDE)."""
+    sde_sample_freq: _Count | Literal[-1] = -1
+    """Steps between new gSDE noise; -1: once per rollout."""
+    use_sde_at_warmup: Switch = False
+    """Whether to use gSDE instead of random actions before `learning_starts`."""
+
+
+class Sac(_MaximumEntropy):
+    """Soft actor-critic."""
+
+    tau: _PositiveFraction = 0.005
+    """Share of the online network in each update of the target network."""
+    target_update_interval: _Count = 1
+    """Gradient steps between updates of the target network."""
+
+
+class Tqc(Sac):
+    """Truncated quantile critics."""
+
+    top_quantiles_to_drop_per_net: _CountFrom0 = 2
+    """Highest quantiles of each critic that are left out; fewer than `policy_kwargs.n_quantiles`."""
+
+
+class CrossQ(_MaximumEntropy):
+    """CrossQ: SAC with batch normalisation instead of target networks."""
+
+    learning_rate: _Schedule = 1e-3
+    policy_delay: _Count = 3
+    """Critic updates per update of the actor."""
+
+
+class Ddpg(_Continuous):
+    """Deep deterministic policy gradient."""
+
+    learning_rate: _Schedule = 1e-3
+    tau: _PositiveFraction = 0.005
+    """Share of the online network in each update of the target network."""
+    action_noise: _NotNegative | None = Field(None, json_schema_extra=decide_by("0.1"))
+
+
+class Td3(Ddpg):
+    """Twin delayed DDPG."""
+
+    policy_delay: _Count = 2
+    """Critic updates per update of the actor."""
+    target_policy_noise: _NotNegative = 0.2
+    """Standard deviation of the noise that smooths the target policy."""
+    target_noise_clip: _NotNegative = 0.5
+    """That noise is clipped to this."""
+
+
+class Dqn(_OffPolicy):
+    """Deep Q-network."""
+
+    learning_rate: _Schedule = 1e-4
+    batch_size: _Minibatch = 32
+    tau: _PositiveFraction = 1.0
+    """Share of the online network in each update of the target network."""
+    train_freq: _Count = Field(4, json_schema_extra=decide_by("1"))
+    target_update_interval: _Count = 10_000
+    """Steps between updates of the target network."""
+    exploration_fraction: _Fraction = 0.1
+    """Part of the training over which the random actions become fewer."""
+    exploration_initial_eps: _Fraction = 1.0
+    """Share of random actions at the beginning."""
+    exploration_final_eps: _Fraction = 0.05
+    """Share of random actions at the end."""
+    max_grad_norm: _Positive = 10.0
+    """Gradients are clipped to this norm."""
+
+
+ALGORITHM_PARAMETERS: dict[str, type[Parameters]] = {
+    "ppo": Ppo,
+    "a2c": A2c,
+    "sac": Sac,
+    "td3": Td3,
+    "ddpg": Ddpg,
+    "dqn": Dqn,
+    "tqc": Tqc,
+    "crossq": CrossQ,
+    "recurrent_ppo": RecurrentPpo,
+}

@@ -1,0 +1,167 @@
+"""The parameters of the networks of every algorithm, `policy_kwargs`: SB3's names, with the type and range of each."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from rlctl.recipe.hyperparameters import Parameters
+from rlctl.recipe.quantities import Number, Switch, Whole
+
+_Width = Annotated[Whole, Field(ge=1, le=65_536)]
+_Few = Annotated[Whole, Field(ge=1, le=100)]
+_Layers = Annotated[list[_Width], Field(max_length=100)]
+_PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
+
+
+def _widths(default: str, *examples: str) -> Any:
+    """Return the field of `net_arch`, whose default SB3 chooses."""
+    return Field(None, examples=list(examples) or None, json_schema_extra={"default_text": default})
+
+
+class _FeaturesExtractor(Parameters):
+    features_dim: _Width = 512
+    """Features of an image (NatureCNN)."""
+    cnn_output_dim: _Width = 256
+    """Features per image of a dict observation."""
+    normalized_image: Switch = False
+    """Whether images are in [0, 1] already."""
+
+
+class _Lstm(Parameters):
+    dropout: Annotated[Number, Field(ge=0, le=0.99)] = 0.0
+    """Dropout between layers."""
+    bias: Switch = True
+    """Whether the layers have a bias."""
+
+
+class _ActorAndValue(Parameters):
+    pi: _Layers
+    vf: _Layers
+
+
+class _ActorAndCritic(Parameters):
+    pi: _Layers
+    qf: _Layers
+
+
+Activation = Literal["tanh", "relu", "elu", "silu"]
+
+
+class _Network(Parameters):
+    activation_fn: Activation = "relu"
+    """Activation function of the hidden layers."""
+    features_extractor_kwargs: _FeaturesExtractor | None = None
+    """What comes before the layers of `net_arch`, for images: `features_dim`, `cnn_output_dim`, `normalized_image`."""
+
+
+class QNetwork(_Network):
+    """The network of DQN."""
+
+    net_arch: _Layers | None = _widths("[64, 64]; [] for images")
+    """Widths of the hidden layers."""
+
+
+class ActorCritic(_Network):
+    """The networks of PPO and A2C."""
+
+    net_arch: _Layers | _ActorAndValue | None = _widths(
+        "[64, 64]; [] for images", "[64, 64]", "{pi: [64, 64], vf: [64, 64]}"
+    )
+    """Widths of the hidden layers, of the actor (`pi`) and the value function (`vf`)."""
+    activation_fn: Activation = "tanh"
+    ortho_init: Switch = True
+    """Orthogonal initialisation."""
+    log_std_init: Annotated[Number, Field(ge=-20, le=10)] = 0.0
+    """Logarithm of the actions' first standard deviation."""
+    full_std: Switch = True
+    """With gSDE: a standard deviation per feature and action, not per feature."""
+    use_expln: Switch = False
+    """With gSDE: expln() instead of exp() for the standard deviation."""
+    squash_output: Switch = False
+    """With gSDE: tanh after the action."""
+    share_features_extractor: Switch = True
+    """Whether actor and value function share their features extractor."""
+
+
+class RecurrentActorCritic(ActorCritic):
+    """The networks of recurrent PPO."""
+
+    lstm_hidden_size: _Width = 256
+    """Units per LSTM layer."""
+    n_lstm_layers: _Few = 1
+    """LSTM layers."""
+    shared_lstm: Switch = False
+    """Whether actor and value function share one LSTM."""
+    enable_critic_lstm: Switch = True
+    """Whether the value function has an LSTM."""
+    lstm_kwargs: _Lstm | None = None
+    """Further arguments of torch's LSTM: `dropout`, `bias`."""
+
+
+class TwinCritics(_Network):
+    """The networks of TD3 and DDPG."""
+
+    net_arch: _Layers | _ActorAndCritic | None = _widths(
+        "[400, 300]; [256, 256] for images", "[256, 256]", "{pi: [256, 256], qf: [256, 256]}"
+    )
+    """Widths of the hidden layers, of the actor (`pi`) and the critics (`qf`)."""
+    n_critics: _Few = 2
+    """Critics, of which the lowest value is taken."""
+    share_features_extractor: Switch = False
+    """Whether actor and critics share their features extractor."""
+
+
+class DdpgNetwork(TwinCritics):
+    """The networks of DDPG."""
+
+    n_critics: _Few = Field(2, json_schema_extra={"default_text": "1"})
+
+
+class SquashedActor(TwinCritics):
+    """The networks of SAC."""
+
+    net_arch: _Layers | _ActorAndCritic | None = _widths("[256, 256]", "[256, 256]", "{pi: [256, 256], qf: [256, 256]}")
+    log_std_init: Annotated[Number, Field(ge=-20, le=10)] = -3.0
+    """With gSDE: logarithm of the actions' first standard deviation."""
+    use_expln: Switch = False
+    """With gSDE: expln() instead of exp() for the standard deviation."""
+    clip_mean: Annotated[Number, Field(ge=0)] = 2.0
+    """With gSDE: bound of the mean action before tanh."""
+
+
+class QuantileCritics(SquashedActor):
+    """The networks of TQC."""
+
+    n_quantiles: Annotated[Whole, Field(ge=1, le=10_000)] = 25
+    """Quantiles per critic."""
+
+
+class BatchNormCritics(SquashedActor):
+    """The networks of CrossQ."""
+
+    net_arch: _Layers | _ActorAndCritic | None = _widths(
+        "{pi: [256, 256], qf: [1024, 1024]}", "[256, 256]", "{pi: [256, 256], qf: [1024, 1024]}"
+    )
+    batch_norm: Switch = True
+    """Whether to normalise batches at all."""
+    batch_norm_momentum: _PositiveFraction = 0.01
+    """Share of a batch in the running statistics."""
+    batch_norm_eps: _PositiveFraction = 0.001
+    """What is added to the variance."""
+    renorm_warmup_steps: Annotated[Whole, Field(ge=0, le=10**9)] = 100_000
+    """Gradient steps before batch renormalisation begins."""
+
+
+NETWORK_PARAMETERS: dict[str, type[Parameters]] = {
+    "ppo": ActorCritic,
+    "a2c": ActorCritic,
+    "sac": SquashedActor,
+    "td3": TwinCritics,
+    "ddpg": DdpgNetwork,
+    "dqn": QNetwork,
+    "tqc": QuantileCritics,
+    "crossq": BatchNormCritics,
+    "recurrent_ppo": RecurrentActorCritic,
+}

@@ -1,0 +1,270 @@
+"""Recipes: how to train a task. YAML, typed, every key checked; `rlctl.recipe.sources` puts them together."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import pydantic
+from pydantic import Field
+
+from rlctl.environments.spec import EnvSpec, merge
+from rlctl.errors import RecipeError, short_repr
+from rlctl.recipe import schema_text
+from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, decide_by
+from rlctl.recipe.hyperparameters import ON_POLICY as ON_POLICY
+from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
+from rlctl.recipe.quantities import Number, Section, Switch, Whole
+from rlctl.recipe.stages import Stage, check_promotions
+from rlctl.storage import yaml_text
+
+Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
+ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
+IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
+"""What can learn in hindsight: what has a replay buffer, except crossq, which has no network for Dict spaces."""
+
+NOT_SET = "(not set)"
+"""What `find_difference` has for a key that a recipe does not have."""
+_QUANTILES = 25  # per critic, where a recipe does not say
+_MOST_STEPS = 10**12
+_MOST_ENVS = 10_000
+
+
+class Normalize(Section):
+    """Running normalisation, as SB3's VecNormalize does it."""
+
+    observation: Switch = True
+    """Whether to normalise observations."""
+    reward: Switch = True
+    """Whether to scale rewards by the deviation of the return."""
+    clip_observation: Number = Field(10.0, gt=0)
+    """Bound of normalised observations."""
+    clip_reward: Number = Field(10.0, gt=0)
+    """Bound of normalised rewards."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_bounds(self) -> Normalize:
+        for name, normalized in (("observation", self.observation), ("reward", self.reward)):
+            bound = f"clip_{name}"
+            if not normalized and getattr(self, bound) != type(self).model_fields[bound].default:
+                raise ValueError(f"{bound} has no effect with {name}: false; what is normalised is clipped")
+        return self
+
+
+class Evaluation(Section):
+    """Evaluation while training; steps are environment steps, all environments together."""
+
+    every_steps: Whole | None = Field(
+        None, ge=1, le=_MOST_STEPS, json_schema_extra=decide_by("a tenth of total_timesteps")
+    )
+    """Steps between evaluations."""
+    episodes: Whole = Field(20, ge=1, le=1_000_000)
+    """Episodes per evaluation, the same seeds each time."""
+    deterministic: Switch = True
+    """Whether to take the mean action, and not a sample."""
+
+
+class Hindsight(Section):
+    """Hindsight experience replay, by the names of SB3's `HerReplayBuffer`; see `rlctl.training.hindsight`."""
+
+    n_sampled_goal: Whole = Field(4, ge=1, le=1000)
+    """Goals in hindsight per real one."""
+    goal_selection_strategy: Literal["future", "final", "episode"] = "future"
+    """Which of the goals that an episode reached are taken."""
+
+
+class Checkpoints(Section):
+    """Which checkpoints are kept."""
+
+    keep: Whole = Field(3, ge=1, le=1_000_000)
+    """How many of the newest are kept."""
+
+
+class Recipe(Section):
+    """How to train a task. `algo_kwargs` and `policy_kwargs` are SB3's own names."""
+
+    task: dict[str, Any] = {}
+    """Parameters of the task: what its constructor takes."""
+    reward_weights: dict[str, Number] = {}
+    """Weights of reward terms, where they differ from the task's."""
+    randomize: Switch = False
+    """Whether all random changes (`events`) that the task offers act."""
+    events: dict[str, dict[str, Any]] = {}
+    """Random changes that act, by name, with the parameters that differ from the task's."""
+    algo: Algorithm = "ppo"
+    """The algorithm."""
+    algo_kwargs: dict[str, Any] = {}
+    """Parameters of the algorithm; see its own table."""
+    policy_kwargs: dict[str, Any] = {}
+    """Parameters of the networks; see the algorithm's own table."""
+    her: Hindsight | None = None
+    """Hindsight experience replay, for tasks with goals; null: none."""
+    normalize: Normalize | None = Field(
+        None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; else neither")
+    )
+    """Running normalisation of observations and rewards."""
+    frame_stack: Whole = Field(1, ge=1, le=1000)
+    """How many of the last observations the policy gets."""
+    time_feature: Switch = False
+    """Whether the policy also observes the part of the episode that is left, from 1 to 0, as rl-zoo3's agents do."""
+    overlap: Switch = True
+    """Whether off-policy algorithms learn while environments play, with a policy one chunk of `train_freq` older."""
+    n_envs: Whole = Field(8, ge=1, le=_MOST_ENVS)
+    """Environments stepped side by side."""
+    total_timesteps: Whole = Field(300_000, ge=1, le=_MOST_STEPS)
+    """Environment steps, all environments together."""
+    seed: Whole = Field(0, ge=0, lt=2**32)
+    """Seed of everything random."""
+    eval: Evaluation = Evaluation()
+    """Evaluation while training."""
+    stop_success: Number | None = Field(None, gt=0, le=1)
+    """Stop after two evaluations in a row at this success rate; null: never."""
+    checkpoint: Checkpoints = Checkpoints()
+    """Which checkpoints are kept."""
+    stages: Annotated[list[Stage], pydantic.AfterValidator(check_promotions)] = []
+    """Curriculum: what each stage changes, and when it ends."""
+
+    @pydantic.field_validator("algo_kwargs", "policy_kwargs")
+    @classmethod
+    def _check_parameters(cls, values: dict[str, Any], info: pydantic.ValidationInfo) -> dict[str, Any]:
+        models = ALGORITHM_PARAMETERS if info.field_name == "algo_kwargs" else NETWORK_PARAMETERS
+        model = models.get(info.data.get("algo", ""))  # not there if it is wrong itself, which is then reported
+        if model is None:
+            return values
+        checked = model.model_validate(values)
+        return checked.model_dump(mode="json", exclude_unset=True)
+
+    @pydantic.model_validator(mode="after")
+    def _fit_together(self) -> Recipe:
+        dropped = self.algo_kwargs.get("top_quantiles_to_drop_per_net", 0)
+        if dropped >= (quantiles := self.policy_kwargs.get("n_quantiles", _QUANTILES)):
+            raise ValueError(
+                f"algo_kwargs.top_quantiles_to_drop_per_net: {dropped} of {quantiles} leaves nothing; "
+                "it must be below policy_kwargs.n_quantiles"
+            )
+        return self
+
+    @pydantic.field_validator("her")
+    @classmethod
+    def _check_replay(cls, value: Hindsight | None, others: pydantic.ValidationInfo) -> Hindsight | None:
+        algo = others.data.get("algo")
+        if value is not None and algo is not None and algo not in IN_HINDSIGHT:
+            raise ValueError(f"{algo} cannot learn in hindsight; {', '.join(IN_HINDSIGHT)} can")
+        return value
+
+    def env_specs(self, task: str, named_by: str = "") -> list[EnvSpec]:
+        """Return what environments are made from, stage by stage; of a recipe without stages a list of one.
+
+        `named_by` is the kind of file that names the task, if no person does.
+        """
+        base = EnvSpec(
+            task,
+            self.task,
+            self.reward_weights,
+            self.randomize,
+            self.events,
+            self.frame_stack,
+            self.time_feature,
+            named_by=named_by,
+        )
+        return [
+            dataclasses.replace(
+                base,
+                parameters=merge(self.task, stage.task),
+                reward_weights={**self.reward_weights, **stage.reward_weights},
+                events=merge(self.events, stage.events),
+                stage=number,
+                level=stage.level,
+            )
+            for number, stage in enumerate(self.stages, start=1)
+        ] or [base]
+
+    def to_yaml(self) -> str:
+        """Return the recipe as YAML that is itself valid for `--config`."""
+        return yaml_text.dump(self.model_dump(mode="json", by_alias=True))
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """Values of a recipe, and where they are from."""
+
+    name: str
+    """Empty for what was typed, or given to a function: errors need not say where that is."""
+    values: Mapping[str, Any]
+    file: Path | None = None
+
+    def find(self, path: Sequence[str | int]) -> str | None:
+        """Return where the value at `path` is from, with the line of a file; None if it is not from here."""
+        value: Any = self.values
+        for part in path:
+            if not (isinstance(value, Mapping) and part in value) and not (isinstance(part, int) and value):
+                return None
+            value = value[part]
+        return self.name if self.file is None else f"{self.file}:{yaml_text.find_line(self.file.read_text(), path)}"
+
+
+def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
+    """Check plain data; raises `RecipeError` that names each wrong key, what was expected, and the closest name.
+
+    `sources` are where values are from, topmost first: of the first that has the key the error names the place.
+    """
+    try:
+        return Recipe.model_validate(values)
+    except pydantic.ValidationError as error:
+        schema = build_schema(values.get("algo", "ppo"))
+
+        def explain(problem: Any, path: schema_text.Place) -> str:
+            origins = (each if isinstance(each, str) else each.find(path) for each in sources)
+            origin = next((each for each in origins if each is not None), "recipe")
+            return (f"{origin}: " if origin else "") + _explain(problem, path, schema, values)
+
+        raise RecipeError(schema_text.explain_all(error, schema, explain)) from None
+
+
+def build_schema(algo: Any = None) -> schema_text.Schema:
+    """Return the JSON schema of a recipe, with the parameters of an algorithm and its networks; do not change it."""
+    return _build_schema(algo if isinstance(algo, str) and algo in ALGORITHMS else None)
+
+
+@functools.cache
+def _build_schema(algo: str | None) -> schema_text.Schema:
+    schema = Recipe.model_json_schema()
+    for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
+        if algo in models:
+            own = models[algo].model_json_schema()
+            schema["$defs"] |= own.pop("$defs", {})
+            schema["properties"][key] |= own
+    return schema
+
+
+def _explain(problem: Any, path: Sequence[str | int], schema: schema_text.Schema, values: Mapping[str, Any]) -> str:
+    where, shown = "", path
+    if len(path) > 1 and path[0] == "stages":
+        where, shown = f"stage {int(path[1]) + 1}: ", path[2:]
+    key = ".".join(short_repr(str(part)) for part in shown)
+    of = f" for {values.get('algo', 'ppo')}" if path and path[0] in ("algo_kwargs", "policy_kwargs") else ""
+    return where + schema_text.explain(problem, path, schema, values, key=key, of=of)
+
+
+def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:
+    """Return per dotted key that differs the value in `recipe` and the one in `base`; the seed is not compared."""
+    ours, theirs = (dict(_flatten(each.model_dump(mode="json", by_alias=True))) for each in (recipe, base))
+    keys = dict.fromkeys([*theirs, *ours])
+    pairs = {key: (ours.get(key, NOT_SET), theirs.get(key, NOT_SET)) for key in keys if key != "seed"}
+    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def find_mixed(recipes: Sequence[Recipe]) -> list[str]:
+    """Return the dotted keys in which several recipes are not the same."""
+    return sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flatten(value, f"{prefix}{key}.")
+        elif value != {}:
+            yield prefix + key, value

@@ -1,0 +1,118 @@
+"""Prints the page about recipes, `docs/recipe.md`: `python -m rlctl.recipe.reference > docs/recipe.md`."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+from pydantic import BaseModel
+
+from rlctl.recipe import schema_text
+from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
+from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
+from rlctl.recipe.recipe import Recipe, build_schema
+from rlctl.recipe.schema_text import Schema
+from rlctl.recipe.sources import list_presets
+from rlctl.recipe.stages import Stage
+from rlctl.storage import yaml_text
+
+Path = tuple[str | int, ...]
+
+_OWN_TABLES = ("stages", "algo_kwargs", "policy_kwargs")
+
+_HEAD = """# Recipes
+
+A recipe says how to train a task. It is made from the defaults on this page, then the task's own recipe (a YAML file
+beside its module: `rlctl tasks show TASK` prints it), then `--config FILE`, then `--set KEY=VALUE` and the other flags
+of `rlctl train`. Every training writes the recipe it used to `recipe.yaml` of its run, which is itself a valid
+`--config`.
+
+```yaml
+algo: ppo
+algo_kwargs: {learning_rate: 3e-4, gamma: 0.98}
+policy_kwargs: {net_arch: [64, 64]}
+n_envs: 16
+total_timesteps: 200_000
+eval: {every_steps: 20_000, episodes: 50}
+```
+
+YAML 1.2: `3e-4` is a number, `1e6` is a whole number where one is expected, `on` is text. Anchors, aliases and tags are
+not supported. `--set` takes a key with dots: `--set algo_kwargs.gamma=0.98`. `check-env`, `eval` and `replay` take
+those of `task`, `reward_weights`, `randomize` and `events`; `--set randomize=false` also leaves out the events that a
+policy was trained with.
+
+A default with *rlctl* is chosen by rlctl; the others are those of Stable-Baselines3.
+
+Presets come with rlctl and go over the task's own recipe like a file, by `--config presets/NAME`:
+
+{presets}
+
+This page is generated: `python -m rlctl.recipe.reference > docs/recipe.md`.
+"""
+_STAGES = """
+Stages are a curriculum. Each changes the recipe's own task, and all but the last say when they end:
+
+```yaml
+stages:
+  - {task: {tolerance: 0.2}, promote: {success: 0.8, window: 100}}
+  - {task: {tolerance: 0.05}}
+```
+"""
+
+
+def render() -> str:
+    """Return the page."""
+    lines = [
+        _HEAD.replace("{presets}", "\n".join(_render_presets())),
+        "## Keys",
+        "",
+        *_render_table(build_schema(None), (), Recipe),
+    ]
+    lines += [_STAGES, *_render_table(build_schema(None), ("stages", 0), Stage)]
+    for algo in ALGORITHM_PARAMETERS:
+        for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
+            model = models[algo]
+            heading = f"## {algo}\n\n" if key == "algo_kwargs" else ""
+            lines += ["", f"{heading}`{key}`: {(model.__doc__ or '').strip()}", ""]
+            lines += _render_table(build_schema(algo), (key,), model)
+    return "\n".join(lines) + "\n"
+
+
+def _render_presets() -> Iterator[str]:
+    """Yield a line for each preset, with the first sentence of its file's comment."""
+    for name, file in list_presets().items():
+        comment = itertools.takewhile(lambda line: line.startswith("# "), file.read_text().splitlines())
+        yield f"- `{name}`: {' '.join(line[2:] for line in comment).partition('. ')[0].rstrip('.')}."
+
+
+def _render_table(root: Schema, path: Path, model: type[BaseModel]) -> list[str]:
+    return ["| key | value | default | meaning |", "|---|---|---|---|", *_render_rows(root, path, "", model)]
+
+
+def _render_rows(root: Schema, path: Path, prefix: str, model: type[BaseModel] | None) -> Iterator[str]:
+    """Yield a row for each key of the mapping at `path`, and below it the keys of the mapping that it is, if so."""
+    for key in schema_text.list_keys(root, schema_text.find_schema(root, path)):
+        part = schema_text.find_schema(root, (*path, key))
+        meaning = part.get("description") or _find_description(model, key)
+        value = schema_text.describe_value(root, part).replace("|", "\\|")
+        yield f"| `{prefix}{key}` | {value} | {_render_default(part)} | {meaning} |"
+        if key not in _OWN_TABLES and "examples" not in part:
+            yield from _render_rows(root, (*path, key), f"{prefix}{key}.", None)
+
+
+def _find_description(model: type[BaseModel] | None, key: str) -> str:
+    """Return the description that a class gives a field, or the class that it inherits the field from."""
+    classes = [each for each in model.__mro__ if issubclass(each, BaseModel)] if model else []
+    found = (each.model_fields[key].description for each in classes if key in each.model_fields)
+    return next((text for text in found if text), "")
+
+
+def _render_default(part: Schema) -> str:
+    if "default_text" in part:
+        return str(part["default_text"])
+    default = part.get("default", {})
+    return "" if isinstance(default, dict) else yaml_text.dump(default).partition("\n")[0]
+
+
+if __name__ == "__main__":
+    print(render(), end="")

@@ -1,0 +1,136 @@
+"""What a JSON schema says of a value, in words: for messages about a recipe, and for the page that describes one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import pydantic
+
+from rlctl.errors import did_you_mean, short_repr
+from rlctl.storage import yaml_text
+
+Schema = dict[str, Any]
+Place = tuple[str | int, ...]
+"""Keys and indices that lead to a value."""
+_MOST_LINES = 3
+
+
+def find_schema(root: Schema, path: Sequence[str | int]) -> Schema:
+    """Return the part of a schema that describes the value at `path`, or the closest value around it."""
+    return _descend(root, path)[0]
+
+
+def _descend(root: Schema, path: Sequence[str | int]) -> tuple[Schema, int]:
+    # How many parts of `path` a schema has comes with it: what comes after are names that pydantic has for types.
+    node = root
+    for depth, part in enumerate(path):
+        inner = next((each for each in (_find_part(one, part) for one in _list_alternatives(root, node)) if each), None)
+        if inner is None:
+            return node, depth
+        node = inner
+    return node, len(path)
+
+
+def _find_part(node: Schema, part: str | int) -> Schema | None:
+    if isinstance(part, int):
+        return node.get("items")
+    own: Schema | None = node.get("properties", {}).get(part)
+    others = node.get("additionalProperties")
+    return own or (others if isinstance(others, dict) else None)
+
+
+def list_keys(root: Schema, node: Schema) -> list[str]:
+    """Return the keys that a mapping may have; none if `node` describes no mapping, or one of any keys."""
+    return next((list(each["properties"]) for each in _list_alternatives(root, node) if "properties" in each), [])
+
+
+def describe_value(root: Schema, node: Schema) -> str:
+    """Return what a value must be: `a number in (0, 1]`, `a whole number in [1, 1e9] or -1`."""
+    return " or ".join(dict.fromkeys(_describe(root, each) for each in _list_alternatives(root, node)))
+
+
+def explain_all(error: pydantic.ValidationError, root: Schema, explain: Callable[[Any, Place], str]) -> str:
+    """Return a line for every value that is wrong, three at most, as `explain` says it of a problem and its place."""
+    problems: dict[Place, Any] = {}
+    for problem in error.errors(include_url=False):
+        problems.setdefault(_locate(problem, root), problem)  # pydantic has one for each type that a value may be of
+    lines = [explain(problem, place) for place, problem in problems.items()]
+    return "\n".join(lines if len(lines) <= _MOST_LINES else [*lines[:2], f"and {len(lines) - 2} more mistakes"])
+
+
+def _locate(problem: Any, root: Schema) -> Place:
+    path: Place = problem["loc"]
+    return path if problem["type"] == "extra_forbidden" else path[: _descend(root, path)[1]]
+
+
+def explain(
+    problem: Any, path: Sequence[str | int], root: Schema, values: Any, *, key: str, of: str = "", unit: str = ""
+) -> str:
+    """Say what is wrong with the value at `path`, which is called `key`: what was expected, and the closest name."""
+    if problem["type"] == "extra_forbidden":
+        keys = list_keys(root, find_schema(root, path[:-1]))
+        name, outer = path[-1], (find_schema(root, [*path[:-1], each]) for each in keys)
+        inner = [f"{each}.{name}" for each, node in zip(keys, outer, strict=True) if name in list_keys(root, node)]
+        hint = f" Did you mean {inner[0]!r}?" if inner else did_you_mean(str(name), keys)
+        return f"no key {key!r}{of}.{hint} Keys here: {', '.join(keys)}."
+    label = f"{key}: " if key else ""
+    if problem["type"] == "value_error":  # of a check of ours that needs more than a type
+        return f"{label}{problem['ctx']['error']}"
+    part, given = find_schema(root, path), values
+    for each in path:
+        given = given[each]
+    expected = describe_value(root, part)
+    if unit:
+        expected = f"{expected.removesuffix(' or null')} [{unit}]"
+    examples = f", such as {' or '.join(part['examples'])}" if "examples" in part else ""
+    close = did_you_mean(given, part.get("enum", ())) if isinstance(given, str) else ""
+    got = repr(short_repr(given)) if isinstance(given, str) else short_repr(given)
+    return f"{label}expected {expected}{examples}, got {got}{close and f'.{close}'}"
+
+
+def _list_alternatives(root: Schema, node: Schema) -> Iterator[Schema]:
+    if "$ref" in node:
+        yield from _list_alternatives(root, root["$defs"][node["$ref"].rpartition("/")[2]])
+    elif "anyOf" in node:
+        for each in node["anyOf"]:
+            yield from _list_alternatives(root, each)
+    else:
+        yield node
+
+
+def _describe(root: Schema, node: Schema) -> str:
+    if "const" in node:
+        return yaml_text.dump(node["const"]).partition("\n")[0]
+    if "enum" in node:
+        return " or ".join(map(str, node["enum"]))
+    if "pattern" in node:
+        return str(node["pattern"])
+    if "prefixItems" in node:
+        return f"[{', '.join(describe_value(root, each) for each in node['prefixItems'])}]"
+    kind = node.get("type")
+    if kind in ("integer", "number"):
+        return f"{'a whole number' if kind == 'integer' else 'a number'}{_describe_range(node)}"
+    if kind == "array":
+        return f"a list, each element {describe_value(root, node['items'])}"
+    if kind == "object":
+        keys = list_keys(root, node)
+        return f"a mapping of {', '.join(keys)}" if keys else "a mapping"
+    return {"boolean": "true or false", "null": "null", "string": "text"}.get(str(kind), "any value")
+
+
+def _describe_range(node: Schema) -> str:
+    low, above = node.get("minimum", node.get("ge")), node.get("exclusiveMinimum", node.get("gt"))
+    high, below = node.get("maximum", node.get("le")), node.get("exclusiveMaximum", node.get("lt"))
+    left = f"[{_format_number(low)}" if low is not None else f"({_format_number(above)}" if above is not None else ""
+    right = f"{_format_number(high)}]" if high is not None else f"{_format_number(below)})" if below is not None else ""
+    if left and right:
+        return f" in {left}, {right}"
+    if left:
+        return f" {'>=' if low is not None else '>'} {left[1:]}"
+    return ""
+
+
+def _format_number(value: float) -> str:
+    short = f"{value:.0e}".replace("e+0", "e").replace("e+", "e")
+    return short if value >= 1e6 and float(short) == value else str(value)

@@ -1,0 +1,89 @@
+"""Curricula: the stages of a recipe, from easy to what is wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pydantic
+from pydantic import Field
+
+from rlctl.recipe.quantities import Number, Section, Whole
+
+
+class Promotion(Section):
+    """When training goes on to the next stage: by the success rate or the mean return of its last episodes."""
+
+    success: Number | None = Field(None, gt=0, le=1)
+    """Success rate to reach."""
+    mean_return: Number | None = Field(None, alias="return")
+    """Mean return to reach."""
+    window: Whole = Field(100, ge=1, le=1_000_000)
+    """How many finished training episodes of the stage are looked at; the rule holds no earlier than that."""
+    min_steps: Whole = Field(0, ge=0)
+    """Environment steps that a stage lasts at least, all environments together."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_measure(self) -> Promotion:
+        if (self.success is None) == (self.mean_return is None):
+            raise ValueError("give success or return, one of the two: promote: {success: 0.8, window: 100}")
+        return self
+
+    @property
+    def threshold(self) -> float:
+        """The success rate, in (0, 1], or the mean return to reach."""
+        return self.success if self.success is not None else self.mean_return or 0.0
+
+
+class Stage(Section):
+    """What a stage changes in the recipe's own `task`, `reward_weights` and `events`, and when it ends.
+
+    Each stage changes the recipe, not the stage before it: `{}` is the task as the recipe has it.
+    """
+
+    task: dict[str, Any] = {}
+    """Changes of the recipe's `task`."""
+    reward_weights: dict[str, Number] = {}
+    """Changes of the recipe's `reward_weights`."""
+    events: dict[str, dict[str, Any]] = {}
+    """Changes of the recipe's `events`."""
+    level: Number = Field(1.0, ge=0, le=1)
+    """How far ranges of events written `{from: ..., to: ...}` have widened."""
+    promote: Promotion | None = None
+    """When the stage ends; the last stage has none."""
+
+    def __str__(self) -> str:
+        changes = [f"{name} {value}" for name, value in self.task.items()]
+        changes += [f"reward_weights.{name} {value:g}" for name, value in self.reward_weights.items()]
+        for event, parameters in self.events.items():
+            changes += [f"{event}.{name} {value}" for name, value in parameters.items()] or [event]
+        changes += [f"level {self.level:g}"] if self.level != 1 else []
+        return ", ".join(changes) or "the recipe's own task"
+
+
+def check_promotions(stages: list[Stage]) -> list[Stage]:
+    """Return stages; raises `ValueError` unless every stage but the last says when it ends, and the last does not."""
+    for number, stage in enumerate(stages, start=1):
+        last = number == len(stages)
+        if stage.promote is None and not last:
+            raise ValueError(
+                f"stage {number} of {len(stages)} ({stage}) has no promotion rule, so training would never leave it; "
+                "add promote: {success: 0.8, window: 100} or promote: {return: 50.0, window: 100}"
+            )
+        if stage.promote is not None and last:
+            raise ValueError(f"stage {number} of {len(stages)} ({stage}) is the last: leave out its promote")
+    return stages
+
+
+def format_value(key: str, value: Any) -> str:
+    """Return the value of a recipe's key for people: of stages, as plain data, only what they change."""
+    try:
+        stages = [Stage.model_validate(each) for each in value] if key == "stages" else []
+    except (TypeError, ValueError):  # not set, or what a file by hand holds
+        stages = []
+    return f"{len(stages)} stages: " + "; ".join(map(str, stages)) if stages else str(value)
+
+
+def format_title(number: int, stages: Sequence[Stage]) -> str:
+    """Return a stage for people: `stage 2 of 3: tolerance 0.1`."""
+    return f"stage {number} of {len(stages)}: {stages[number - 1]}"

@@ -1,0 +1,149 @@
+"""Films of episodes, `.mp4` or `.gif`, without a display: from PyBullet's software renderer, or `render()`."""
+
+from __future__ import annotations
+
+import fractions
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import RlctlError, UsageError
+from rlctl.replaying.recorder import Choose, Rollout, frame_time, play_episode
+from rlctl.replaying.report import FilmReport
+from rlctl.replaying.scene import Env
+from rlctl.replaying.view import Picture, look_at
+from rlctl.storage import files
+
+SUFFIXES = (".mp4", ".gif")
+
+_SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels]
+_RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
+_DT = 1 / 30  # [s] a step, where an environment does not say
+_PAUSE_S = 0.5  # [s] at the end of each episode
+
+
+def check_file(path: Path) -> None:
+    """Raise `UsageError` for a file that is not a film's, or one that nothing installed can encode."""
+    if path.suffix not in SUFFIXES:
+        raise UsageError(f"--video {path}: give a file that ends in .mp4 or .gif")
+    if path.suffix == ".mp4":
+        try:
+            import av  # noqa: F401
+        except ImportError:
+            raise UsageError("--video: .mp4 needs PyAV: pip install 'rlctl[video]'; .gif needs nothing more") from None
+
+
+def make_filmable(spec: EnvSpec) -> Env:
+    """Build an environment that can be filmed; raises `UsageError` for one that makes no pictures."""
+    try:
+        return spec.make("rgb_array")
+    except RlctlError as error:
+        spec.make().close()  # raises again if the pictures were not the reason
+        raise UsageError(f"--video: no pictures: {str(error).splitlines()[0]}") from None
+
+
+def film_episodes(
+    path: Path, env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose], *, policy: str
+) -> tuple[list[Rollout], FilmReport]:
+    """Play an episode per seed and write one film of all, whole or not at all."""
+    film = _Film(env, path.suffix)
+    rollouts: list[Rollout] = []
+
+    def write(part: Path) -> None:
+        film.begin(part)
+        for seed in seeds:
+            rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=film.watch))
+            film.pause()
+        film.writer.close()
+
+    files.write_with(path, write)
+    return rollouts, film.report(path)
+
+
+class _Film:
+    """Takes the pictures of one film."""
+
+    def __init__(self, env: Env, suffix: str) -> None:
+        self._view = look_at(env, *_SIZE[suffix])
+        dt = frame_time(env) or _DT
+        self._every = max(1, round(1 / (_RATE[suffix] * dt)))
+        self._rate = 1 / (dt * self._every)
+        self._count = 0
+        self._seconds = 0.0
+        self._last: Picture = np.zeros((0, 0, 3), np.uint8)
+        self._is_taken = False
+
+    def begin(self, path: Path) -> None:
+        """Begin to write a file."""
+        self.writer = (_Mp4 if path.suffix == ".mp4" else _Gif)(path, self._rate)
+
+    def watch(self, step: int) -> None:
+        """Take a picture of the reset, and of every few steps."""
+        if step == 0:
+            self._view.begin()
+        self._is_taken = step % self._every == 0
+        if self._is_taken:
+            self._take()
+
+    def _take(self) -> None:
+        start = time.perf_counter()
+        self._last = self._view.draw()
+        self._seconds += time.perf_counter() - start
+        self._count += 1
+        self.writer.add(self._last)
+
+    def pause(self) -> None:
+        """Take the end of an episode, and stay there for a moment."""
+        if not self._is_taken:
+            self._take()
+        for _ in range(round(_PAUSE_S * self._rate)):
+            self.writer.add(self._last)
+
+    def report(self, path: Path) -> FilmReport:
+        height, width = self._last.shape[:2]
+        return FilmReport(path, self._count, width, height, self._rate, self._count / self._seconds)
+
+
+class _Mp4:
+    """H.264 in MP4, by PyAV: plays in browsers and slides."""
+
+    def __init__(self, path: Path, rate: float) -> None:
+        import av
+
+        self._av = av
+        self._container = av.open(str(path), "w", format="mp4", options={"movflags": "faststart"})
+        self._stream = self._container.add_stream("libx264", rate=fractions.Fraction(rate).limit_denominator(1000))
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.options = {"crf": "20"}
+
+    def add(self, picture: Picture) -> None:
+        if self._stream.width != picture.shape[1]:
+            self._stream.height, self._stream.width = picture.shape[:2]
+        frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        self._container.mux(self._stream.encode())
+        self._container.close()
+
+
+class _Gif:
+    """An animated GIF, by Pillow, whose pictures are kept with their 256 colours until the end."""
+
+    def __init__(self, path: Path, rate: float) -> None:
+        self._path = path
+        self._duration = round(1000 / rate)  # [ms]
+        self._pictures: list[Any] = []
+
+    def add(self, picture: Picture) -> None:
+        from PIL import Image
+
+        self._pictures.append(Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE))
+
+    def close(self) -> None:
+        first, *rest = self._pictures
+        first.save(self._path, "GIF", save_all=True, append_images=rest, duration=self._duration, loop=0)

@@ -1,0 +1,246 @@
+"""Plays an episode in this process and records it: its numbers, a log, and what can be drawn of it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.environments import dict_spaces, registry
+from rlctl.environments.info import EnvInfo, describe
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
+from rlctl.policy.policy import collect_versions
+from rlctl.replaying.scene import Env, Scene, Warn, make_reader
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode
+
+Choose = Callable[[Any, int], Any]
+"""From an observation and the number of steps done to an action; None ends the episode."""
+Watch = Callable[[int], None]
+"""Looks at an environment after a step; 0 is the reset."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LogEntry:
+    """A line in the log of an episode."""
+
+    step: int
+    text: str
+    level: str = "INFO"
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """An episode of T steps that was just played. Step 0 is the reset; step k is the world after action k."""
+
+    env: EnvInfo
+    episode: RecordedEpisode
+    weighted_terms: NDArray[np.float64]
+    """Shape (T, terms); they add up to the reward."""
+    successes: NDArray[np.bool_] | None
+    """Whether the goal held after each step, shape (T,); None where the environment does not report it."""
+    ended: bool
+    """Whether the environment ended the episode, rather than the list of actions."""
+    log: list[LogEntry]
+    dt: float | None
+    """Time between two steps [s], where known."""
+    scene: Scene
+    """Empty if nothing was to be drawn."""
+
+    @property
+    def length(self) -> int:
+        """Number of steps, T."""
+        return len(self.episode.rewards)
+
+
+def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
+    """Build an environment that can be drawn; `warn` receives why there will be no pictures."""
+    if registry.is_task(spec.constructor()):
+        return spec.make()  # its bodies are drawn; pictures would be slow and show less
+    try:
+        return spec.make("rgb_array")
+    except RlctlError as error:
+        env = spec.make()  # raises again if drawing was not the reason
+        warn(f"no camera pictures: {str(error).splitlines()[0]}")
+        return env
+
+
+class _Step(NamedTuple):
+    # What an environment returned for an action; what it may go on writing into is copied.
+    action: Any
+    observation: Any
+    reward: float
+    raw: list[float]
+    """Reward terms, by the names of the weights."""
+    weighted: list[float]
+    success: bool | None
+    events: dict[str, dict[str, float]]
+
+
+def play_episode(
+    env: Env,
+    spec: EnvSpec,
+    seed: int,
+    choose: Choose,
+    *,
+    policy: str = "",
+    draw: Warn | None = None,
+    watch: Watch = lambda step: None,
+) -> Rollout:
+    """Play the episode of a seed and record it; `watch` is called after its reset and each of its steps.
+
+    With `draw` the rollout has a scene, and `draw` receives why parts of it are missing. Raises `TaskError`, with
+    seed and step, for whatever the environment raises.
+    """
+    about, space = describe(env), env.observation_space
+    reader = make_reader(env, draw) if draw is not None else None
+    looks = [watch] if reader is None else [reader.read, watch]
+    steps: list[_Step] = []
+    terminated = truncated = False
+    with _locate_errors(spec.task, seed, 0):
+        observation, info = env.reset(seed=seed)
+        first, drawn = copy_observation(observation, space), _find_events(info, about)
+    for look in looks:
+        look(0)
+    while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
+        with _locate_errors(spec.task, seed, len(steps) + 1):
+            observation, reward, terminated, truncated, info = env.step(_cast_action(action, env.action_space))
+            steps.append(_read_step(action, copy_observation(observation, space), float(reward), info, about))
+        for look in looks:
+            look(len(steps))
+    ended = bool(terminated or truncated)
+    log = [LogEntry(0, f"reset with seed {seed}"), *_log_events(0, drawn), *_log_steps(steps)]
+    log += _log_end(steps, terminated) if ended else [LogEntry(len(steps), "the recorded actions end here", "WARN")]
+    successes = [step.success for step in steps if step.success is not None]
+    return Rollout(
+        env=about,
+        episode=_make_episode(spec, seed, policy, about, first, steps, env.action_space),
+        weighted_terms=_stack_terms([step.weighted for step in steps], about),
+        successes=np.array(successes, np.bool_) if steps and len(successes) == len(steps) else None,
+        ended=ended,
+        log=log,
+        dt=frame_time(env),
+        scene=Scene() if reader is None else reader.scene(),
+    )
+
+
+def _read_step(action: Any, observation: Any, reward: float, info: dict[str, Any], about: EnvInfo) -> _Step:
+    if not math.isfinite(reward):
+        raise ValueError(f"reward is {reward}")
+    names = list(about.reward_weights)
+    raw, weighted = ([float(info[key][name]) for name in names] for key in ("metrics", "reward_terms"))
+    success = None if (given := info.get("is_success")) is None else bool(given)
+    return _Step(np.array(action), observation, reward, raw, weighted, success, _find_events(info, about))
+
+
+def _find_events(info: dict[str, Any], about: EnvInfo) -> dict[str, dict[str, float]]:
+    found: dict[str, dict[str, float]] = info.get("events", {}) if about.events else {}
+    return found  # of a plain environment it may be anything
+
+
+def _make_episode(
+    spec: EnvSpec, seed: int, policy: str, about: EnvInfo, first: Any, steps: list[_Step], space: spaces.Space[Any]
+) -> RecordedEpisode:
+    rewards = [step.reward for step in steps]
+    info = EpisodeInfo(
+        spec=spec,
+        seed=seed,
+        policy=policy,
+        success=steps[-1].success if steps else None,
+        total_reward=sum(rewards, 0.0),
+        term_names=list(about.reward_weights),
+        versions=current_versions(spec.task),
+    )
+    actions = np.array([step.action for step in steps]) if steps else np.zeros((0, *(space.shape or ())))
+    observations = dict_spaces.stack([first, *(step.observation for step in steps)])
+    raw = _stack_terms([step.raw for step in steps], about)
+    return RecordedEpisode(info, actions, observations, np.array(rewards, np.float64), raw)
+
+
+def _stack_terms(rows: list[list[float]], about: EnvInfo) -> NDArray[np.float64]:
+    return np.array(rows, np.float64).reshape(len(rows), len(about.reward_weights))
+
+
+def _log_steps(steps: Iterable[_Step]) -> Iterator[LogEntry]:
+    """Yield what was drawn in each step, and where the goal was reached or lost."""
+    held = False
+    for number, step in enumerate(steps, start=1):
+        yield from _log_events(number, step.events)
+        if bool(step.success) != held:
+            held = not held
+            yield LogEntry(number, "goal reached") if held else LogEntry(number, "goal lost", "WARN")
+
+
+def _log_end(steps: Sequence[_Step], terminated: bool) -> Iterator[LogEntry]:
+    yield LogEntry(len(steps), "terminated" if terminated else "truncated: time limit")
+    if (success := steps[-1].success) is not None:
+        yield LogEntry(len(steps), "success") if success else LogEntry(len(steps), "no success", "WARN")
+
+
+def _log_events(step: int, events: Mapping[str, Mapping[str, float]]) -> Iterator[LogEntry]:
+    for name, drawn in events.items():
+        values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
+        yield LogEntry(step, f"event {name}: {values}", "DEBUG")
+
+
+def frame_time(env: Env) -> float | None:
+    """Return the time between two steps [s], where an environment has it."""
+    fps = env.metadata.get("render_fps")
+    return describe(env).control_dt or (1.0 / fps if fps else None)
+
+
+def recorded_actions(episode: RecordedEpisode, env: Env, path: Path | None = None) -> Choose:
+    """Return what chooses the actions of a recorded episode; raises `ArtifactError` if they are for another space."""
+    check_actions(episode, env.action_space.shape or (), path)
+    return lambda _, step: episode.actions[step] if step < len(episode.actions) else None
+
+
+def check_actions(episode: RecordedEpisode, shape: tuple[int, ...], path: Path | None = None) -> None:
+    """Raise `ArtifactError` if the actions of an episode do not have the shape that its task has now."""
+    given = episode.actions.shape[1:]
+    if given != shape:
+        name = path or f"episode of {episode.info.spec.task}"
+        raise ArtifactError(f"{name}: its actions have shape {given}, those of {episode.info.spec.task} have {shape}")
+
+
+def current_versions(task: str) -> dict[str, str]:
+    """Return the versions that an episode of a task depends on."""
+    origin = registry.find_origin(task)
+    return {**collect_versions(), **({origin["distribution"]: origin["version"]} if origin else {})}
+
+
+def _cast_action(action: Any, space: spaces.Space[Any]) -> Any:
+    return int(action) if isinstance(space, spaces.Discrete) else np.array(action, dtype=space.dtype)
+
+
+@contextlib.contextmanager
+def _locate_errors(task: str, seed: int, step: int) -> Iterator[None]:
+    """Add the task, the episode and the step to whatever an environment raises, `SystemExit` included."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        ours = isinstance(error, RlctlError)
+        what = str(error) if ours else describe_exception(error)
+        where = f"in the episode with seed {seed}, step {step}"
+        details = None if ours else format_plugin_traceback(error) or None
+        message = f"task {task!r}: {what}\n{where}; to see it alone: rlctl check-env {task}"
+        raise TaskError(message, details=details) from error
+
+
+def copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
+    """Copy an observation in the dtype of its space, as recorded episodes have it; some environments reuse theirs."""
+    if isinstance(space, spaces.Dict):
+        return {key: copy_observation(observation[key], part) for key, part in space.spaces.items()}
+    value = np.array(observation, dtype=space.dtype)
+    if value.shape != space.shape:
+        raise ValueError(f"observation has shape {value.shape}, the space has {space.shape}")
+    return value

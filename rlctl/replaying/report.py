@@ -1,0 +1,159 @@
+"""What a replay prints."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rlctl import output
+from rlctl.environments.info import describe_randomization
+from rlctl.errors import AnswerIsNo
+from rlctl.policy.policy import collect_versions
+from rlctl.replaying.difference import Difference
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayedEpisode:
+    """One episode that was played."""
+
+    seed: int
+    length: int
+    total_reward: float
+    success: bool | None
+    events: Mapping[str, bool]
+    """The events that the task offers, and whether each acted."""
+    recording: Path | None = None
+    """The `.rrd` file."""
+    episode: Path | None = None
+    """The `.npz` file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Verification:
+    """How a recorded episode compares with a new rollout of its actions."""
+
+    episode: Path
+    difference: Difference | None
+    other_versions: dict[str, tuple[str, str | None]]
+    """Recorded and current version, by name, of those that differ."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FilmReport:
+    """A film that was written."""
+
+    file: Path
+    pictures: int
+    width: int
+    height: int
+    rate: float
+    """Pictures per second, as it plays."""
+    drawn_per_s: float
+    """Pictures per second, as they were drawn."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayResult:
+    """Episodes that were played, and the verification of one."""
+
+    task: str
+    policy: str
+    episodes: list[ReplayedEpisode]
+    verification: Verification | None = None
+    policy_file: str = ""
+    """Where the policy is, and what it is; empty for a recorded episode."""
+    choice: str = ""
+    """What the episodes are of many others, where they were chosen by outcome."""
+    film: FilmReport | None = None
+
+    def check(self) -> None:
+        """Raise `AnswerIsNo` if a recorded episode could not be reproduced."""
+        if self.verification is not None and self.verification.difference is not None:
+            raise AnswerIsNo(f"{self.verification.episode}: not identical, {self.verification.difference}")
+
+
+def show(result: ReplayResult, json: str | None) -> None:
+    """Print the episodes and the command that opens them, or write them as JSON."""
+    if json is not None and output.write_result_json(json, as_json(result)):
+        return
+    if result.verification is not None:
+        _show_verification(result, result.verification)
+        return
+    out = output.out()
+    randomization = describe_randomization(result.episodes[0].events) if result.episodes else ""
+    parts = [each for each in (result.policy_file or result.policy, randomization) if each]
+    out.print(f"{result.task}: {', '.join(parts)}" if parts else result.task)
+    if result.choice:
+        out.print(result.choice)
+    for episode in result.episodes:
+        out.print(_line(episode))
+    if film := result.film:
+        out.print(
+            f"{film.file}: {film.pictures} pictures of {film.width}x{film.height}, {film.rate:.3g} per second; "
+            f"drawn at {film.drawn_per_s:.3g} per second",
+        )
+    if command := open_command(result):
+        out.print(f"open with: {command}")
+        out.print(f"without a display, in a browser: {command.replace('rerun', 'rerun --serve-web', 1)}")
+
+
+def _line(episode: ReplayedEpisode) -> str:
+    parts = [f"seed {episode.seed}", f"{episode.length} steps", f"return {episode.total_reward:.4g}"]
+    if episode.success is not None:
+        parts.append("success" if episode.success else "no success")
+    where = f"{episode.recording}: " if episode.recording else ""
+    return where + ", ".join(parts)
+
+
+def _show_verification(result: ReplayResult, verification: Verification) -> None:
+    out, (episode,) = output.out(), result.episodes
+    verdict = "identical, bit for bit" if verification.difference is None else "not identical"
+    out.print(f"{verification.episode}: {result.task}, {_line(episode)}: {verdict}")
+    for name, (recorded, now) in verification.other_versions.items():
+        out.print(f"recorded with {name} {recorded}, here is {now or 'none'}")
+
+
+def open_command(result: ReplayResult) -> str | None:
+    """Return the command that opens the recordings; None if there are none."""
+    files = [str(episode.recording) for episode in result.episodes if episode.recording]
+    return shlex.join(["rerun", *files]) if files else None
+
+
+def as_json(result: ReplayResult) -> dict[str, Any]:
+    """Return what is written as JSON."""
+    content: dict[str, Any] = {
+        "task": result.task,
+        "policy": result.policy,
+        "episodes": [_episode_json(episode) for episode in result.episodes],
+        "open": open_command(result),
+        "versions": collect_versions(),
+    }
+    if result.choice:
+        content["choice"] = result.choice
+    if result.film is not None:
+        content["film"] = result.film
+    if (verification := result.verification) is not None:
+        versions = verification.other_versions.items()
+        content["verification"] = {
+            "episode": verification.episode,
+            "identical": verification.difference is None,
+            "difference": verification.difference,
+            "other_versions": {name: {"recorded": recorded, "now": now} for name, (recorded, now) in versions},
+        }
+    return content
+
+
+def _episode_json(episode: ReplayedEpisode) -> dict[str, Any]:
+    return {
+        "file": episode.recording,
+        "episode": episode.episode,
+        "seed": episode.seed,
+        "length": episode.length,
+        "return": episode.total_reward,
+        "success": episode.success,
+        "randomized": any(episode.events.values()),
+        "events": episode.events,
+    }

@@ -1,0 +1,185 @@
+"""Writes a rollout as a Rerun recording (`.rrd`), with the layout that the viewer opens it in."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from rlctl.environments import registry
+from rlctl.errors import ArtifactError
+from rlctl.replaying.bodies import bounds, draw_scene
+from rlctl.replaying.curves import Plot, Timelines, send_curves
+from rlctl.replaying.recorder import Rollout
+from rlctl.replaying.scene import BodyMotion, Scene, Warn
+from rlctl.run.episode import RecordedEpisode
+from rlctl.storage import files
+
+Followed = tuple[str, BodyMotion] | None
+"""What the camera follows: an entity, and the body that it is of."""
+
+_LEVEL_COLORS = {"INFO": 0xB0D0FFFF, "WARN": 0xFFC060FF, "DEBUG": 0xB0B0B0FF}
+_EYE_DIRECTION = np.array([1.0, 0.75, 0.5])  # from the front left, looking down
+_GOAL_MARGIN = 2.5  # distance of the eye in distances of the goal; from 1.9 on it is in a view of 55 degrees
+_PLOT_ROWS = (("reward",), ("action",), ("joints", "observation"))  # by kind; those of a row are tabs
+
+
+def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: bool = False) -> None:
+    """Write a recording, whole or not at all. Opens no port.
+
+    Rows are at the steps of the episode: 0 is the reset; the action, the reward and the state after it have the
+    same number. The same episode always has the same recording id. `warn` receives what cannot be drawn.
+    With `several` recordings to open together, the viewer shows their list.
+    """
+    info = rollout.episode.info
+    stream = rr.RecordingStream(
+        f"rlctl_{registry.make_slug(info.spec.task)}",
+        recording_id=_recording_id(rollout.episode),
+        send_properties=False,
+    )
+    stream.set_log_time_enabled(False)
+
+    def write(part: Path) -> None:
+        try:
+            with stream:
+                # What is sent before `save` waits in memory: the layout is known only at the end.
+                layout = _send(stream, rollout, title, warn, several)
+                stream.save(part, default_blueprint=layout)
+                stream.flush()
+        except RuntimeError as error:  # what Rerun raises when the disk is full
+            raise ArtifactError(f"{path}: cannot be written: {error}") from error
+
+    files.write_with(path, write)
+
+
+def _recording_id(episode: RecordedEpisode) -> str:
+    content = hashlib.sha256(episode.info.model_dump_json().encode())
+    content.update(episode.actions.tobytes())
+    content.update(episode.rewards.tobytes())
+    return f"{registry.make_slug(episode.info.spec.task)}-{episode.info.seed}-{content.hexdigest()[:12]}"
+
+
+def _send(stream: rr.RecordingStream, rollout: Rollout, title: str, warn: Warn, several: bool) -> rrb.Blueprint:
+    timelines, scene = Timelines(stream, rollout.dt), rollout.scene
+    stream.send_recording_name(title)
+    stream.send_property("episode", _properties(rollout))
+    followed = draw_scene(scene, timelines, warn)
+    plots = send_curves(rollout, timelines)
+    _send_log(rollout, timelines)
+    if scene.pictures:
+        steps, blobs = [step for step, _ in scene.pictures], [blob for _, blob in scene.pictures]
+        columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
+        timelines.send("camera", steps, columns)
+    return _layout(rollout, plots, timelines.default, followed, several)
+
+
+def _properties(rollout: Rollout) -> rr.AnyValues:
+    info = rollout.episode.info
+    values: dict[str, Any] = {
+        "task": info.spec.task,
+        "parameters": json.dumps(dict(info.spec.parameters)),
+        "seed": info.seed,
+        "length": rollout.length,
+        "total_reward": info.total_reward,
+        "policy": info.policy,
+        "robot": rollout.env.robot,
+        "control_dt": rollout.env.control_dt,
+        "versions": json.dumps({**info.versions, "rerun-sdk": version("rerun-sdk")}),
+        "success": info.success,
+    }
+    return rr.AnyValues(**{key: value for key, value in values.items() if value is not None})
+
+
+def _send_log(rollout: Rollout, timelines: Timelines) -> None:
+    log = rollout.log
+    # All three for every row: the viewer carries a missing level or colour over from another row.
+    columns = rr.TextLog.columns(
+        text=[each.text for each in log],
+        level=[each.level for each in log],
+        color=np.array([_LEVEL_COLORS[each.level] for each in log], np.uint32),
+    )
+    timelines.send("events", [each.step for each in log], columns)
+    if rollout.successes is None:
+        return
+    style = rr.StateConfiguration(values=["away", "at goal"], colors=[0x8090A0FF, 0x28C85AFF])
+    timelines.stream.log("goal", style, static=True)
+    held = [False, *rollout.successes.tolist()]
+    changes = [0, *(step for step in range(1, len(held)) if held[step] != held[step - 1])]
+    states = ["at goal" if held[step] else "away" for step in changes]
+    timelines.send("goal", changes, rr.StateChange.columns(state=states))
+
+
+def _layout(rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: Followed, several: bool) -> rrb.Blueprint:
+    """Return the layout: the world on the left, its numbers on the right; the camera follows `followed`."""
+    scene = rollout.scene
+    left: list[rrb.Container | rrb.View] = []
+    if scene.bodies or scene.markers:
+        left.append(_world(scene, followed))
+    if scene.pictures:
+        left.append(rrb.Spatial2DView(name="camera", origin="/camera"))
+    left += [rrb.Spatial2DView(name=plot.title, origin=f"/{plot.entity}") for plot in plots if plot.kind == "image"]
+    columns = rrb.TextLogColumns(
+        timeline_columns=["step"] if timeline == "step" else ["step", timeline], text_log_columns=["body"]
+    )
+    log = rrb.TextLogView(name="events", origin="/events", columns=columns)
+    below = (
+        rrb.Horizontal(log, rrb.StateTimelineView(name="goal", origin="/goal"))
+        if rollout.successes is not None
+        else log
+    )
+    right = _curves(plots)
+    if left:
+        content: rrb.Container = rrb.Horizontal(
+            rrb.Vertical(rrb.Vertical(*left), below, row_shares=[4, 1]), right, column_shares=[3, 2]
+        )
+    else:
+        content = rrb.Vertical(right, below, row_shares=[4, 1])
+    return rrb.Blueprint(
+        content,
+        rrb.TimePanel(state="collapsed", timeline=timeline),
+        rrb.BlueprintPanel(state="expanded" if several else "hidden"),  # the list of recordings is in it
+        rrb.SelectionPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _curves(plots: Sequence[Plot]) -> rrb.Container:
+    rows = [[_plot(plot) for plot in plots if plot.kind in kinds] for kinds in _PLOT_ROWS]
+    return rrb.Vertical(*(rrb.Tabs(*views) if len(views) > 1 else views[0] for views in rows if views))
+
+
+def _plot(plot: Plot) -> rrb.TimeSeriesView:
+    legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=True)
+    return rrb.TimeSeriesView(name=plot.title, origin=f"/{plot.entity}", plot_legend=legend)
+
+
+def _world(scene: Scene, followed: Followed) -> rrb.Spatial3DView:
+    entity, body = followed or (None, None)
+    low, high = bounds(scene) if body is None else body.box
+    center, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    distances = [1.0, 1.15 * size]
+    if body is not None:
+        # What is followed is in the middle of the picture: its feet are far below, and a goal is to one side.
+        goals = [float(np.linalg.norm(positions[0] - center)) for positions in scene.markers.values()]
+        distances = [1.0, 1.5 * size, *(_GOAL_MARGIN * goal for goal in goals)]
+    eye = center + max(distances) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
+    start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    so_far = [rrb.VisibleTimeRange(name, start=start, end=end) for name in ("step", "sim_time")]
+    return rrb.Spatial3DView(
+        name="world",
+        origin="/",
+        contents=["/world/**"],
+        overrides={
+            rr.new_entity_path(["world", "paths", body.name]): rrb.VisibleTimeRanges(so_far) for body in scene.robots()
+        },
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=center, eye_up=(0, 0, 1), tracking_entity=entity),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, plane=rr.components.Plane3D.XY),
+    )

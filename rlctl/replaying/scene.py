@@ -1,0 +1,248 @@
+"""What an episode looks like: the bodies of a PyBullet world, or camera pictures of any other environment.
+
+Read after every step, drawn when the episode is over.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import itertools
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError, describe_exception
+from rlctl.replaying.mjcf import Shape, read_shapes
+from rlctl.task.body import Body
+from rlctl.task.bullet import pybullet
+from rlctl.task.env import TaskEnv
+
+Env = gymnasium.Env[Any, Any]
+Array = NDArray[np.float64]
+Warn = Callable[[str], None]
+"""Receives a message for the user: what cannot be drawn as it should be."""
+
+_GROUND_SIZE = 8.0  # [m]; a body without joints that is wider both ways is the ground
+_INERTIAL_POSE = slice(3, 5)  # of getDynamicsInfo: the centre of mass in the link frame
+_LINK_POSE = slice(4, 6)  # of getLinkState: the link frame in the world
+_MOST_PICTURES = 100  # of an episode: drawing one takes up to 40 ms
+_LARGEST_PICTURE = 480  # [pixels]
+_JPEG_QUALITY = 80
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyMotion:
+    """A body over T steps. Positions [m] and quaternions (x, y, z, w) are of link frames in the world frame."""
+
+    name: str
+    file: Path
+    ground_height: float | None
+    """Height of the upper face [m] if the body is the flat ground."""
+    terrain: Array | None
+    """Points of rough ground [m], world frame, shape (along x, along y, 3)."""
+    joint_names: list[str]
+    joint_positions: Array
+    """[rad or m], shape (T + 1, joints)."""
+    joint_velocities: Array
+    """[rad/s or m/s], shape (T + 1, joints)."""
+    links: list[str]
+    """The base first."""
+    positions: Array
+    """Shape (T + 1, links, 3)."""
+    orientations: Array
+    """Shape (T + 1, links, 4)."""
+    shapes: list[Shape]
+    trunk: int | None
+    """Index in `links` of what moves about: a free base, or what sliding joints without limits carry; else None."""
+    box: tuple[Array, Array]
+    """Lowest and highest corner [m] at the reset."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """What can be drawn of an episode of T steps."""
+
+    bodies: list[BodyMotion] = dataclasses.field(default_factory=list)
+    markers: dict[str, Array] = dataclasses.field(default_factory=dict)
+    """World positions [m], shape (T + 1, 3)."""
+    pictures: list[tuple[int, bytes]] = dataclasses.field(default_factory=list)
+    """Step and JPEG file."""
+
+    def robots(self) -> list[BodyMotion]:
+        """Return the bodies with joints."""
+        return [body for body in self.bodies if body.joint_names]
+
+
+def make_reader(env: Env, warn: Warn) -> SceneReader | Camera:
+    """Return what reads the world of a task, or takes the pictures of any other environment."""
+    inner = env.unwrapped
+    return SceneReader(inner) if isinstance(inner, TaskEnv) else Camera(env, warn)
+
+
+def find_bounds(bodies: Sequence[Body], markers: Sequence[Array] = ()) -> tuple[Array, Array]:
+    """Return the lowest and the highest corner [m] now of bodies that are not the ground, and of markers."""
+    corners = list(markers)
+    for body in bodies:
+        boxes = [
+            np.array(pybullet.getAABB(body.id, link, physicsClientId=body.client))
+            for link in range(-1, len(body.link_names))
+        ]
+        wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
+        corners += [] if wide else list(itertools.chain(*boxes))
+    return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
+
+
+class SceneReader:
+    """Reads bodies and markers of a task's world; changes nothing."""
+
+    def __init__(self, env: TaskEnv) -> None:
+        self._env = env
+        self._bodies: list[_BodyReader] = []
+        self._markers: dict[str, list[Array]] = {}
+
+    def read(self, step: int) -> None:
+        """Read the world after a step; 0 is the reset."""
+        if step == 0:  # only now: a reset may load the bodies anew
+            self._bodies = [_BodyReader(body) for body in self._env.sim.bodies.values()]
+            self._markers = {name: [] for name in self._marker_positions()}
+        for reader in self._bodies:
+            reader.read()
+        if self._markers:
+            positions = self._marker_positions()
+            for name, history in self._markers.items():
+                history.append(np.array(positions[name], np.float64))
+
+    def _marker_positions(self) -> dict[str, Array]:
+        try:
+            return self._env.task.markers()
+        except Exception as error:  # a plugin may raise anything
+            message = f"{self._env.name}: markers() raised {type(error).__name__}: {error}"
+            raise TaskError(message, details=traceback.format_exc()) from error
+
+    def scene(self) -> Scene:
+        """Return what was read since the last reset."""
+        return Scene(
+            [reader.motion() for reader in self._bodies],
+            {name: np.stack(history) for name, history in self._markers.items()},
+        )
+
+
+class _BodyReader:
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        self.client = body.client
+        base, _ = pybullet.getBodyInfo(body.id, physicsClientId=self.client)
+        self.links = [base.decode(), *body.link_names]
+        inertial = pybullet.getDynamicsInfo(body.id, -1, physicsClientId=self.client)[_INERTIAL_POSE]
+        # PyBullet's base pose is that of the centre of mass.
+        self._base_in_inertial = pybullet.invertTransform(*inertial)
+        self._box = find_bounds([body])
+        self._joint_positions: list[Array] = []
+        self._joint_velocities: list[Array] = []
+        self._poses: list[list[tuple[tuple[float, ...], tuple[float, ...]]]] = []
+
+    def read(self) -> None:
+        body = self.body
+        self._joint_positions.append(body.joint_positions.copy())
+        self._joint_velocities.append(body.joint_velocities.copy())
+        inertial = pybullet.getBasePositionAndOrientation(body.id, physicsClientId=self.client)
+        poses = [pybullet.multiplyTransforms(*inertial, *self._base_in_inertial)]
+        if len(self.links) > 1:
+            states = pybullet.getLinkStates(
+                body.id, list(range(len(self.links) - 1)), computeForwardKinematics=1, physicsClientId=self.client
+            )
+            poses += [state[_LINK_POSE] for state in states]
+        self._poses.append(poses)
+
+    def motion(self) -> BodyMotion:
+        body = self.body
+        shapes = self._shapes()
+        return BodyMotion(
+            name=body.name,
+            file=body.file,
+            ground_height=self._ground_height(),
+            terrain=self.body.terrain,
+            joint_names=body.joint_names,
+            joint_positions=np.stack(self._joint_positions),
+            joint_velocities=np.stack(self._joint_velocities),
+            links=self.links,
+            positions=np.array([[pose[0] for pose in poses] for poses in self._poses], np.float64),
+            orientations=np.array([[pose[1] for pose in poses] for poses in self._poses], np.float64),
+            shapes=shapes,
+            trunk=self._trunk(),
+            box=self._box,
+        )
+
+    def _ground_height(self) -> float | None:
+        if len(self.links) > 1 or self.body.terrain is not None:
+            return None
+        low, high = pybullet.getAABB(self.body.id, -1, physicsClientId=self.client)
+        if min(high[0] - low[0], high[1] - low[1]) < _GROUND_SIZE:
+            return None
+        endless = high[2] - low[2] > 1e6  # an infinite plane has an infinite box
+        return float(self._poses[0][0][0][2] if endless else high[2])
+
+    def _trunk(self) -> int | None:
+        trunk = self.body.find_trunk() if self.body.joint_names else None
+        if trunk is None:
+            return None
+        return 0 if not self.body.fixed else self.links.index(trunk, 1)
+
+    def _shapes(self) -> list[Shape]:
+        if self.body.file.suffix == ".xml":
+            try:
+                return read_shapes(self.body.file)
+            except ValueError:  # PyBullet's reader accepts more; the user is warned that nothing is drawn
+                return []
+        shapes = []
+        for data in pybullet.getVisualShapeData(self.body.id, physicsClientId=self.client):
+            _, link, kind, size, mesh, position, orientation, color = data[:8]
+            file = Path(mesh.decode()) if mesh else None
+            shapes.append(Shape(self.links[link + 1], kind, tuple(size), file, position, orientation, color))
+        return shapes
+
+
+class Camera:
+    """Takes pictures of an environment, of long episodes only every few steps; one that cannot draw is asked once."""
+
+    def __init__(self, env: Env, warn: Warn) -> None:
+        self._env = env
+        self._warn = warn
+        self._works = env.render_mode == "rgb_array"
+        self._pictures: list[tuple[int, bytes]] = []
+        self._every = 1
+
+    def read(self, step: int) -> None:
+        """Take a picture after a step, if it is one to take."""
+        if not self._works or step % self._every:
+            return
+        try:
+            self._pictures.append((step, encode_jpeg(np.asarray(self._env.render()))))
+        except Exception as error:  # missing pygame, no OpenGL, no picture: the recording goes on without
+            self._works = False
+            no_render = isinstance(error, NotImplementedError)
+            why = "the environment does not implement render" if no_render else describe_exception(error)
+            self._warn(f"no camera pictures: {why}")
+        if len(self._pictures) > _MOST_PICTURES:  # the length of an episode is not known before its end
+            self._pictures, self._every = self._pictures[::2], 2 * self._every
+
+    def scene(self) -> Scene:
+        """Return the pictures."""
+        return Scene(pictures=self._pictures)
+
+
+def encode_jpeg(picture: NDArray[Any]) -> bytes:
+    """Return a picture of shape (height, width, 1 or 3), uint8, as a JPEG file of at most 480 pixels a side."""
+    from PIL import Image
+
+    image = Image.fromarray(np.squeeze(picture, axis=-1) if picture.shape[-1] == 1 else picture)
+    image.thumbnail((_LARGEST_PICTURE, _LARGEST_PICTURE))
+    file = io.BytesIO()
+    image.convert("RGB").save(file, "JPEG", quality=_JPEG_QUALITY)
+    return file.getvalue()

@@ -1,0 +1,72 @@
+"""PyBullet's window, or that of a Gymnasium environment: `--gui`."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+from rlctl.environments import registry
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import TaskError, UsageError
+from rlctl.replaying.recorder import Choose, Rollout, Watch, frame_time, play_episode
+from rlctl.replaying.scene import Env
+
+_INSTEAD = "leave out --gui to write a recording instead"
+_DT = 1 / 30  # [s] a step, where an environment does not say
+
+
+def open_window(spec: EnvSpec) -> Env:
+    """Build an environment that shows itself; raises `UsageError` where there is no display."""
+    if sys.platform == "linux":
+        _check_display(bullet=registry.is_task(spec.constructor()))
+    return spec.make("human")
+
+
+def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose]) -> list[Rollout]:
+    """Play an episode per seed in real time; closing PyBullet's window ends it early, without an error."""
+    shown: list[Rollout] = []
+    for seed in seeds:
+        try:
+            shown.append(play_episode(env, spec, seed, begin(seed), watch=_wait(frame_time(env) or _DT)))
+        except TaskError as error:
+            if "Not connected to physics server" not in str(error.__cause__):
+                raise
+            break
+    return shown
+
+
+def _wait(dt: float) -> Watch:
+    """Return what waits after each step, of `dt` [s], until the simulated time has passed on the clock."""
+    start: list[float] = []
+
+    def wait(step: int) -> None:
+        if step == 0:
+            start.append(time.monotonic())
+        time.sleep(max(0.0, start[0] + step * dt - time.monotonic()))
+
+    return wait
+
+
+def _check_display(*, bullet: bool) -> None:
+    """Look for a display first: without one PyBullet ends the process."""
+    display, wayland = os.environ.get("DISPLAY"), os.environ.get("WAYLAND_DISPLAY")
+    if not display and (bullet or not wayland):
+        raise UsageError(f"--gui: there is no display, DISPLAY is not set; {_INSTEAD}")
+    if bullet and not _x_server_answers():
+        raise UsageError(f"--gui: no X server answers at DISPLAY={display}; {_INSTEAD}")
+
+
+def _x_server_answers() -> bool:
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")  # the one that PyBullet itself loads
+    except OSError:
+        return False
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
+    connection = x11.XOpenDisplay(None)
+    if connection:
+        x11.XCloseDisplay(connection)
+    return bool(connection)

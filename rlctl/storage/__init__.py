@@ -1,0 +1,1 @@
+"""Files: atomic writing, tables, YAML, and reading what others may have written."""

@@ -1,0 +1,231 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import io
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlctl.errors import ArtifactError
+from rlctl.storage import untrusted
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def write_with(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` make a file beside its place, flush it to the disk, and rename it into place."""
+    os.makedirs(path.parent, exist_ok=True)
+    beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # keeps the suffix: some writers look at it
+    try:
+        write(beside)
+        sync(beside)
+        os.replace(beside, path)
+    except BaseException:
+        with contextlib.suppress(OSError):  # the error that led here is the one to report
+            os.unlink(beside)
+        raise
+    _sync_folder(path.parent)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file, whole or not at all."""
+    write_with(path, lambda beside: append(beside, content, 0))
+
+
+def write_new(path: Path, content: bytes) -> None:
+    """Write a file and flush it to the disk: for a folder that is not in its place yet."""
+    append(path, content, 0)
+    sync(path)
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write a UTF-8 file, whole or not at all."""
+    write_bytes(path, content.encode())
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write indented JSON, whole or not at all."""
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON; raises `ArtifactError` if the file is missing or damaged."""
+    try:
+        return untrusted.parse_json(untrusted.read_bytes(path, untrusted.JSON_LIMIT).decode())
+    except ValueError as error:
+        raise ArtifactError(f"{path}: damaged: {error}") from None
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays as `.npz`, whole or not at all; object arrays, which would need pickle, are refused."""
+    import numpy as np
+
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """Read a `.npz` without pickle; raises `ArtifactError` if it is missing, damaged, too large or of another kind."""
+    try:
+        return untrusted.read_arrays(path)
+    except ArtifactError:
+        raise
+    except Exception as error:  # numpy raises whatever zipfile, zlib and its own parser raise
+        raise ArtifactError(f"{path}: damaged, or not an .npz file: {error}") from None
+
+
+_OLD = ".old.part"
+
+
+@contextlib.contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Give a folder to fill by `write_new`; it takes its place when the block ends well, and is removed if not."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    remove_tree(beside)
+    os.makedirs(beside)
+    try:
+        yield beside
+        sync(beside)
+        _take_place(beside, path)
+    except BaseException:
+        remove_tree(beside)
+        raise
+    _sync_folder(path.parent)
+
+
+def _take_place(new: Path, path: Path) -> None:
+    # No system call that Python has swaps two folders. Whoever finds the old one aside puts it back: `recover`.
+    aside = path.with_name(f".{path.name}{_OLD}")
+    if path.exists():
+        os.rename(path, aside)
+    try:
+        os.rename(new, path)
+    except OSError:
+        if aside.exists():
+            os.rename(aside, path)
+        raise
+    remove_tree(aside)
+
+
+def recover(folder: Path) -> None:
+    """Put back what `whole_folder` had set aside, and remove what was half-written, when its process was killed."""
+    for place in folder.glob(".*.part*"):
+        original = place.with_name(place.name[1:].removesuffix(_OLD))
+        if place.name.endswith(_OLD) and not original.exists():
+            os.rename(place, original)
+        elif place.is_dir() and not place.is_symlink():
+            remove_tree(place)
+        else:
+            remove(place)
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a folder and all in it, if it is there."""
+    # It is moved aside first: what is removed half must not be taken for whole.
+    if not path.name.startswith("."):
+        hidden = path.with_name(f".{path.name}.{os.getpid()}.part")
+        shutil.rmtree(hidden, ignore_errors=True)
+        with contextlib.suppress(FileNotFoundError):
+            os.rename(path, hidden)
+        path = hidden
+    shutil.rmtree(path, ignore_errors=True)
+
+
+def append(path: Path, content: bytes, size: int) -> None:
+    """Append to the first `size` bytes of a file, and cut it back to them if the disk does not take it all."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    try:
+        os.ftruncate(descriptor, size)
+        _write_all(descriptor, content)
+    except OSError:
+        with contextlib.suppress(OSError):  # the next one to append cuts it back again
+            os.ftruncate(descriptor, size)
+        raise
+    finally:
+        os.close(descriptor)
+
+
+def truncate(path: Path, size: int) -> None:
+    """Cut a file back to its first `size` bytes."""
+    descriptor = os.open(path, os.O_WRONLY)
+    try:
+        os.ftruncate(descriptor, size)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _write_all(descriptor: int, content: bytes) -> None:
+    rest = memoryview(content)
+    while rest:
+        written = os.write(descriptor, rest)
+        if written == 0:
+            raise OSError(errno.EIO, "the disk accepts no more data")
+        rest = rest[written:]
+
+
+def digest(content: bytes) -> str:
+    """Return the sha256 of some content, as hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def check_digest(path: Path, expected: str) -> None:
+    """Raise `ArtifactError` if a file is not there, or not what it was when `expected` was its digest."""
+    if digest(untrusted.read_bytes(path)) != expected:
+        raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
+
+
+_SEAL = "\n# sha256 of the above: "
+
+
+def write_sealed(path: Path, content: str) -> None:
+    """Write a UTF-8 file that ends in a comment with its sha256, whole or not at all."""
+    content = content.removesuffix("\n")
+    write_text(path, f"{content}{_SEAL}{digest(content.encode())}\n")
+
+
+def is_as_sealed(path: Path) -> bool:
+    """Whether a file that can be read is as `write_sealed` wrote it."""
+    content, _, seal = path.read_bytes().rpartition(_SEAL.encode())
+    return seal.decode(errors="replace") == digest(content) + "\n"
+
+
+def set_aside(path: Path) -> None:
+    """Rename what is damaged out of the way, in the place of what was set aside before under this name."""
+    aside = path.with_name(f"{path.name}.damaged")
+    if aside.is_dir():
+        remove_tree(aside)
+    os.replace(path, aside)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if it is there."""
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(path)
+
+
+def sync(path: Path) -> None:
+    """Flush a file or a folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sync_folder(path: Path) -> None:
+    try:
+        sync(path)
+    except OSError as error:
+        # Some file systems cannot sync a folder; the rename itself has happened.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM):
+            raise

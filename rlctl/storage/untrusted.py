@@ -1,0 +1,131 @@
+"""Reading what somebody may have sent: regular files only, nothing unpickled, no more memory than the file may take."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import stat
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
+
+from rich.filesize import decimal as format_bytes
+
+from rlctl.errors import ArtifactError, short_repr
+from rlctl.storage import memory
+from rlctl.version import __version__
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from pydantic import BaseModel
+
+Model = TypeVar("Model", bound="BaseModel")
+
+JSON_LIMIT = 16 * 2**20  # [bytes]
+_ALWAYS_READ = 1_000_000  # [bytes]
+_MEMBERS = 1000
+"""How many arrays a file may have."""
+_PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""How arrays may be packed: as numpy does it. LZMA lets a file choose how much memory unpacking takes."""
+
+
+@contextlib.contextmanager
+def open_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a regular file; raises `ArtifactError` for one that is missing, unreadable, a folder, a pipe or a device."""
+    try:
+        # A pipe would otherwise wait for somebody who writes.
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
+        raise ArtifactError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise ArtifactError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if not stat.S_ISREG(mode := os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise ArtifactError(f"{path}: {'a folder' if stat.S_ISDIR(mode) else 'a pipe or a device'}, not a file")
+    with os.fdopen(descriptor, "rb") as file:
+        yield file
+
+
+def read_bytes(path: Path, limit: int | None = None) -> bytes:
+    """Read a regular file of at most `limit` bytes, by default of what fits into memory; raises `ArtifactError`."""
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if limit is not None and size > limit:
+            raise ArtifactError(f"{path}: too large: {format_bytes(size)}, at most {format_bytes(limit)} are read")
+        _check_size(path, size)
+        try:
+            return file.read()
+        except OSError as error:
+            raise ArtifactError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _check_size(path: Path, size: int, what: str = "") -> None:
+    """Raise `ArtifactError` for more bytes than are read into memory: half of what is there."""
+    # To ask costs as much as to read a small file, of which `rlctl runs` reads thousands.
+    if size > _ALWAYS_READ and (there := memory.available()) is not None and size > there // 2:
+        needs = f"{what}it needs {format_bytes(size)} of memory, and {format_bytes(there)} are free"
+        raise ArtifactError(f"{path}: too large: {needs}")
+
+
+def check_safetensors(path: Path) -> None:
+    """Raise `ArtifactError` for what is not a regular file, or would take more memory than a policy may."""
+    with open_file(path) as file:
+        _check_size(path, os.fstat(file.fileno()).st_size)
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON; raises `ValueError` for what is damaged, nested too deeply or has a number too large to be one."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def parse_model(text: str | bytes, model: type[Model], path: Path, what: str) -> Model:
+    """Read JSON as a model with a `format`; raises `ArtifactError` for what is damaged, or newer than this rlctl."""
+    newest = model.model_fields["format"].default
+    try:
+        content = parse_json(text)
+        found = content.get("format") if isinstance(content, dict) else None
+        if isinstance(found, int) and found > newest:
+            known = f"this rlctl {__version__} can read ({newest}); upgrade rlctl"
+            raise ArtifactError(f"{path}: {what} format {found} is newer than {known}")
+        return model.model_validate(content)
+    except ValueError as error:  # pydantic's is one
+        raise ArtifactError(f"{path}: damaged: {_explain_error(error)}") from None
+
+
+def _explain_error(error: ValueError) -> str:
+    """Return in a line what is wrong with a description; of pydantic's report the first problem, with its place."""
+    import pydantic
+
+    if isinstance(error, pydantic.ValidationError):
+        problem = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in problem["loc"]) or "it"
+        return short_repr(f"{place}: {problem['msg']}, got {short_repr(problem['input'])}", 200)
+    return short_repr(str(error), 200)
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an `.npz` file, by name, once what the archive says of their sizes was checked.
+
+    Raises `ArtifactError` for what is not a file, or is too large, and whatever numpy and zipfile raise for a damaged
+    one. An array whose own header says another size than the archive is one: numpy touches no memory before it is read.
+    """
+    import numpy as np
+
+    with open_file(path) as file, zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        if len(members) > _MEMBERS:
+            raise ValueError(f"it has {len(members):,} members, at most {_MEMBERS:,} are read")
+        for each in members:
+            if not each.filename.endswith(".npy") or each.compress_type not in _PACKED:
+                raise ValueError(f"{each.filename!r} is not an array, or not packed as numpy does it")
+        _check_size(path, sum(each.file_size for each in members), "unpacked ")
+        arrays: dict[str, NDArray[Any]] = dict(np.load(path, allow_pickle=False))
+    for name, content in arrays.items():
+        if not isinstance(content, np.ndarray):  # numpy gives back the bytes of what has no header
+            raise ValueError(f"{name!r} is not an array")
+    return arrays

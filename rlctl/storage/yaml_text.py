@@ -1,0 +1,139 @@
+"""YAML as people mean it: version 1.2 scalars (`3e-4` is a number, `on` is text), duplicate keys refused."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rlctl.errors import RecipeError, short_repr
+from rlctl.storage import untrusted
+
+_PREFIX = "tag:yaml.org,2002:"
+_DEEPEST = 50
+_LONGEST = 2**20  # [bytes] of a file
+_MOST_DIGITS = 100  # of a whole number: one of thousands cannot even be read
+
+
+class _Dumper(yaml.SafeDumper):
+    pass
+
+
+class _Loader(yaml.SafeLoader):
+    depth = 0
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # filled below: no dates
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
+        if getattr(event, "anchor", None) is not None:  # of an alias too
+            raise _make_error("anchors and aliases (&name, *name) are not supported: write the values out", event)
+        if getattr(event, "tag", None) is not None:  # bytes, sets, objects of Python
+            raise _make_error("tags (!!int, !name) are not supported: write the value alone", event)
+        if self.depth >= _DEEPEST:
+            raise _make_error(f"nested more than {_DEEPEST} deep", event)
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = _check_key(key_node)
+            if key in seen:
+                raise _make_error(f"key {key!r} is given twice", key_node)
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+    def construct_int(self, node: yaml.ScalarNode) -> int:
+        text = self.construct_scalar(node).replace("_", "")
+        base = 0 if text.startswith(("0x", "0o")) else 10
+        if len(text) > _MOST_DIGITS or abs(number := int(text, base)) >= 2**63:
+            raise _make_error(f"{short_repr(text)} is too large a number", node)
+        return number
+
+    def construct_float(self, node: yaml.ScalarNode) -> float:
+        return float(self.construct_scalar(node).replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan"))
+
+
+def _make_error(message: str, node: Any) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(problem=message, problem_mark=node.start_mark)
+
+
+def _check_key(node: yaml.Node) -> str:
+    if node.tag != f"{_PREFIX}str" or not isinstance(node.value, str):
+        given = short_repr(node.value) if isinstance(node.value, str) else "a list or a mapping"
+        raise _make_error(f"{given} cannot be a key: keys are text, numbers in quotes", node)
+    return node.value
+
+
+_Loader.add_constructor(f"{_PREFIX}int", _Loader.construct_int)
+_Loader.add_constructor(f"{_PREFIX}float", _Loader.construct_float)
+# https://yaml.org/spec/1.2.2/#103-core-schema, and digits grouped by underscores.
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?[0-9][0-9_]*|0o[0-7]+|0x[0-9a-fA-F]+", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9_]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+0123456789."),
+    ),
+):
+    # Text that looks like a number in either version of YAML is written in quotes.
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(f"{_PREFIX}{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a YAML file; raises `ArtifactError` if it cannot be read, `RecipeError` if it is not UTF-8."""
+    try:
+        return untrusted.read_bytes(path, _LONGEST).decode()
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start:,}; save it as UTF-8") from None
+
+
+def load(text: str, source: str) -> Any:
+    """Parse YAML without anchors and aliases; raises `RecipeError` with `source` and the line."""
+    try:
+        loader = _Loader(text)
+        try:
+            return loader.get_single_data()
+        finally:
+            loader.dispose()
+    except RecursionError:
+        raise RecipeError(f"{source}: nested more than {_DEEPEST} deep") from None
+    except yaml.reader.ReaderError as error:
+        raise RecipeError(f"{source}: character {error.character:#x} at {error.position:,} cannot be in YAML") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{source}:{mark.line + 1}" if mark else source
+        problem = getattr(error, "problem", None) or str(error)
+        if isinstance(error, yaml.composer.ComposerError) and error.context:
+            problem = f"{error.context}, {problem}"
+        raise RecipeError(f"{where}: {short_repr(problem, 200)}") from None
+
+
+def find_line(text: str, path: Sequence[str | int]) -> int:
+    """Return the line, from 1, of the key at `path` in YAML that `load` has read."""
+    loader = _Loader(text)
+    node = loader.get_single_node()
+    line = 1
+    for part in path:
+        if isinstance(node, yaml.MappingNode):
+            key, node = next((key, value) for key, value in node.value if key.value == part)
+            line = key.start_mark.line + 1
+        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
+            node = node.value[part]
+            line = node.start_mark.line + 1
+    loader.dispose()
+    return line
+
+
+def dump(value: Any) -> str:
+    """Write plain data as YAML, keys in the order they have."""
+    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=100)
+    return text

@@ -1,0 +1,185 @@
+"""From a recipe to an SB3 model."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from rich.filesize import decimal as format_bytes
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from rlctl.environments.dict_spaces import split_space
+from rlctl.errors import RecipeError, UsageError, short_repr
+from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
+from rlctl.recipe.recipe import ON_POLICY, Normalize, Recipe
+from rlctl.storage import memory
+from rlctl.training.hindsight import replay_arguments
+from rlctl.training.vec_env import WorkerVecEnv
+
+# numpy reserves a replay buffer without touching it: one of a terabyte is made at once, and fills up step by step.
+_FLOAT32 = 4  # [bytes]
+_USABLE_SHARE = 0.9  # of the memory that is free; the environments need some as well
+_CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
+
+
+def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm:
+    """Build the model of a recipe on vector environments; raises `RecipeError` for what does not fit."""
+    _check_device(device)
+    cls = ALGORITHMS[recipe.algo]
+    kwargs = _algorithm_kwargs(recipe)
+    if recipe.her is not None:
+        kwargs = {**replay_arguments(recipe, recipe.her, env.workers.info), **kwargs}
+    name = policy_name(recipe.algo, env.observation_space)
+    if name not in cls.policy_aliases:
+        kind = "dictionaries" if isinstance(env.observation_space, spaces.Dict) else "images"
+        raise RecipeError(f"{recipe.algo} cannot be used here: it has no network for {kind}")
+    check_spaces(recipe.algo, env.observation_space, env.action_space)
+    _check_memory(recipe, env)
+    keep_compiler_out()
+    try:
+        model: BaseAlgorithm = cls(
+            name,
+            wrap_normalize(env, recipe.normalize, kwargs.get("gamma", 0.99)),
+            policy_kwargs=_policy_kwargs(recipe),
+            seed=recipe.seed,
+            device=device,
+            **kwargs,
+        )
+        _use_fused_adam(model)
+        return model
+    except (AssertionError, ValueError, TypeError, RuntimeError) as error:
+        raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error) or error, 300)}") from error
+
+
+def keep_compiler_out() -> None:
+    """Take torch's marks for its compiler off the optimisers: nothing is compiled here, and to honour them imports it.
+
+    That takes 1.6 s, more than torch itself.
+    """
+    for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
+        setattr(torch.optim.Optimizer, name, inspect.unwrap(getattr(torch.optim.Optimizer, name)))
+    for optimizer in (torch.optim.Adam, torch.optim.RMSprop):
+        setattr(optimizer, "step", torch.no_grad()(inspect.unwrap(optimizer.step)))  # noqa: B010
+
+
+def _use_fused_adam(model: BaseAlgorithm) -> None:
+    """Let Adam update all weights in one call; it computes the same, and a small network's update is mostly calls."""
+    parts = [model, *(getattr(model.policy, name, None) for name in ("actor", "critic")), model.policy]
+    for part in parts:
+        for name in ("optimizer", "ent_coef_optimizer"):
+            optimizer = getattr(part, name, None)
+            if isinstance(optimizer, torch.optim.Adam):
+                for group in optimizer.param_groups:
+                    group["fused"] = True
+
+
+def _check_device(device: str) -> None:
+    # SB3 silently takes the CPU where there is no GPU.
+    if device == "auto":
+        return
+    requested = torch.device(device)
+    if requested.type == "cuda" and (requested.index or 0) >= torch.cuda.device_count():
+        raise UsageError(
+            f"--device {device}: torch sees {torch.cuda.device_count()} CUDA devices here; use cpu or auto"
+        )
+
+
+def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """Raise `RecipeError` for spaces that SB3 refuses in its own words, or not before training."""
+    actions = short_repr(action_space)
+    if algo == "dqn" and not isinstance(action_space, spaces.Discrete):
+        others = "ppo or sac" if isinstance(action_space, spaces.Box) else "ppo"
+        raise RecipeError(f"dqn cannot be used here: it needs Discrete actions, these are {actions}; try {others}")
+    if algo in _CONTINUOUS and not isinstance(action_space, spaces.Box):
+        others = "ppo or dqn" if isinstance(action_space, spaces.Discrete) else "ppo"
+        raise RecipeError(f"{algo} cannot be used here: it needs Box actions, these are {actions}; try {others}")
+    for what, space, advice in (
+        ("observation", observation_space, "observe values less start"),
+        ("action", action_space, "add start in step"),
+    ):
+        if isinstance(space, spaces.Box) and 0 in space.shape:
+            raise RecipeError(f"the {what} is {space}, which has no element")
+        for key, part in split_space(space).items():
+            name = f"{what} {key!r}" if key else f"the {what}"
+            if np.any(getattr(part, "start", 0)):
+                raise RecipeError(
+                    f"{name} is {part}, and Stable-Baselines3 counts categories from 0: "
+                    f"leave start out of the space, and {advice}"
+                )
+            if isinstance(part, spaces.Box) and part.shape == () and what == "observation":
+                raise RecipeError(f"{name} is {part}, a single number: make it an array of the shape (1,)")
+
+
+def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:
+    given = recipe.algo_kwargs.items()
+    return {name: _make_schedule(value) for name, value in given if name != "action_noise"}  # which workers add
+
+
+def _make_schedule(value: Any) -> Any:
+    """Return what falls to zero over the training for `lin_3e-4`, as rl-zoo writes it; other values as they are."""
+    if not isinstance(value, str) or not value.startswith("lin_"):
+        return value
+    start = float(value.removeprefix("lin_"))
+    # The last rollout may go past the end, and a negative rate would unlearn.
+    return lambda remaining: max(remaining, 0.0) * start
+
+
+def _policy_kwargs(recipe: Recipe) -> dict[str, Any]:
+    kwargs = dict(recipe.policy_kwargs)
+    if "activation_fn" in kwargs:
+        kwargs["activation_fn"] = ACTIVATIONS[kwargs["activation_fn"]]
+    return kwargs
+
+
+def wrap_normalize(env: VecEnv, settings: Normalize | None, gamma: float) -> VecEnv:
+    """Wrap environments in SB3's VecNormalize, as far as their observations are real numbers."""
+    if settings is None:
+        return env
+    space = env.observation_space
+    keys = None
+    if isinstance(space, spaces.Dict):
+        keys = [key for key, each in space.spaces.items() if _is_real(each)]
+    observation = settings.observation and (bool(keys) if keys is not None else _is_real(space))
+    if not observation and not settings.reward:
+        return env
+    return VecNormalize(
+        env,
+        norm_obs=observation,
+        norm_reward=settings.reward,
+        clip_obs=settings.clip_observation,
+        clip_reward=settings.clip_reward,
+        gamma=gamma,
+        norm_obs_keys=keys if observation else None,
+    )
+
+
+def _is_real(space: spaces.Space[Any]) -> bool:
+    return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and not is_image_space(space)
+
+
+def _check_memory(recipe: Recipe, env: VecEnv) -> None:
+    """Raise `RecipeError`, with the bytes, for a buffer that does not fit into this machine's memory."""
+    free, (key, size) = memory.available(), _measure_buffer(recipe, env)
+    if free is not None and size > _USABLE_SHARE * free:
+        needs, are = format_bytes(size), format_bytes(free)
+        given = recipe.algo_kwargs.get(key)
+        raise RecipeError(f"algo_kwargs.{key}: {given} needs {needs} of memory, and {are} are free; give less")
+
+
+def _measure_buffer(recipe: Recipe, env: VecEnv) -> tuple[str, int]:
+    """Return the parameter that decides how large the buffer is, and its bytes."""
+    kwargs = recipe.algo_kwargs
+    parts = [(math.prod(part.shape or ()), part.dtype) for part in split_space(env.observation_space).values()]
+    action = math.prod(env.action_space.shape or ()) * _FLOAT32
+    if recipe.algo in ON_POLICY:
+        row = sum(elements for elements, _ in parts) * _FLOAT32 + action + 6 * _FLOAT32
+        return "n_steps", int(kwargs.get("n_steps", 5)) * env.num_envs * row
+    # Observations before and after, in the space's dtype, action, reward and two flags.
+    observation = sum(elements * np.dtype(dtype or np.float32).itemsize for elements, dtype in parts)
+    return "buffer_size", int(kwargs["buffer_size"]) * (2 * observation + action + 3 * _FLOAT32)

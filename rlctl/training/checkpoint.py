@@ -1,0 +1,267 @@
+"""Checkpoints: everything to go on with a training exactly as if it had never stopped, without pickle.
+
+A folder with `policy.safetensors` (a policy file), `state.safetensors` (optimisers, generators, statistics, the actions
+of running episodes) and `state.json` (plain data, and each file's sha256); it appears whole or not at all. The replay
+buffer of an off-policy algorithm is in segments beside the folders.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydantic
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from rlctl.errors import ArtifactError
+from rlctl.policy.policy import PolicyInfo, collect_versions, encode_policy
+from rlctl.run.directory import RunDirectory
+from rlctl.storage import files
+from rlctl.training import replay_segments, snapshot
+from rlctl.training.curriculum import begin_next_episodes
+from rlctl.training.progress import Progress
+from rlctl.training.replay_segments import ReplaySegments, Segment
+from rlctl.training.snapshot import Tensors
+from rlctl.training.vec_env import WorkerVecEnv
+
+FORMAT = 1
+_POLICY, _STATE, _TENSORS = "policy.safetensors", "state.json", "state.safetensors"
+
+
+class State(pydantic.BaseModel):
+    """The content of `state.json`."""
+
+    format: int = FORMAT
+    step: int
+    model: dict[str, Any]
+    """Plain data of `snapshot.take`."""
+    progress: Progress
+    segments: list[Segment] = []
+    """Where the replay buffer is."""
+    computed_with: dict[str, str]
+    """What the last bits of a result depend on: versions, processor, threads."""
+    sha256: dict[str, str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint that was read and found whole."""
+
+    folder: Path
+    state: State
+    tensors: Tensors = dataclasses.field(repr=False)
+
+    @property
+    def progress(self) -> Progress:
+        return self.state.progress
+
+
+class Checkpoints:
+    """Writes the checkpoints of a training, and restores one."""
+
+    def __init__(self, run: RunDirectory, model: BaseAlgorithm, env: WorkerVecEnv, keep: int) -> None:
+        self._run = run
+        self._model = model
+        self._env = env
+        self._keep = keep
+        self._replay: ReplaySegments | None = None
+        if isinstance(model, OffPolicyAlgorithm):
+            assert model.replay_buffer is not None  # SB3 makes it in its constructor
+            self._replay = ReplaySegments(run.replay_segments, model.replay_buffer)
+
+    @property
+    def _added(self) -> int:
+        """How many transitions the replay buffer has been given: one for each step of all environments."""
+        return self._model.num_timesteps // self._env.num_envs
+
+    def save(self, packed: tuple[PolicyInfo, Tensors], progress: Progress) -> None:
+        """Write a checkpoint of the present boundary; raises `OSError` if the disk does not take it."""
+        tensors, plain = snapshot.take(self._model)
+        tensors |= _environment_tensors(self._env)
+        segments: list[Segment] = []
+        if self._replay is not None:
+            segments = self._replay.save(self._added)
+            tensors |= replay_segments.hindsight_tensors(self._replay.buffer)
+        contents = {
+            _POLICY: encode_policy(*packed),
+            _TENSORS: save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()}),
+        }
+        state = State(
+            step=self._model.num_timesteps,
+            model=plain,
+            progress=progress,
+            segments=segments,
+            computed_with=self.computed_with(),
+            sha256={name: files.digest(content) for name, content in contents.items()},
+        )
+        with files.whole_folder(self._run.checkpoint(state.step)) as folder:
+            for name, content in contents.items():
+                files.write_new(folder / name, content)
+            files.write_new(folder / _STATE, _encode_state(state.model_dump(mode="json")))
+
+    def computed_with(self) -> dict[str, str]:
+        """Return what the last bits of this training's results depend on."""
+        return {
+            **collect_versions(),
+            "machine": platform.machine(),
+            "processor": f"{_cpu_vendor()} {torch.backends.cpu.get_cpu_capability()}",
+            "threads": str(torch.get_num_threads()),
+            "device": str(self._model.device),
+        }
+
+    def remove_old(self) -> None:
+        """Remove all checkpoints but the newest few, and the segments of the replay buffer that none of them names."""
+        for old in self._run.checkpoints()[: -self._keep]:
+            files.remove_tree(old)
+        if self._replay is not None:
+            replay_segments.remove_unnamed(self._run.replay_segments, _named_segments(self._run))
+
+    def restore(self, checkpoint: Checkpoint) -> str | None:
+        """Restore model, replay buffer and environments from a checkpoint.
+
+        Return a message if an environment did not reach its former state; then all begin their next episodes.
+        """
+        model, tensors = self._model, checkpoint.tensors
+        try:
+            snapshot.restore(model, tensors, checkpoint.state.model)
+            if self._replay is not None:
+                self._replay.load(checkpoint.state.segments, self._added)
+                replay_segments.restore_hindsight(self._replay.buffer, tensors)
+            mismatch = _restore_environments(self._env, tensors)
+        except (ArtifactError, KeyError) as error:
+            raise ArtifactError(f"{checkpoint.folder}: {error}") from None
+        # That there is one keeps SB3 from a reset; nothing else is done with it.
+        model._last_obs = self._env.workers.observations()
+        if mismatch is not None:
+            begin_next_episodes(model)
+            if self._replay is not None:
+                self._replay.mark_last_changed(self._added)
+        return mismatch
+
+
+def read_newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
+    """Return the newest undamaged checkpoint, and what is wrong with those after it; None where there is none yet.
+
+    Raises `ArtifactError` if all are damaged.
+    """
+    damage: list[str] = []
+    for folder in reversed(run.checkpoints()):
+        try:
+            return read(folder), damage
+        except ArtifactError as error:
+            damage.append(str(error))
+    if damage:
+        raise ArtifactError(f"{damage[0]}\nnone of the checkpoints of {run.path} can be read; train anew")
+    return None, []
+
+
+def read(folder: Path) -> Checkpoint:
+    """Read a checkpoint and check all of it; raises `ArtifactError` if something is missing, damaged or not ours."""
+    state = _read_state(folder)
+    for name in (_POLICY, _TENSORS):
+        files.check_digest(folder / name, state.sha256.get(name, ""))
+    replay_segments.check(folder.parent / "replay", state.segments)
+    try:
+        tensors = load_tensors((folder / _TENSORS).read_bytes())
+    except (OSError, SafetensorError) as error:
+        raise ArtifactError(f"{folder / _TENSORS}: damaged: {error}") from None
+    return Checkpoint(folder, state, tensors)
+
+
+def _read_state(folder: Path) -> State:
+    file = folder / _STATE
+    sealed = files.read_json(file)
+    if not isinstance(sealed, dict) or not isinstance(sealed.get("state"), dict):
+        raise ArtifactError(f"{file}: damaged, or not a checkpoint of rlctl")
+    content = sealed["state"]
+    if isinstance(content.get("format"), int) and content["format"] > FORMAT:
+        raise ArtifactError(f"{file}: checkpoint format {content['format']} is newer than this rlctl reads ({FORMAT})")
+    if sealed.get("sha256") != _seal(content):
+        raise ArtifactError(f"{file}: damaged: its sha256 is not the one it was saved with")
+    try:
+        state = State.model_validate(content)
+    except pydantic.ValidationError as error:
+        raise ArtifactError(f"{file}: not a checkpoint of rlctl: {str(error).splitlines()[0]}") from None
+    if state.step != int(folder.name):
+        raise ArtifactError(f"{folder}: this is the checkpoint of step {state.step}, under another name")
+    return state
+
+
+def _encode_state(state: dict[str, Any]) -> bytes:
+    return json.dumps({"sha256": _seal(state), "state": state}).encode()
+
+
+def _seal(state: Any) -> str:
+    return files.digest(json.dumps(state, sort_keys=True).encode())
+
+
+def _named_segments(run: RunDirectory) -> list[Segment]:
+    named: list[Segment] = []
+    for folder in run.checkpoints():
+        try:
+            named += _read_state(folder).segments
+        except ArtifactError:  # a damaged checkpoint needs no segments any more
+            continue
+    return named
+
+
+def _cpu_vendor() -> str:
+    """Return the vendor of the processor, where known: libraries choose their code by that too."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or "unknown"
+    found = (line.partition(":")[2].strip() for line in lines if line.startswith(("vendor_id", "CPU implementer")))
+    return next(found, "unknown")
+
+
+def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
+    """Return `torch 2.13.0 -> 2.14.0` for each entry that is another one now."""
+    names = dict.fromkeys([*before, *now])
+    return [
+        f"{name} {before.get(name, 'none')} -> {now.get(name, 'none')}"
+        for name in names
+        if before.get(name) != now.get(name)
+    ]
+
+
+def _environment_tensors(env: WorkerVecEnv) -> Tensors:
+    """Return the episodes that environments are in, what was done in them, and what was observed last."""
+    histories = [env.history.of(index) for index in range(env.num_envs)]
+    tensors = {
+        "environments/episodes_started": np.array(env.episodes_started, np.int64),
+        "environments/steps": np.array([len(actions) for actions in histories], np.int64),
+        "environments/actions": np.concatenate(histories),
+    }
+    for key, observation in env.workers.arrays.observation.items():
+        tensors[f"environments/observation/{key}"] = observation
+    return tensors
+
+
+def _restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
+    """Replay the running episodes; return a message if an environment does not reach its former state."""
+    steps = tensors["environments/steps"].tolist()
+    if len(steps) != env.num_envs:
+        raise ArtifactError(f"it is of {len(steps)} environments, not {env.num_envs}")
+    started = tensors["environments/episodes_started"].tolist()
+    actions: list[NDArray[Any]] = np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])
+    mismatch = set(env.replay_actions(started, actions))
+    for key, observation in env.workers.arrays.observation.items():
+        before = tensors[f"environments/observation/{key}"]
+        mismatch.update(index for index in range(env.num_envs) if not np.array_equal(before[index], observation[index]))
+    if not mismatch:
+        return None
+    return (
+        f"environment {min(mismatch)} did not come back to where it was with its seed and actions, "
+        "so all begin their next episodes"
+    )

@@ -1,0 +1,152 @@
+"""Evaluation while training: the same episodes each time, and which of them a run keeps: the first and the worst."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rlctl.environments.info import EnvInfo
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import ArtifactError, EpisodeFailed, RlctlError
+from rlctl.policy.acting import Exploration
+from rlctl.policy.policy import PolicyInfo, collect_versions
+from rlctl.recipe.recipe import Recipe
+from rlctl.rollout.collect import Episode, play_episodes
+from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.rollout.workers import Workers
+from rlctl.run.directory import RunDirectory
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
+from rlctl.storage import files
+from rlctl.training.snapshot import Tensors
+
+if TYPE_CHECKING:
+    from rlctl.training.saving import Saver
+
+
+_POLICY = "training step "
+"""What a kept episode was played with, for people: followed by the number."""
+
+
+class Evaluator:
+    """Plays the evaluation episodes of a run, and writes some; nothing of the training changes by it.
+
+    `goal` is what the environments are in which it evaluates.
+    """
+
+    def __init__(self, recipe: Recipe, make_workers: Callable[[], Workers], saver: Saver, goal: EnvInfo) -> None:
+        self._recipe = recipe
+        self._make_workers = make_workers
+        self._saver = saver
+        self._goal = goal
+        # They build their environments beside the first updates, which leave a core idle.
+        self._workers: Workers | None = make_workers()
+        self._spec = self._workers.spec
+        self._latest: list[RecordedEpisode] = []
+
+    def run(
+        self, info: PolicyInfo, tensors: Tensors, check: Callable[[], None], *, unseen: int | None = None
+    ) -> list[Episode]:
+        """Return the episodes of a policy: those of every evaluation, or a number that no evaluation has played.
+
+        `check` is called several times a second and may raise to leave. Raises `TaskError` if an environment fails;
+        the next call begins with new environments.
+        """
+        settings = self._recipe.eval
+        workers = self._workers = self._workers or self._make_workers()
+        usual = settings.episodes
+        seeds = episode_seeds(self._recipe.seed, Stream.EVAL_IN_TRAINING, usual + (unseen or 0))
+        seeds = seeds[:usual] if unseen is None else seeds[usual:]
+        try:
+            workers.set_policy(info, tensors)
+            exploration = Exploration(stochastic=not settings.deterministic)
+            return play_episodes(workers, seeds, exploration, record=True, watch=lambda _: check())
+        except Exception:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End the environments' processes."""
+        if self._workers is not None:
+            self._workers.close()
+        self._workers = None
+
+    def keep(self, episodes: list[Episode], steps: int) -> None:
+        """Write the first and the worst of an evaluation; remember all of it for `record`."""
+        self._latest = recorded = [self._recorded(episode, steps) for episode in episodes]
+        worst = min(
+            range(len(episodes)), key=lambda i: (episodes[i].result.success is True, episodes[i].result.total_reward)
+        )
+        for index in dict.fromkeys((0, worst)):
+            self._write(recorded[index])
+
+    def record(self, count: int) -> list[Path]:
+        """Write the last `count` episodes of the last evaluation, and recordings of them; return these."""
+        recordings = []
+        for episode in self._latest[-count:] if count else []:
+            from rlctl.replaying.reproduce import record_episode
+
+            path = self._write(episode)
+            recording = path.with_suffix(".rrd")
+            title = f"{self._saver.run.path.name} / episode {path.stem}"
+            record_episode(episode, recording, title=title, several=count > 1)
+            recordings.append(recording)
+        return recordings
+
+    def keep_failed(self, error: RlctlError, spec: EnvSpec, evaluated_at: int | None = None) -> RlctlError:
+        """Write the actions of an episode that failed, if they are known; return the error, with the file in its hint.
+
+        It was of environments of `spec`, in training or in the evaluation at a step.
+        """
+        if not isinstance(error, EpisodeFailed) or error.actions is None:
+            return error
+        info = EpisodeInfo(
+            spec=spec,
+            seed=error.seed,
+            policy="training" if evaluated_at is None else f"{_POLICY}{evaluated_at}",
+            total_reward=0.0,
+            versions=collect_versions(),
+            failure=str(error).partition("\n")[0],
+        )
+        nothing = np.zeros(0)
+        # Of a reset that failed there is no action to take the shape from.
+        actions = np.asarray(error.actions).reshape(-1, *(self._goal.spaces()[1].shape or ()))
+        episode = RecordedEpisode(info, actions, nothing, nothing, nothing.reshape(0, 0))
+        written: list[Path] = []
+        self._saver.attempt("failed episode", lambda: written.append(self._write(episode)))
+        return error.with_hint(f"to reproduce it: rlctl replay {shlex.quote(str(written[0]))}") if written else error
+
+    def _write(self, episode: RecordedEpisode) -> Path:
+        run = self._saver.run
+        path = run.episode_file(run.next_episode_number())
+        save_episode(path, episode)
+        return path
+
+    def _recorded(self, episode: Episode, steps: int) -> RecordedEpisode:
+        trajectory = episode.trajectory
+        assert trajectory is not None  # evaluations record
+        info = EpisodeInfo(
+            spec=self._spec,
+            seed=episode.result.seed,
+            policy=f"{_POLICY}{steps}",
+            success=episode.result.success,
+            total_reward=episode.result.total_reward,
+            term_names=list(self._goal.reward_weights),
+            versions=collect_versions(),
+        )
+        return RecordedEpisode(info, trajectory.actions, trajectory.observations, trajectory.rewards, trajectory.terms)
+
+
+def remove_after(run: RunDirectory, steps: int) -> None:
+    """Remove the episodes of evaluations after a training step: a resumed run repeats them."""
+    for file in run.episodes.glob("*.npz"):
+        try:
+            policy = load_episode(file).info.policy
+        except ArtifactError:
+            continue  # not one that a training has written whole
+        step = policy.removeprefix(_POLICY)
+        if policy.startswith(_POLICY) and step.isdigit() and int(step) > steps:
+            files.remove(file)

@@ -1,0 +1,86 @@
+"""Hindsight experience replay: what an episode reached is learnt from as if it had been the goal.
+
+M. Andrychowicz et al., Hindsight Experience Replay, 2017, https://arxiv.org/abs/1707.01495; SB3's buffer does it.
+In a curriculum, exchanged goals are rewarded as the present stage does, whichever stage their episode is of.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.her import HerReplayBuffer
+
+from rlctl.environments.info import EnvInfo
+from rlctl.errors import RecipeError
+from rlctl.recipe.recipe import Hindsight, Recipe
+
+_KEYS = ("observation", "achieved_goal", "desired_goal")
+_LEARNING_STARTS = 100  # SB3's own default, of every algorithm
+
+
+def replay_arguments(recipe: Recipe, her: Hindsight, env: EnvInfo) -> dict[str, Any]:
+    """Return the replay buffer for SB3's constructor, and a `learning_starts` by which every first episode is over.
+
+    Raises `RecipeError` for an environment without goals, and for what does not go together with hindsight.
+    """
+    _check_goals(env)
+    _check_rewards(recipe)
+    steps = (env.max_steps or 0) * recipe.n_envs
+    _check_room(recipe, steps)
+    return {
+        "replay_buffer_class": HerReplayBuffer,
+        "replay_buffer_kwargs": her.model_dump(),
+        "learning_starts": max(_LEARNING_STARTS, steps),
+    }
+
+
+def _check_goals(env: EnvInfo) -> None:
+    space = env.spaces()[0]
+    parts = space.spaces if isinstance(space, spaces.Dict) else {}
+    missing = [f"{key} in its observation" for key in _KEYS if key not in parts]
+    if not env.has_compute_reward:
+        missing.append("compute_reward")
+    if missing:
+        raise RecipeError(
+            f"her: this environment has no {', no '.join(missing)}; hindsight needs a Dict observation of "
+            f"{', '.join(_KEYS)}, and compute_reward(achieved_goal, desired_goal, info)"
+        )
+    achieved, desired = parts["achieved_goal"], parts["desired_goal"]
+    if achieved.shape != desired.shape or not isinstance(desired, spaces.Box) or is_image_space(desired):
+        raise RecipeError(
+            f"her: achieved_goal is {achieved}, desired_goal {desired}: they take each other's place, so both have to "
+            "be a Box of one shape, and no image"
+        )
+
+
+def _check_rewards(recipe: Recipe) -> None:
+    if recipe.reward_weights or any(stage.reward_weights for stage in recipe.stages):
+        raise RecipeError("her: compute_reward knows nothing of a recipe's reward_weights; leave out one of the two")
+    if recipe.algo_kwargs.get("n_steps", 1) != 1:
+        raise RecipeError("algo_kwargs.n_steps: hindsight has no returns over several steps; leave out one of the two")
+
+
+def _check_room(recipe: Recipe, steps: int) -> None:
+    size = int(recipe.algo_kwargs["buffer_size"])
+    if size < min(2 * steps, recipe.total_timesteps):
+        raise RecipeError(_no_room(size, recipe.n_envs, f"{2 * steps} will do"))
+
+
+def _no_room(size: int, n_envs: int, what_will_do: str) -> str:
+    return (
+        f"algo_kwargs.buffer_size: {size} steps of {n_envs} environments have no room for two episodes of each, "
+        f"and hindsight learns from whole ones; {what_will_do}"
+    )
+
+
+def has_whole_episode(buffer: ReplayBuffer) -> bool:
+    """Say whether there is one to learn from, if it is a buffer for hindsight; raises `RecipeError` if none can be."""
+    if not isinstance(buffer, HerReplayBuffer) or (buffer.ep_length > 0).any():
+        return True
+    if buffer.full:
+        advice = f"give it twice the steps of an episode, times {buffer.n_envs}"
+        raise RecipeError(_no_room(buffer.buffer_size * buffer.n_envs, buffer.n_envs, advice))
+    return False

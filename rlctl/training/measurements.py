@@ -1,0 +1,281 @@
+"""The columns of `metrics.csv` and `evals.csv`, beside those of steps, time and stage.
+
+Actions, exploration, values and gradients are read from what SB3 holds after an update anyway; it depends on steps
+alone, so a resumed run measures the same. Where something does not exist, as limits of discrete actions, it is None.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3 import DQN
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import obs_as_tensor
+
+from rlctl.environments.dict_spaces import join, split, split_names
+from rlctl.environments.info import EnvInfo
+from rlctl.evaluation.statistics import mean_metrics, mean_return, mean_terms, success_rate
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.training.vec_env import WorkerVecEnv
+
+HISTOGRAMS = 20
+"""How many times in a training TensorBoard gets histograms, which cost more than numbers."""
+
+_ROWS = 500
+"""Steps of each environment that are looked at, the last ones."""
+_SAMPLES = 2000
+"""Values in a histogram."""
+_AT_LIMIT = 0.99
+"""From this part of its range on an action counts as saturated."""
+
+
+_LOSSES = (
+    "learning_rate", "loss", "policy_gradient_loss", "policy_loss", "value_loss", "entropy_loss", "approx_kl",
+    "clip_fraction", "clip_range", "explained_variance", "std", "actor_loss", "critic_loss", "ent_coef",
+    "ent_coef_loss", "n_updates",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class LastSteps:
+    """The last steps of all environments; arrays of shape (n_envs, steps, ...) but for `values`."""
+
+    observation: Mapping[str, NDArray[Any]]
+    """As the environments gave them."""
+    action: NDArray[Any]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    values: NDArray[Any] | None
+    """What the critic expected of each step, in any order; None where it was not computed."""
+
+
+def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timesteps: int) -> dict[str, float | None]:
+    """Return columns for the environment steps since the last row; log them, and now and then distributions."""
+    steps = model.num_timesteps
+    last = _read_last_steps(model, env, steps - last_row)
+    row = {
+        **summarize_steps(last, model.action_space, model.logger.name_to_value),
+        "gradient_norm": _gradient_norm(model),
+    }
+    for name, value in row.items():
+        if value is not None:
+            model.logger.record(f"rollout/{name}", value)
+    part = max(1, total_timesteps // HISTOGRAMS)
+    if last is not None and steps // part > last_row // part:
+        if last.values is None:
+            last = dataclasses.replace(last, values=estimate_values(model, last))
+        for name, values in collect_histograms(last, env.workers.info).items():
+            model.logger.record(name, values)
+    return row
+
+
+def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> LastSteps | None:
+    """Return the environments' last steps, at most `steps` of all together; None before there are any.
+
+    On-policy they are the last segment, else the newest of the replay buffer.
+    """
+    replay: Any = getattr(model, "replay_buffer", None)
+    if replay is not None:
+        return _read_replay_buffer(model, replay, max(1, steps // env.num_envs))
+    segment = env.last_segment
+    if segment is None:
+        return None
+    rollout: Any = model.rollout_buffer  # type: ignore[attr-defined]
+    observation = {key: rows[:, :-1] for key, rows in segment.observation.items()}
+    space, action, half = env.action_space, segment.action, _half_range(env.action_space)
+    if isinstance(space, spaces.Box) and half is not None:
+        action = (action - (space.high + space.low) / 2) / half  # as a replay buffer has it
+    return LastSteps(observation, action, segment.terminated, segment.truncated, rollout.values.ravel())
+
+
+def _read_replay_buffer(model: BaseAlgorithm, buffer: Any, steps: int) -> LastSteps | None:
+    stored = buffer.buffer_size if buffer.full else buffer.pos
+    rows = np.arange(buffer.pos - min(stored, steps, _ROWS), buffer.pos)
+    if not len(rows):
+        return None
+    done, timeout = (np.asarray(values[rows], np.bool_).T for values in (buffer.dones, buffer.timeouts))
+    observation = {key: values[rows].swapaxes(0, 1) for key, values in split(buffer.observations).items()}
+    # SB3 stores continuous actions scaled to [-1, 1].
+    return LastSteps(observation, buffer.actions[rows].swapaxes(0, 1), done & ~timeout, done & timeout, None)
+
+
+def _half_range(space: spaces.Space[Any]) -> NDArray[Any] | None:
+    """Return half the range of each element of an action; None for actions without limits, or discrete ones."""
+    if not isinstance(space, spaces.Box) or not np.isfinite([space.low, space.high]).all():
+        return None
+    half: NDArray[Any] = np.maximum((space.high - space.low) / 2, 1e-12)
+    return half
+
+
+def summarize_steps(
+    last: LastSteps | None, space: spaces.Space[Any], log: Mapping[str, Any]
+) -> dict[str, float | None]:
+    """Return what can be said of steps with actions of a space; `log` is what SB3 logged of the update."""
+    limited = _half_range(space) is not None
+    actions = None if last is None or not isinstance(space, spaces.Box) else last.action.astype(np.float32)
+    return {
+        "terminated": None if last is None else _terminated_share(last),
+        "action_saturation": None if actions is None or not limited else float((np.abs(actions) > _AT_LIMIT).mean()),
+        "action_change": None if actions is None or last is None else _mean_change(actions, last),
+        "exploration": _exploration(space, log.get("train/entropy_loss")),
+        "value": _expected_value(last, log),
+    }
+
+
+def _terminated_share(last: LastSteps) -> float | None:
+    ended = int((last.terminated | last.truncated).sum())
+    return float(last.terminated.sum()) / ended if ended else None
+
+
+def _mean_change(actions: NDArray[np.float32], last: LastSteps) -> float | None:
+    """Return the mean size of the change from one action to the next of the same episode, in half ranges."""
+    same = ~(last.terminated | last.truncated)[:, :-1]
+    return float(np.abs(np.diff(actions, axis=1))[same].mean()) if same.any() else None
+
+
+def _exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
+    """Return how widely an on-policy algorithm explores: 1 is the half range of an action, or any choice of all.
+
+    For a normal distribution it is the standard deviation that has the logged entropy; gSDE's own log has the one of a
+    matrix instead.
+    """
+    if entropy_loss is None or not math.isfinite(entropy_loss):
+        return None
+    if isinstance(space, spaces.Discrete):
+        return math.exp(-entropy_loss) / int(space.n)
+    if (half := _half_range(space)) is None:
+        return None
+    per_element = -entropy_loss / half.size
+    return math.exp(min(per_element - 0.5 * math.log(2 * math.pi * math.e), 50.0)) / float(np.exp(np.log(half).mean()))
+
+
+def _expected_value(last: LastSteps | None, log: Mapping[str, Any]) -> float | None:
+    """Return what the critic expects: the mean over a rollout, or over the replay buffer's samples of an update.
+
+    The loss of an off-policy actor is minus that value, SAC's with the entropy that it is paid for.
+    """
+    if last is not None and last.values is not None:
+        return float(last.values.mean())
+    loss = log.get("train/actor_loss")
+    return None if loss is None else -float(loss)
+
+
+def _gradient_norm(model: BaseAlgorithm) -> float | None:
+    """Return the norm of the last minibatch's gradient as it was applied: not above `max_grad_norm`, if clipped.
+
+    Of an off-policy actor and critic it is the critic's root mean square over about the last thousand updates: Adam
+    keeps it, and the gradients of the last minibatch are mixed with those that passed through to the actor.
+    """
+    if (critic := getattr(model, "critic", None)) is not None:
+        return recent_gradient_norm(critic.optimizer)
+    if not hasattr(model, "max_grad_norm"):
+        return None
+    gradients = [each.grad for each in model.policy.parameters() if each.grad is not None]
+    return float(torch.nn.utils.get_total_norm(gradients)) if gradients else None
+
+
+def recent_gradient_norm(optimizer: torch.optim.Optimizer) -> float | None:
+    """Return the root mean square of a gradient's norm over some 1,000 updates, as Adam remembers it; else None."""
+    squares = [
+        state["exp_avg_sq"].sum().item() / (1 - group["betas"][1] ** float(state["step"]))
+        for group in optimizer.param_groups
+        for parameter in group["params"]
+        if "exp_avg_sq" in (state := optimizer.state.get(parameter, {}))
+    ]
+    return math.sqrt(sum(squares)) if squares else None
+
+
+def collect_histograms(last: LastSteps, info: EnvInfo) -> dict[str, torch.Tensor]:
+    """Return what TensorBoard draws distributions of: actions, values, and observations by name."""
+    found = {"actions": last.action, **_named_observations(last.observation, info)}
+    if last.values is not None:
+        found["values"] = last.values
+    return {f"histograms/{name}": _sample(values) for name, values in found.items()}
+
+
+def _named_observations(observation: Mapping[str, NDArray[Any]], info: EnvInfo) -> dict[str, NDArray[Any]]:
+    rows = join({key: values.reshape(-1, *values.shape[2:]) for key, values in observation.items()})
+    named = split_names(rows, info.observation_sizes)
+    return {name: values for name, values in named.items() if name and np.issubdtype(values.dtype, np.floating)}
+
+
+def estimate_values(model: BaseAlgorithm, last: LastSteps) -> NDArray[Any]:
+    """Return what an off-policy critic expects of some of the steps: the mean of its networks and quantiles."""
+    picked = slice(None, None, max(1, last.action[..., 0].size // _SAMPLES))
+    rows = {key: values.reshape(-1, *values.shape[2:])[picked] for key, values in last.observation.items()}
+    observation, normalizer = join(rows), model.get_vec_normalize_env()
+    if normalizer is not None:
+        observation = normalizer.normalize_obs(observation)
+    tensors: Any = obs_as_tensor(observation, model.device)
+    actions = torch.as_tensor(last.action.reshape(-1, *last.action.shape[2:])[picked], device=model.device)
+    model.policy.set_training_mode(False)
+    with torch.no_grad():
+        if isinstance(model, DQN):
+            values = model.q_net(tensors).gather(1, actions.long())
+        else:
+            found = model.critic(tensors, actions.float())  # type: ignore[attr-defined]
+            values = found if isinstance(found, torch.Tensor) else torch.cat(found, dim=1)
+    result: NDArray[Any] = values.flatten(1).mean(1).cpu().numpy()
+    return result
+
+
+def _sample(values: NDArray[Any]) -> torch.Tensor:
+    flat = np.asarray(values, np.float32).ravel()
+    return torch.from_numpy(flat[:: max(1, len(flat) // _SAMPLES)].copy())
+
+
+def training_row(
+    recent: Sequence[EpisodeResult], weights: Mapping[str, float], log: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what the episodes that ended lately have come to, and what SB3 logged of the last update.
+
+    `weights` are those of the reward terms; missing values are None.
+    """
+    means, metrics = mean_terms(recent), mean_metrics(recent)
+    return {
+        "acting": _mean(each.acting for each in recent),
+        "return": mean_return(recent) if recent else None,
+        "length": _mean(each.length for each in recent),
+        "success": success_rate(recent) if recent else None,
+        "distance": _mean(each.final_distance for each in recent),
+        **{f"term/{name}": means.get(name) for name in weights},
+        **{f"metric/{name}": metrics.get(name) for name, weight in weights.items() if weight == 0},
+        **{name: log.get(f"train/{name}") for name in _LOSSES},
+    }
+
+
+def tensorboard_values(row: Mapping[str, Any]) -> dict[str, float]:
+    """Return what TensorBoard gets of a row of metrics, by its tags, beside what SB3 and `measurements` log."""
+    tags = {"return": "rollout/ep_rew_mean", "length": "rollout/ep_len_mean", "success": "rollout/success_rate"}
+    tags |= {"distance": "rollout/final_distance", "stage": "curriculum/stage"}
+    tags |= {name: f"reward_terms/{name.removeprefix('term/')}" for name in row if name.startswith("term/")}
+    tags |= {name: f"metrics/{name.removeprefix('metric/')}" for name in row if name.startswith("metric/")}
+    return {tag: row[name] for name, tag in tags.items() if row.get(name) is not None}
+
+
+def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Return what the episodes of an evaluation have come to."""
+    depths = [each.deepest_contact for each in results if each.deepest_contact is not None]
+    return {
+        "episodes": len(results),
+        "success": success_rate(results),
+        "return": mean_return(results),
+        "length": _mean(each.length for each in results),
+        "distance": _mean(each.final_distance for each in results),
+        "overlap": float(np.median(depths)) if depths else None,
+        **{f"term/{name}": value for name, value in mean_terms(results).items()},
+        **{f"metric/{name}": value for name, value in mean_metrics(results).items()},
+    }
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are known; None without any."""
+    known = [each for each in values if each is not None]
+    return float(np.mean(known)) if known else None

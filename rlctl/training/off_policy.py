@@ -1,0 +1,82 @@
+"""SAC, TQC, CrossQ, TD3, DDPG and DQN on chunks of steps that workers play while the model learns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rlctl.environments.dict_spaces import join, split_space
+from rlctl.policy.acting import Exploration
+from rlctl.policy.network import DETERMINISTIC
+from rlctl.recipe.recipe import Recipe
+from rlctl.training.hindsight import has_whole_episode
+from rlctl.training.progress import Progress
+from rlctl.training.rollouts import Check, Rollouts, to_network_layout
+from rlctl.training.vec_env import WorkerVecEnv
+
+
+class OffPolicyRollouts(Rollouts):
+    """Plays `train_freq` steps, a chunk, into the replay buffer.
+
+    With `overlap` a chunk is played with the policy from before the updates that the chunk before it is due, while
+    these are computed: it is one chunk older than without. The order follows from steps alone, so it repeats exactly.
+    The last chunk's updates stay due then: a run made longer does them beside its next chunk, as one that was that long
+    from the beginning.
+    """
+
+    def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
+        super().__init__(model, env, recipe, progress)
+        # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
+        self.overlap = recipe.overlap and recipe.her is None
+        default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # else they would not explore at all
+        self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
+
+    def start(self) -> None:
+        self.send_policy(self.acting_statistics())
+        self.env.start(self.model.train_freq.frequency, self._exploration())
+
+    def _exploration(self) -> Exploration:
+        model = self.model
+        plays = self.policy_plays_warmup or (model.use_sde and model.use_sde_at_warmup)
+        return Exploration(
+            stochastic=True,
+            warmup=model.num_timesteps < model.learning_starts and not plays,
+            epsilon=float(getattr(model, "exploration_rate", 0.0)),
+            action_noise=self._action_noise,
+            sde_every=max(model.sde_sample_freq, 0) if model.use_sde else 0,
+        )
+
+    def finish(self, check: Check | None) -> None:
+        """Put the chunk into the replay buffer, raw, and do what SB3 does after each step."""
+        segment = self.env.finish(check)
+        model, spaces = self.model, split_space(self.model.observation_space)
+        observation = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.observation.items()}
+        final = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.final.items()}
+        done, timeouts = segment.done, segment.truncated & ~segment.terminated
+        for step in range(done.shape[1]):
+            now = {key: rows[:, step] for key, rows in observation.items()}
+            after = {key: rows[:, step + 1] for key, rows in observation.items()}
+            if (ended := done[:, step]).any():
+                after = {key: rows.copy() for key, rows in after.items()}
+                for key, rows in after.items():
+                    rows[ended] = final[key][ended, step]
+            infos = [{"TimeLimit.truncated": bool(each)} for each in timeouts[:, step]]
+            reward = segment.reward[:, step].astype(np.float32)
+            model.replay_buffer.add(join(now), join(after), segment.stored[:, step], reward, ended, infos)
+            model.num_timesteps += len(reward)
+            model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
+            model._on_step()
+        self._progress.steps_to_learn += done.size
+        model._episode_num += len(segment.ended)
+        self.update_reward_statistics(segment)
+        self.finish_segment(segment)
+
+    def learn(self) -> None:
+        """Do the updates that are due for the last chunk; with hindsight none before the first episode is over."""
+        model = self.model
+        steps, self._progress.steps_to_learn = self._progress.steps_to_learn, 0
+        if steps and model.num_timesteps > model.learning_starts and has_whole_episode(model.replay_buffer):
+            updates = model.gradient_steps if model.gradient_steps >= 0 else steps
+            if updates > 0:
+                self._learner.train(batch_size=model.batch_size, gradient_steps=updates)

@@ -1,0 +1,201 @@
+"""Prepares a training: environments, model, and run folder, with what a checkpoint restores of them."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import shlex
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future
+from typing import TYPE_CHECKING
+
+from rlctl.checking.check import Report, check
+from rlctl.checking.families import find_rules
+from rlctl.checking.finding import Severity
+from rlctl.environments import registry
+from rlctl.environments.named_task import RUN
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import AnswerIsNo
+from rlctl.output import format_count
+from rlctl.policy.policy import read_policy
+from rlctl.recipe.recipe import ON_POLICY
+from rlctl.rollout.workers import Workers, available_cores
+from rlctl.run import directory
+from rlctl.run.directory import RunDirectory
+from rlctl.training import status
+from rlctl.training.display import Display
+from rlctl.training.start import Start
+
+if TYPE_CHECKING:
+    from rlctl.training.checkpoint import Checkpoints
+    from rlctl.training.loop import Learner, TrainingLoop
+    from rlctl.training.saving import Saver
+
+
+_CHECK_BUDGET_S = 2.0
+"""Time for playing episodes [s]; importing and building the environment come on top."""
+_EXPERIMENTS = ("build", "comparisons", "episodes")
+"""What one child process can do in that time."""
+
+
+@contextlib.contextmanager
+def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
+    """Prepare a training; at the end its processes are ended, and the run has what ended it before its time."""
+    recipe, request = start.recipe, start.request
+    specs = recipe.env_specs(start.task, named_by=RUN if start.run else "")
+    display.phase(f"building {format_count(recipe.n_envs, 'environment')}, importing PyTorch")
+    with contextlib.ExitStack() as stack:
+        # The workers build their environments, and the check runs, while this process imports torch.
+        workers = stack.enter_context(_make_workers(specs[start.stage - 1], recipe.n_envs, start, display))
+        checked = None
+        if request.check and start.run is None:
+            checked = _begin_check(specs[-1], request.env_timeout_s)
+        from rlctl.training.evaluation import Evaluator
+        from rlctl.training.loop import TrainingLoop
+
+        learner = _build_learner(start, specs, workers, display)
+        if start.run is None:
+            _warn_of_turned_weights(specs, display)
+        if checked is not None:
+            display.phase("checking the environment")
+            _refuse_errors(checked.result(), display)
+        run = start.run or directory.create(start.task, recipe.seed, request.root)
+        lock = start.lock or stack.enter_context(run.lock())
+        if not lock.keeps_out:
+            display.message(f"warning: {run.path}: no locks on this file system: let no second process write this run")
+        saver = _open_run(run, start, learner, display)
+        n_envs = min(recipe.eval.episodes, available_cores())
+        make_workers = functools.partial(_make_workers, specs[-1], n_envs, start, display)
+        evaluator = Evaluator(recipe, make_workers, saver, learner.curriculum.goal)
+        stack.callback(evaluator.close)
+        display.run_folder(run)
+        try:
+            yield TrainingLoop(learner, evaluator, saver, display)
+        except BaseException as error:
+            with contextlib.suppress(OSError):  # a full disk must not hide the error itself
+                status.write_failure(run, error)
+            raise
+
+
+def _make_workers(spec: EnvSpec, n_envs: int, start: Start, display: Display) -> Workers:
+    return Workers(spec, n_envs, timeout_s=start.request.env_timeout_s, on_output=display.message)
+
+
+def _warn_of_turned_weights(specs: list[EnvSpec], display: Display) -> None:
+    """Warn of weights that pay for what the task itself penalises, or the other way round; all stages can be built."""
+    own = getattr(registry.load(specs[0].task), "reward_weights", {})
+    for name, weight in dict.fromkeys(pair for spec in specs for pair in spec.reward_weights.items()):
+        if float(own.get(name, 0.0)) * weight < 0.0:
+            display.message(
+                f"warning: reward_weights.{name}: {weight:g} turns the sign of the task's own, {float(own[name]):g}"
+            )
+
+
+def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display: Display) -> Learner:
+    from rlctl.policy.torch_policy import pin_threads
+    from rlctl.training.algorithms import build_model
+    from rlctl.training.curriculum import Curriculum, check_stages
+    from rlctl.training.loop import Learner
+    from rlctl.training.off_policy import OffPolicyRollouts
+    from rlctl.training.on_policy import OnPolicyRollouts
+    from rlctl.training.progress import Progress
+    from rlctl.training.vec_env import WorkerVecEnv
+    from rlctl.training.warm_start import load_source
+
+    pin_threads()
+    recipe, goal = start.recipe, workers.info
+    if len(specs) > 1:  # a look at every stage now, not after hours of training
+        with _make_workers(specs[0], 1, start, display) as probe:
+            goal = check_stages(specs, probe)
+    # Of a plain environment it is not known before an episode has ended.
+    start.check_may_succeed(workers.info.has_success or not workers.info.reward_weights)
+    # What a training begins with is evaluated: it may be better than all that follows.
+    progress = Progress(next_eval=0 if start.source else recipe.eval.every_steps or recipe.total_timesteps)
+    if start.checkpoint is not None:
+        progress = start.checkpoint.progress
+    env = WorkerVecEnv(workers, recipe.seed)
+    model = build_model(recipe, env, start.request.device)
+    rollouts = (OnPolicyRollouts if recipe.algo in ON_POLICY else OffPolicyRollouts)(model, env, recipe, progress)
+    if start.source is not None:
+        rollouts.policy_plays_warmup = True
+        if start.checkpoint is None:
+            display.message(load_source(start.source, model, goal))
+    return Learner(recipe, rollouts, Curriculum(recipe.stages, specs, goal, progress), progress)
+
+
+def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Saver:
+    """Restore the checkpoint, if there is one, and return what writes from now on."""
+    from rlctl.training.checkpoint import Checkpoints
+    from rlctl.training.saving import Saver, cut_back
+    from rlctl.training.tensorboard import make_logger
+
+    model = learner.rollouts.model
+    model.set_logger(make_logger(run.tensorboard, display.message, None if start.run is None else start.step))
+    checkpoints = Checkpoints(run, model, learner.rollouts.env, start.recipe.checkpoint.keep)
+    for note in start.notes:
+        display.message(note)
+    if start.checkpoint is not None:
+        display.message(_restore(start, checkpoints, learner))
+    for warning in cut_back(run, start.step, learner.progress) if start.run else ():
+        display.message(warning)
+    status.write_start(run, start)
+    saver = Saver(run, checkpoints, display.message)
+    saver.saved_step = start.step if start.checkpoint is not None else None
+    return saver
+
+
+def _restore(start: Start, checkpoints: Checkpoints, learner: Learner) -> str:
+    """Restore model and environments; return a message about how exactly the training goes on."""
+    from rlctl.training.checkpoint import find_differences
+
+    assert start.checkpoint is not None
+    file = start.checkpoint.folder / "policy.safetensors"
+    read_policy(file)[0].check_fits(learner.curriculum.goal, file)
+    mismatch = checkpoints.restore(start.checkpoint)
+    inexact = [*start.inexact, *find_differences(start.checkpoint.state.computed_with, checkpoints.computed_with())]
+    inexact += [mismatch] if mismatch else []
+    exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "as if it had never stopped"
+    return f"going on at step {start.step:,}, {exactness}"
+
+
+def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[Report]:
+    """Check an environment in a child process, watched by a thread of this one."""
+    future: Future[Report] = Future()
+
+    def run() -> None:
+        try:
+            report = check(
+                spec,
+                rules=find_rules(_EXPERIMENTS),
+                only=_EXPERIMENTS,
+                budget_s=_CHECK_BUDGET_S,
+                env_timeout_s=env_timeout_s,
+                show_progress=False,
+            )
+            future.set_result(report)
+        except BaseException as error:  # raised again where somebody waits for it
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()  # the child ends with this process
+    return future
+
+
+def _refuse_errors(report: Report, display: Display) -> None:
+    """Raise `AnswerIsNo` if the check found an error, and show its warnings."""
+    if report.records.built is None:
+        return  # the workers build it too, and report what is wrong
+    task, found = shlex.quote(report.task), report.verdict.findings
+    for name in report.verdict.crashed:
+        display.message(f"check before training: {name} crashed, a bug in rlctl; what it would find is not known")
+    errors = [finding for finding in found if finding.severity is Severity.ERROR]
+    if errors:
+        text = "; ".join(f"{each.rule} {each.name} ({each.message})" for each in errors)
+        count = format_count(len(errors), "error")
+        raise AnswerIsNo(
+            f"the check before training found {count}: {text}\n"
+            f"rlctl check-env {task} shows details; --no-check trains anyway."
+        )
+    warnings = [finding.rule for finding in found if finding.severity is Severity.WARNING]
+    if warnings:
+        display.message(f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} shows details")

@@ -1,0 +1,153 @@
+"""The replay buffer on disk: segments of transitions, each written once.
+
+A buffer of hours is too large to be written at every checkpoint. Transitions are numbered as they come, those of all
+environments in a step being one; a segment holds a range of them, and a checkpoint names the segments that make up the
+buffer, oldest first. Where two overlap the later one holds. Segments that no checkpoint names any more are removed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydantic
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from rlctl.environments.dict_spaces import split
+from rlctl.errors import ArtifactError
+from rlctl.storage import files
+
+Tensors = dict[str, NDArray[Any]]
+
+SEGMENT_BYTES = 8 * 2**20
+"""Size of a segment; the last one is written again, longer, until it has it."""
+_FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_NAME = re.compile(r"^\d{12}-\d{12}\.safetensors$")
+
+
+class Segment(pydantic.BaseModel):
+    """Transitions from `first` up to `last`, which is not one of them, in a file."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+    first: int = pydantic.Field(ge=0, lt=10**12)
+    last: int = pydantic.Field(gt=0, lt=10**12)
+    sha256: str
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return f"{self.first:012d}-{self.last:012d}.safetensors"
+
+
+class ReplaySegments:
+    """Writes a replay buffer into a folder, segment by segment, and reads it again."""
+
+    def __init__(self, folder: Path, buffer: ReplayBuffer) -> None:
+        self.folder = folder
+        self.buffer = buffer
+        self._segments: list[Segment] = []
+        self._written = 0
+        arrays = _arrays(buffer).values()
+        self._row_bytes = sum(array[:1].nbytes for array in arrays)
+        self._most_rows = max(1, SEGMENT_BYTES // self._row_bytes)
+
+    def mark_last_changed(self, added: int) -> None:
+        """Say that the last of `added` transitions is another one now than when it was added."""
+        self._written = min(self._written, added - 1)
+
+    def save(self, added: int) -> list[Segment]:
+        """Write what is new after `added` transitions in all; return the segments that make up the buffer."""
+        oldest = max(0, added - self.buffer.buffer_size)
+        segments = [each for each in self._segments if each.last > oldest]
+        if not all((self.folder / each.name).exists() for each in segments):  # somebody has removed some
+            segments, self._written = [], 0
+        rows = self._most_rows
+        first = max(self._written // rows * rows, oldest)
+        segments = [each for each in segments if each.first < first]
+        segments += [self._write(low, min(low + rows, added)) for low in range(first, added, rows)]
+        self._segments, self._written = segments, added
+        return list(segments)
+
+    def _write(self, first: int, last: int) -> Segment:
+        indices = np.arange(first, last) % self.buffer.buffer_size
+        content = save_tensors({name: array[indices] for name, array in _arrays(self.buffer).items()})
+        segment = Segment(first=first, last=last, sha256=files.digest(content))
+        files.write_bytes(self.folder / segment.name, content)
+        return segment
+
+    def load(self, segments: Sequence[Segment], added: int) -> None:
+        """Fill the buffer with the last of `added` transitions; raises `ArtifactError` if they are not its own."""
+        buffer = self.buffer
+        reached = max(0, added - buffer.buffer_size)
+        for segment in segments:
+            if segment.first > reached:
+                break
+            self._read(segment)
+            reached = max(reached, segment.last)
+        if reached != added:
+            raise ArtifactError(f"{self.folder}: transitions after number {reached} are missing, of {added}")
+        buffer.pos, buffer.full = added % buffer.buffer_size, added >= buffer.buffer_size
+        self._segments, self._written = list(segments), added
+
+    def _read(self, segment: Segment) -> None:
+        file = self.folder / segment.name
+        indices = np.arange(segment.first, segment.last) % self.buffer.buffer_size
+        try:
+            stored = load_tensors(file.read_bytes())
+            for name, array in _arrays(self.buffer).items():
+                if stored[name].shape != (len(indices), *array.shape[1:]) or stored[name].dtype != array.dtype:
+                    raise ValueError(f"{name} has shape {stored[name].shape} and type {stored[name].dtype}")
+                array[indices] = stored[name]
+        except (OSError, SafetensorError, KeyError, ValueError) as error:
+            raise ArtifactError(f"{file}: does not fit this recipe: {error}") from None
+
+
+def check(folder: Path, segments: Iterable[Segment]) -> None:
+    """Raise `ArtifactError` if a segment is not there, or not as it was written."""
+    for segment in segments:
+        files.check_digest(folder / segment.name, segment.sha256)
+
+
+def remove_unnamed(folder: Path, named: Iterable[Segment]) -> None:
+    """Remove the segments that no checkpoint names; other files are left alone."""
+    if not folder.is_dir():
+        return
+    names = {segment.name for segment in named}
+    for file in folder.iterdir():
+        if _NAME.match(file.name) and file.name not in names:
+            files.remove(file)
+
+
+def _arrays(buffer: ReplayBuffer) -> Tensors:
+    arrays: Tensors = {}
+    for name in _FIELDS:
+        value: Any = getattr(buffer, name)
+        arrays |= {f"{name}/{key}": part for key, part in split(value).items()}
+    return arrays
+
+
+def hindsight_tensors(buffer: ReplayBuffer) -> Tensors:
+    """Return where the episodes of a HER buffer are, and where those that run began; nothing of another buffer."""
+    if not isinstance(buffer, HerReplayBuffer):
+        return {}
+    return {
+        "hindsight/start": buffer.ep_start,
+        "hindsight/length": buffer.ep_length,
+        "hindsight/running": buffer._current_ep_start,
+    }
+
+
+def restore_hindsight(buffer: ReplayBuffer, tensors: Tensors) -> None:
+    """Give a HER buffer, whose transitions are there, the episodes that `hindsight_tensors` returned."""
+    if isinstance(buffer, HerReplayBuffer):
+        for name, array in hindsight_tensors(buffer).items():
+            array[...] = tensors[name]

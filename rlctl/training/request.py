@@ -1,0 +1,73 @@
+"""`rlctl train`: from a request to a finished run."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+
+from rlctl.errors import TaskError
+from rlctl.recipe.recipe import Recipe
+from rlctl.run.directory import RunDirectory
+from rlctl.training import status
+from rlctl.training.display import make_display
+from rlctl.training.prepare import prepare
+from rlctl.training.progress import Progress
+from rlctl.training.signals import StopSignals
+from rlctl.training.start import Start, TrainRequest, find_start
+
+__all__ = ["TrainRequest", "TrainResult", "run_training"]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainResult:
+    """How a training ended."""
+
+    run: RunDirectory
+    task: str
+    recipe: Recipe
+    steps: int
+    progress: Progress
+    """The best evaluation, the stage of the curriculum, and the seconds of training, with those before a resume."""
+    wall_seconds: float
+    """From the call to the end: with the start of the workers, the check, imports and saving."""
+    recordings: list[Path] = dataclasses.field(default_factory=list)
+    note: str = ""
+
+
+def run_training(request: TrainRequest) -> TrainResult:
+    """Train, or go on with a run; returns when it is done.
+
+    Raises `Interrupted` after a signal, and `TaskError` if evaluations failed.
+    """
+    with StopSignals() as signals, find_start(request) as start:
+        if start.run is not None and start.checkpoint is not None and start.checkpoint.progress.done:
+            return _report_finished(start, start.run, start.checkpoint.progress)
+        title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
+        with make_display(title, start.recipe.total_timesteps) as display, prepare(start, display) as training:
+            signals.begin(training)
+            training.run()
+            signals.end()
+            recordings = training.write_end(request.record)
+    run, progress = training.saver.run, training.progress
+    _raise_if_evaluations_failed(run, progress)
+    seconds = time.monotonic() - start.began
+    return TrainResult(run, start.task, start.recipe, training.steps, progress, seconds, recordings)
+
+
+def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> TrainResult:
+    if run.status().get("status") == "running":  # killed after all was done
+        status.write_end(run, start.step, progress)
+    _raise_if_evaluations_failed(run, progress)
+    note = "this run is finished already: nothing to do; -n makes it longer"
+    if start.request.record:
+        note += f"; to record episodes of it: rlctl replay {run.path}"
+    return TrainResult(run, start.task, start.recipe, start.step, progress, time.monotonic() - start.began, note=note)
+
+
+def _raise_if_evaluations_failed(run: RunDirectory, progress: Progress) -> None:
+    if progress.failed_evaluations:
+        raise TaskError(
+            f"{run.path}: the training is done, but {progress.failed_evaluations} of its evaluations failed, "
+            f"the first {progress.first_failure}"
+        )

@@ -1,0 +1,123 @@
+"""Workers play with a model's policy, and the model learns from it: what all algorithms have in common.
+
+A segment is played with the statistics of normalisation of its beginning; they are brought up to date after it.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.policy.policy import PolicyInfo
+from rlctl.recipe.recipe import Recipe
+from rlctl.rollout.shared_arrays import SegmentArrays
+from rlctl.training.progress import Progress
+from rlctl.training.snapshot import observation_statistics, pack
+from rlctl.training.updates import choose_learner
+from rlctl.training.vec_env import WorkerVecEnv
+
+Check = Callable[[], None]
+"""Called several times a second while workers play; may raise to leave."""
+Statistics = dict[str, tuple[NDArray[Any], NDArray[Any]]]
+"""Mean and variance per normalised observation, "" for one that is not a dict."""
+
+
+class Rollouts(abc.ABC):
+    """Stands in for the loop in an SB3 algorithm's `learn`, which asks the policy for every step."""
+
+    overlap = False
+    """Whether a segment is played while the model learns from those before."""
+    policy_plays_warmup = False
+    """Whether the steps before the first update are played by the policy, which is a trained one, and not at random."""
+
+    def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
+        self.model = model
+        self.env = env
+        self._algo = recipe.algo
+        self._progress = progress
+        self._learner = choose_learner(model)
+        self._policy_info: PolicyInfo | None = None
+
+    def begin(self, total_timesteps: int) -> None:
+        """Prepare the model to learn up to a step; a new training's first episodes begin."""
+        self.model._setup_learn(total_timesteps - self.model.num_timesteps, None, reset_num_timesteps=False)
+
+    def advance(self, check: Check | None = None) -> None:
+        """Play a segment and learn what is due: from this segment, or with overlap from those before."""
+        self.model.policy.set_training_mode(False)
+        self.start()
+        if self.overlap:
+            self.learn()
+        self.finish(check)
+        if not self.overlap:
+            self.learn()
+
+    @abc.abstractmethod
+    def start(self) -> None:
+        """Let the workers begin to play with the present policy."""
+
+    @abc.abstractmethod
+    def finish(self, check: Check | None) -> None:
+        """Wait until they have played, and store it in the model's buffer."""
+
+    @abc.abstractmethod
+    def learn(self) -> None:
+        """Do the updates that are due for what is stored."""
+
+    def acting_statistics(self) -> Statistics:
+        """Return a copy of the statistics; until the first segment is over, as if observations were normalised."""
+        found = {}
+        for key, rms in observation_statistics(self.model.get_vec_normalize_env()).items():
+            mean, var = rms.mean.copy(), rms.var.copy()
+            # Before that there are only the observations of a few resets, and what hardly varies in them would explode.
+            found[key] = (mean, var) if self.model.num_timesteps else (np.zeros_like(mean), np.ones_like(var))
+        return found
+
+    def send_policy(self, statistics: Statistics) -> None:
+        """Give the workers the present numbers of the model's policy."""
+        model, workers = self.model, self.env.workers
+        if self._policy_info is None:
+            self._policy_info = pack(model, self._algo, workers.spec, workers.info)[0]
+        tensors = {f"policy/{name}": value.cpu().numpy() for name, value in model.policy.state_dict().items()}
+        for key, (mean, var) in statistics.items():
+            tensors |= {f"normalize/{key}/mean": mean, f"normalize/{key}/var": var}
+        workers.set_policy(self._policy_info, tensors)
+        if (state := workers.recurrent_state) is not None:
+            last = model._last_lstm_states.pi
+            state[:, 0], state[:, 1] = (part.cpu().numpy().transpose(1, 0, 2) for part in last)
+            state[np.asarray(model._last_episode_starts)] = 0.0
+
+    def update_reward_statistics(self, segment: SegmentArrays) -> NDArray[np.float32]:
+        """Take the returns of a segment into account, and return its rewards divided by their deviation."""
+        normalizer = self.model.get_vec_normalize_env()
+        rewards = segment.reward
+        if normalizer is None or not normalizer.norm_reward:
+            return rewards.astype(np.float32)
+        returns, done = np.zeros_like(rewards), segment.done
+        for step in range(rewards.shape[1]):
+            normalizer.returns = normalizer.returns * normalizer.gamma + rewards[:, step]
+            returns[:, step] = normalizer.returns
+            normalizer.returns[done[:, step]] = 0.0
+        normalizer.ret_rms.update(returns.ravel())
+        normalized: NDArray[np.float32] = normalizer.normalize_reward(rewards).astype(np.float32)
+        return normalized
+
+    def finish_segment(self, segment: SegmentArrays) -> None:
+        """Take the observations of a stored segment into account."""
+        model = self.model
+        for key, rms in observation_statistics(model.get_vec_normalize_env()).items():
+            rows = segment.observation[key][:, 1:]
+            rms.update(rows.reshape(-1, *rows.shape[2:]))
+        model._last_episode_starts = segment.done[:, -1]
+        model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
+
+
+def to_network_layout(rows: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
+    """Return observations as the network's `space` has them: images with their channels first."""
+    shape = space.shape or ()
+    return np.moveaxis(rows, -1, -3) if len(shape) == 3 and rows.shape[-3:] != shape else rows

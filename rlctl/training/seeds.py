@@ -1,0 +1,139 @@
+"""`rlctl train TASK --seeds 0-4`: an ordinary run for every seed, each in a process of its own, in one group."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from rlctl import output
+from rlctl.environments import registry
+from rlctl.errors import RlctlError, UsageError
+from rlctl.evaluation.evaluate import EvalRequest
+from rlctl.evaluation.group import GroupScore, as_json, evaluate_group
+from rlctl.recipe.sources import resolve
+from rlctl.rollout.workers import available_cores
+from rlctl.run.group import Group, create_group, parse_seeds, read_group
+from rlctl.storage import files
+from rlctl.training.request import TrainRequest
+from rlctl.training.start import check_arguments, preserve_process_state
+from rlctl.training.trainings import CORES_PER_TRAINING, Trainings, choose_jobs
+from rlctl.training.warm_start import find_source
+
+
+class SeedsFailed(RlctlError):
+    """Some seeds of a group have failed; the exit code is the highest of theirs."""
+
+    def __init__(self, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+
+
+@dataclasses.dataclass(frozen=True)
+class SeedsResult:
+    """How the trainings of a group ended."""
+
+    score: GroupScore
+    failed: Mapping[int, int]
+    """Exit code per seed that failed."""
+
+    def check(self) -> None:
+        """Raise `SeedsFailed` if a seed failed."""
+        if self.failed:
+            which = ", ".join(f"seed {seed} with exit code {code}" for seed, code in self.failed.items())
+            group = self.score.group
+            raise SeedsFailed(
+                f"{group.path}: {len(self.failed)} of {len(group.seeds)} seeds failed: {which}. "
+                f"What each said is above; to try again: rlctl train --resume {shlex.quote(str(group.path))}",
+                max(self.failed.values()),
+            )
+
+
+def train_seeds(
+    request: TrainRequest, seeds: str | None, *, jobs: int | None = None, episodes: int = 100
+) -> SeedsResult:
+    """Train a request with several seeds, or go on with the group that it resumes; then evaluate each best policy.
+
+    At most `jobs` train at a time. Seeds that are done are left as they are, and one that fails stops no other. Raises
+    `UsageError` for seeds that are none, `RecipeError` for a recipe that is wrong, and `Interrupted` after a signal,
+    when all have saved their checkpoints.
+    """
+    if seeds is not None:
+        group, options = _begin(request, seeds), []
+    else:
+        check_arguments(request)
+        group, options = read_group(Path(str(request.resume))), list_options(request)
+    waiting = [seed for seed in group.seeds if not group.is_done(seed) or options]
+    jobs = _choose_jobs(group, len(waiting), jobs)
+    trainings = Trainings(jobs)
+    calls = [
+        functools.partial(trainings.train, _make_command(group, seed, options), functools.partial(_print_line, seed))
+        for seed in waiting
+    ]
+    codes = trainings.run(calls, f"rlctl train --resume {shlex.quote(str(group.path))}")
+    failed = {seed: code for seed, code in zip(waiting, codes, strict=True) if code}
+    score = evaluate_group(group, EvalRequest(None, episodes=episodes))
+    files.write_json(group.scores_file, as_json(score))
+    return SeedsResult(score, failed)
+
+
+def _begin(request: TrainRequest, seeds: str) -> Group:
+    """Make a new group, after a look at its task and recipe: what is wrong is wrong for every seed."""
+    if request.task is None or request.resume is not None:
+        raise UsageError("--seeds is about a new group: give a task, and no --resume")
+    if "seed" in request.settings:
+        raise UsageError("--seeds and --seed: give one of the two")
+    check_arguments(request)
+    numbers = parse_seeds(seeds)
+    with preserve_process_state():
+        registry.load(request.task)
+    recipe = resolve(request.task, request.config, request.settings)
+    if request.initial_policy is not None:
+        find_source(request.initial_policy, recipe)
+    return create_group(request.task, numbers, list_options(request), request.root)
+
+
+def list_options(request: TrainRequest) -> list[str]:
+    """Return the options of `rlctl train` that a request stands for, but for its task, seed and folder."""
+    options = [f"--set={key}={json.dumps(value)}" for key, value in request.settings.items()]
+    options += [f"--config={request.config}"] if request.config is not None else []
+    options += [f"--from={request.initial_policy}"] if request.initial_policy is not None else []
+    options += [f"--record={request.record}"] if request.record else []
+    options += ["--force"] if request.force else []
+    default = TrainRequest(None)
+    for name, value, usual in (
+        ("device", request.device, default.device),
+        ("env-timeout", request.env_timeout_s, default.env_timeout_s),
+    ):
+        options += [f"--{name}={value}"] if value != usual else []
+    return options if request.check else [*options, "--no-check"]
+
+
+def _choose_jobs(group: Group, waiting: int, jobs: int | None) -> int:
+    cores, chosen = available_cores(), choose_jobs(jobs, waiting)
+    done = len(group.seeds) - waiting
+    note = f"{group.path}: {output.format_count(len(group.seeds), 'seed')}"
+    if waiting:
+        note += (
+            f"{f', {done} done' if done else ''}, {chosen} at a time: a training keeps {CORES_PER_TRAINING} cores "
+            f"busy, there are {cores}; --jobs changes it"
+        )
+    else:
+        note += ", all done: nothing to train; -n makes them longer"
+    output.print_notes([note])
+    return chosen
+
+
+def _make_command(group: Group, seed: int, options: Sequence[str]) -> list[str]:
+    run = group.find_run(seed)
+    if run is not None:
+        return ["train", "--resume", str(run.path), *options]
+    return ["train", group.task, "--seed", str(seed), "--output", str(group.path), *group.options, *options]
+
+
+def _print_line(seed: int, line: str) -> None:
+    print(f"seed {seed}: {line}", file=sys.stderr, flush=True)

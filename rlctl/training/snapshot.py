@@ -1,0 +1,217 @@
+"""Everything in a training's memory that decides how it goes on, as tensors and plain data, and back; and its policy.
+
+The environments' part is in `checkpoint.py`, the replay buffer's in `replay_segments.py`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
+
+from rlctl.environments.dict_spaces import split
+from rlctl.environments.info import EnvInfo
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import ArtifactError, DivergedError
+from rlctl.policy.policy import PolicyInfo, collect_versions
+from rlctl.policy.torch_policy import describe_network, policy_name
+
+Tensors = dict[str, NDArray[Any]]
+
+_COUNTERS = (
+    "num_timesteps", "_n_updates", "_episode_num", "_n_calls", "exploration_rate", "_current_progress_remaining",
+)  # fmt: skip
+# Explained variance, for one, is not a number where rewards are constant, and nothing is wrong.
+_MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", "actor_loss", "critic_loss")
+
+
+def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> tuple[PolicyInfo, Tensors]:
+    """Return description and tensors of a model's policy, with the normalisation it has now.
+
+    The arrays are copies: training may go on.
+    """
+    tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in model.policy.state_dict().items()}
+    statistics = observation_statistics(model.get_vec_normalize_env())
+    for key, rms in statistics.items():
+        tensors[f"normalize/{key}/mean"] = rms.mean.copy()
+        tensors[f"normalize/{key}/var"] = rms.var.copy()
+    normalizer = model.get_vec_normalize_env()
+    info = PolicyInfo(
+        algo=algo,
+        policy=policy_name(algo, env.spaces()[0]),
+        policy_kwargs=describe_network(model.policy),
+        clip_observation=normalizer.clip_obs if normalizer is not None and statistics else None,
+        normalized_keys=list(statistics),
+        env=env,
+        spec=spec,
+        training_steps=model.num_timesteps,
+        versions=collect_versions(),
+    )
+    return info, tensors
+
+
+def observation_statistics(normalizer: VecNormalize | None) -> dict[str, RunningMeanStd]:
+    """Return the running statistics per observation key, "" for an observation that is no dict."""
+    if normalizer is None or not normalizer.norm_obs:
+        return {}
+    return split(normalizer.obs_rms)
+
+
+def learned_tensors(model: BaseAlgorithm) -> tuple[Tensors, Any]:
+    """Return all that training changes in a model and its normalisation, and the structure of its state dicts."""
+    weights, structure = _flatten(model.get_parameters(), "parameters")
+    return {**weights, **_variables(model), **_normalizer_tensors(model)}, structure
+
+
+def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
+    """Return the state of a model at a boundary between updates."""
+    tensors, structure = learned_tensors(model)
+    tensors |= _randomness_tensors() | _rollout_tensors(model)
+    plain = {
+        "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
+        "parameters": structure,
+    }
+    return tensors, plain
+
+
+def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
+    """Give a model the state that `take` returned; raises `ArtifactError` if it is another kind of model."""
+    try:
+        parameters = _unflatten(plain["parameters"], tensors)
+        model.set_parameters(parameters, exact_match=True, device=model.device)
+        _restore_variables(model, tensors)
+        _restore_normalizer(model, tensors)
+        _restore_rollout(model, tensors)
+        for name in _COUNTERS:  # no other: a file does not choose what is set
+            if name in plain["counters"]:
+                setattr(model, name, plain["counters"][name])
+        _restore_randomness(tensors)
+    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+        raise ArtifactError(f"does not fit this recipe: {' '.join(str(error).split())[:200]}") from None
+
+
+def _restore_randomness(tensors: Tensors) -> None:
+    """Restore the generators that updates draw from; gSDE's matrices need not be: updates draw them anew."""
+    torch.set_rng_state(torch.from_numpy(tensors["randomness/torch"].copy()))
+    keys, position, has_gauss, cached = (tensors[f"randomness/numpy/{part}"] for part in _NUMPY)
+    np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(cached)))  # noqa: NPY002 (SB3 draws there)
+
+
+_NUMPY = ("keys", "position", "has_gauss", "cached")
+
+
+def _randomness_tensors() -> Tensors:
+    name, *state = np.random.get_state()  # noqa: NPY002 (SB3 draws from it)
+    assert name == "MT19937"  # numpy's global generator has no other kind
+    tensors = {f"randomness/numpy/{part}": np.asarray(value) for part, value in zip(_NUMPY, state, strict=True)}
+    tensors["randomness/torch"] = torch.get_rng_state().numpy()
+    return tensors
+
+
+def _array(tensor: torch.Tensor) -> NDArray[Any]:
+    values: NDArray[Any] = tensor.detach().cpu().numpy()
+    return values
+
+
+def _flatten(value: Any, path: str) -> tuple[Tensors, Any]:
+    """Split nested state dicts into tensors by path, and JSON that refers to them."""
+    if isinstance(value, torch.Tensor):
+        return {path: _array(value)}, {"tensor": path}
+    if isinstance(value, dict):
+        tensors: Tensors = {}
+        entries = []
+        for key, each in value.items():
+            below, structure = _flatten(each, f"{path}/{key}")
+            tensors.update(below)
+            entries.append([key, structure])
+        return tensors, {"dict": entries}
+    if isinstance(value, list | tuple):
+        below, structure = _flatten(dict(enumerate(value)), path)
+        kind = "list" if isinstance(value, list) else "tuple"
+        return below, {kind: [each for _, each in structure["dict"]]}
+    return {}, {"value": value}
+
+
+def _unflatten(structure: Any, tensors: Tensors) -> Any:
+    ((kind, content),) = structure.items()
+    if kind == "tensor":
+        return torch.from_numpy(tensors[content].copy())
+    if kind == "dict":
+        return {key: _unflatten(each, tensors) for key, each in content}
+    if kind in ("list", "tuple"):
+        items = [_unflatten(each, tensors) for each in content]
+        return items if kind == "list" else tuple(items)
+    return content
+
+
+def _variables(model: BaseAlgorithm) -> Tensors:
+    """Return what SB3 trains beside the networks: SAC's entropy coefficient, which `get_parameters` leaves out."""
+    _, names = model._get_torch_save_params()
+    return {f"variables/{name}": _array(getattr(model, name)) for name in names}
+
+
+def _restore_variables(model: BaseAlgorithm, tensors: Tensors) -> None:
+    _, names = model._get_torch_save_params()
+    for name in names:
+        # In place: an optimiser holds this very tensor.
+        getattr(model, name).data.copy_(torch.from_numpy(tensors[f"variables/{name}"].copy()))
+
+
+def _normalizer_tensors(model: BaseAlgorithm) -> Tensors:
+    normalizer = model.get_vec_normalize_env()
+    if normalizer is None:
+        return {}
+    tensors: Tensors = {"normalize/returns": normalizer.returns}
+    for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
+        tensors |= {f"normalize/{key}/{part}": np.asarray(getattr(rms, part)) for part in ("mean", "var", "count")}
+    return tensors
+
+
+def _restore_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
+    normalizer = model.get_vec_normalize_env()
+    if normalizer is None:
+        return
+    normalizer.returns = tensors["normalize/returns"].copy()
+    for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
+        rms.mean = tensors[f"normalize/{key}/mean"].copy()
+        rms.var = tensors[f"normalize/{key}/var"].copy()
+        rms.count = float(tensors[f"normalize/{key}/count"])
+
+
+def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
+    """Return what the next step depends on beside the environments."""
+    tensors: Tensors = {"rollout/starts": np.asarray(model._last_episode_starts)}
+    states: Any = getattr(model, "_last_lstm_states", None)
+    for kind, pair in zip(("pi", "vf"), states or (), strict=False):
+        for index, each in enumerate(pair):
+            tensors[f"rollout/lstm/{kind}/{index}"] = _array(each)
+    return tensors
+
+
+def _restore_rollout(model: BaseAlgorithm, tensors: Tensors) -> None:
+    model._last_episode_starts = tensors["rollout/starts"].copy()
+    if getattr(model, "_last_lstm_states", None) is not None:
+        pairs = [
+            tuple(torch.from_numpy(tensors[f"rollout/lstm/{kind}/{index}"].copy()).to(model.device) for index in (0, 1))
+            for kind in ("pi", "vf")
+        ]
+        model._last_lstm_states = RNNStates(*pairs)  # type: ignore[attr-defined]
+
+
+def check_finite(model: BaseAlgorithm, run: Path) -> None:
+    """Raise `DivergedError`, which names `run`, if a loss, or a number that is learnt, is not finite."""
+    tensors, _ = learned_tensors(model)
+    losses = {name: np.array(model.logger.name_to_value.get(f"train/{name}", 0.0)) for name in _MUST_BE_FINITE}
+    for name, values in {**tensors, **losses}.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise DivergedError(
+                f"training diverged: {name.replace('/', ' ')} is not finite at step {model.num_timesteps:,}. A smaller "
+                f"algo_kwargs.learning_rate or a smaller reward helps most often.\nWhat was saved before is in {run}"
+            )

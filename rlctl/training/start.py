@@ -1,0 +1,197 @@
+"""Where a training starts: at nothing, or at the newest good checkpoint of a run."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import re
+import shlex
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlctl.environments.task_version import describe_task_changes
+from rlctl.errors import ArtifactError, RecipeError, UsageError
+from rlctl.recipe.recipe import Recipe, validate
+from rlctl.recipe.sources import describe_rounding, resolve_with_stages
+from rlctl.run import directory, lookup
+from rlctl.run.directory import RunDirectory, RunLock
+from rlctl.training.warm_start import find_source
+
+if TYPE_CHECKING:
+    from rlctl.training.checkpoint import Checkpoint
+
+_DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainRequest:
+    """The arguments of `rlctl train`."""
+
+    task: str | None
+    resume: str | None = None
+    config: Path | None = None
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    device: str = "cpu"
+    record: int = 0
+    env_timeout_s: float = 60.0
+    root: Path = directory.ROOT
+    check: bool = False
+    """Whether to check the environment first, and to refuse one that has errors."""
+    force: bool = False
+    """Whether to go on with a run even if its task has changed."""
+    initial_policy: str | None = None
+    """A run, a policy file, or the name of a task that ships a policy: what the training begins with."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """Where a training starts; holds the lock of a run that is resumed, as long as it is entered."""
+
+    request: TrainRequest
+    task: str
+    recipe: Recipe
+    run: RunDirectory | None = None
+    """The run that is resumed."""
+    lock: RunLock | None = None
+    checkpoint: Checkpoint | None = None
+    notes: tuple[str, ...] = ()
+    """Messages for the user, before the first step."""
+    source: Mapping[str, Any] | None = None
+    """The policy that it began with; see `warm_start.find_source`."""
+    inexact: tuple[str, ...] = ()
+    """Why the run cannot go on as if it had never stopped, as far as is known before it goes on."""
+    began: float = dataclasses.field(default_factory=time.monotonic)
+
+    def __enter__(self) -> Start:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.lock is not None:
+            self.lock.release()
+
+    @property
+    def stage(self) -> int:
+        """Stage of the curriculum, from 1."""
+        return (self.checkpoint.progress.stage or 1) if self.checkpoint else 1
+
+    @property
+    def step(self) -> int:
+        """Environment steps that are done."""
+        return self.checkpoint.state.step if self.checkpoint else 0
+
+    def check_may_succeed(self, may_succeed: bool) -> None:
+        """Raise `RecipeError` where the recipe waits for success and the task does not report it."""
+        recipe = self.recipe
+        if may_succeed:
+            return
+        if recipe.stop_success is not None:
+            raise RecipeError(f"stop_success: {self.task} does not report success; leave it out")
+        for number, stage in enumerate(recipe.stages, start=1):
+            if stage.promote is not None and stage.promote.success is not None:
+                raise RecipeError(
+                    f"stage {number} of {len(recipe.stages)}: promote.success: {self.task} does not report success; "
+                    "promote by return: promote: {return: 50.0}"
+                )
+
+
+def find_start(request: TrainRequest) -> Start:
+    """Return where a request starts, after a look at all that can be wrong with it; nothing is changed yet."""
+    check_arguments(request)
+    return _find_new(request) if request.task is not None else _find_checkpoint(request)
+
+
+def check_arguments(request: TrainRequest) -> None:
+    """Raise `UsageError` for arguments that exclude each other, and for a device that cannot exist."""
+    if (request.task is None) == (request.resume is None):
+        raise UsageError("give a task to train, or --resume RUN to go on with a run; one of the two")
+    if not _DEVICE.fullmatch(request.device):  # now, and not after half a minute of imports
+        raise UsageError(f"--device {request.device!r}: no such device; give cpu, cuda, cuda:1, or auto")
+    if request.resume is not None:
+        _check_resume(request)
+
+
+def _find_new(request: TrainRequest) -> Start:
+    task = request.task or ""
+    with preserve_process_state():
+        recipe = resolve_with_stages(task, request.config, request.settings)
+    note = describe_rounding(recipe)
+    source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
+    return Start(request, task, recipe, notes=(note,) if note else (), source=source)
+
+
+def _find_checkpoint(request: TrainRequest) -> Start:
+    """Find a run, lock it, and read its newest good checkpoint.
+
+    Raises `UsageError` for settings that cannot be others now, and unless it is forced for a task that has changed.
+    """
+    from rlctl.training import checkpoint
+
+    run = lookup.find_run(request.resume, request.root)
+    before = run.recipe()
+    lock = run.lock()  # before looking: a process that is training removes old checkpoints
+    try:
+        recipe = validate({**before.model_dump(by_alias=True), **request.settings}, "recipe")
+        status = run.status()
+        task = lookup.locate_task(status["task"], run)
+        changes = describe_task_changes(status, task)
+        if changes and not request.force:
+            raise UsageError(
+                f"{run.path}: {'; '.join(changes)}. What was learnt may not fit any more; --force goes on all the same"
+            )
+        run.recover()
+        found, damage = checkpoint.read_newest(run)
+        if found is None and status.get("status") == "finished":
+            command = shlex.join(["rlctl", "train", task, "--from", str(run.path)])
+            raise ArtifactError(
+                f"{run.path}: finished, and its checkpoints were removed; "
+                f"for a new training that begins with its policy: {command}"
+            )
+        if found is not None and request.settings:
+            found = _reopen(found, before, recipe)
+        notes = ["no checkpoint yet: the training begins at its first step"]
+        if found is not None:
+            notes = [f"warning: {each}; going on from step {found.state.step:,}" for each in damage]
+        return Start(request, task, recipe, run, lock, found, tuple(notes), status.get("from"), tuple(changes))
+    except BaseException:
+        lock.release()
+        raise
+
+
+def _check_resume(request: TrainRequest) -> None:
+    if request.config is not None:
+        raise UsageError("--resume goes on with the run's own recipe: leave out --config")
+    if request.initial_policy is not None:
+        raise UsageError("--from begins a new run, and --resume goes on with one: give one of the two")
+    for key in request.settings:
+        if key != "total_timesteps":
+            raise UsageError(f"--resume goes on with the run's own recipe: {key} cannot be changed, only -n")
+
+
+def _reopen(found: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:
+    """Let a training that was done go on, if it is asked for more than it was."""
+    if not found.progress.done or recipe.total_timesteps <= max(found.state.step, before.total_timesteps):
+        return found
+    progress = dataclasses.replace(found.progress, done=False, good_in_a_row=0)
+    return dataclasses.replace(found, state=found.state.model_copy(update={"progress": progress}))
+
+
+@contextlib.contextmanager
+def preserve_process_state() -> Iterator[None]:
+    """Restore what importing somebody's module may change and a training relies on.
+
+    That is the working directory, how numpy takes overflows, and torch's number type, device and gradients. Signal
+    handlers are set anew when the training begins.
+    """
+    try:
+        with contextlib.chdir("."), np.errstate():
+            yield
+    finally:
+        if (torch := sys.modules.get("torch")) is not None:
+            torch.set_default_dtype(torch.float32)
+            torch.set_default_device(None)
+            torch.set_grad_enabled(True)

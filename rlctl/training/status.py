@@ -1,0 +1,90 @@
+"""The content of `run.json`: how it began and how it ended."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import sys
+from typing import TYPE_CHECKING, Any
+
+from rlctl.environments.task_version import find_git_commit, identify_task
+from rlctl.errors import DivergedError, Interrupted, RlctlError
+from rlctl.policy.policy import collect_versions
+from rlctl.recipe.recipe import Recipe, find_difference
+from rlctl.recipe.sources import resolve_packaged
+from rlctl.run.directory import RunDirectory
+
+if TYPE_CHECKING:
+    from rlctl.training.progress import Progress
+    from rlctl.training.start import Start
+
+_STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
+
+
+def write_start(run: RunDirectory, start: Start) -> None:
+    """Write the recipe, and that a training runs."""
+    recipe = start.recipe
+    run.write_recipe(recipe)
+    changes: dict[str, Any] = {
+        "status": "running",
+        "error": None,
+        "task": start.task,
+        **identify_task(start.task),
+        "algo": recipe.algo,
+        "seed": recipe.seed,
+        "recipe_changes": find_recipe_changes(start.task, recipe),
+        "device": start.request.device,
+        "versions": collect_versions(),
+        "git_commit": find_git_commit(),
+        "command": ["rlctl", *sys.argv[1:]],
+        "host": platform.node(),
+        "pid": os.getpid(),
+    }
+    if start.run is not None:
+        changes |= {"resumed": _now(), "resumed_at_step": start.step}
+    else:
+        changes |= {"started": _now(), "folder": os.getcwd()}  # what a task's path may be relative to
+        if start.source is not None:
+            changes["from"] = start.source
+    run.write_status(changes)
+
+
+def find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
+    """Return the keys in which a recipe differs from the task's own, and their values; not what follows from them."""
+    chosen = {key: getattr(recipe, key) for key in ("algo", "n_envs", "total_timesteps")}
+    try:
+        packaged, adapted = resolve_packaged(task), resolve_packaged(task, chosen)
+    except RlctlError:  # a packaged recipe that is wrong in itself; this one was made right by --config or --set
+        return {}
+    own = {key: value for key, value in chosen.items() if value != getattr(packaged, key)}
+    return own | {key: value for key, (value, _) in find_difference(recipe, adapted).items()}
+
+
+def write_failure(run: RunDirectory, error: BaseException) -> None:
+    """Write what ended a training before its time."""
+    kind = _STATUS.get(type(error), "failed")
+    if run.status_file.exists():  # else somebody has removed the run
+        run.write_status({"status": kind, "error": str(error) or repr(error), "ended": _now()})
+
+
+def write_end(run: RunDirectory, steps: int, progress: Progress) -> None:
+    """Write that a training is done, and what came of it."""
+    run.write_status(
+        {
+            "status": "finished",
+            "ended": _now(),
+            "steps": steps,
+            "seconds": round(progress.seconds, 3),
+            "best_step": progress.best_step,
+            "best_success": progress.best_success,
+            "best_return": progress.best_return,
+            "observations_outside": progress.observations_outside,
+            "failed_evaluations": progress.failed_evaluations,
+            **({"stage": progress.stage} if progress.stage else {}),
+        }
+    )
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

@@ -1,0 +1,74 @@
+"""What a training prints at its end."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+from rlctl import output
+from rlctl.runs.diagnosis import Finding, diagnose, format_end
+from rlctl.training.display import duration, percent
+from rlctl.training.request import TrainResult
+
+
+def show(result: TrainResult, json: str | None) -> None:
+    """Print the result, what the training's records show, and what to type next; for `--json -` JSON instead."""
+    findings = diagnose(result.run)
+    if json is not None and output.write_result_json(json, _to_json(result, findings)):
+        return
+    run = shlex.quote(str(result.run.path))
+    lines = [result.note] if result.note else []
+    lines += [*_format_result(result), *format_end(findings, run)]
+    lines += [f"recording: rerun {shlex.quote(str(path))}" for path in result.recordings]
+    if result.recordings:
+        lines.append("  without a display, in a browser: rerun --serve-web FILE")
+    lines += [
+        f"run: {result.run.path}",
+        "next:",
+        f"  rlctl eval {run}",
+        f"  rlctl export {run} --onnx",
+        f"  rlctl replay {run}",
+        f"  tensorboard --logdir {shlex.quote(str(result.run.tensorboard))}",
+    ]
+    for line in lines:
+        output.out().print(line)
+
+
+def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:
+    progress, stages = result.progress, len(result.recipe.stages)
+    return {
+        "run": str(result.run.path),
+        "task": result.task,
+        "steps": result.steps,
+        "seconds": round(progress.seconds, 3),
+        "wall_seconds": round(result.wall_seconds, 3),
+        "best": {
+            "step": progress.best_step,
+            "success_rate": progress.best_success,
+            "mean_return": progress.best_return,
+            "episodes": result.recipe.eval.episodes,
+            "policy": str(result.run.best_policy),
+        },
+        **({"stage": progress.stage, "stages": stages} if stages else {}),
+        "findings": findings,
+        "recordings": [str(path) for path in result.recordings],
+        "note": result.note,
+    }
+
+
+def _format_result(result: TrainResult) -> list[str]:
+    progress, stages = result.progress, len(result.recipe.stages)
+    line = f"trained {result.task}: {result.steps:,} steps in {duration(progress.seconds)}"
+    if result.wall_seconds >= progress.seconds + 3:
+        line += f" ({duration(result.wall_seconds)} with start, check and end)"
+    lines = [line]
+    if progress.best_return is not None and progress.best_step is not None:
+        success = "" if progress.best_success is None else f"success {percent(progress.best_success)}, "
+        lines.append(
+            f"best at step {progress.best_step:,}: {success}return {progress.best_return:.2f} "
+            f"(mean of {output.format_count(result.recipe.eval.episodes, 'episode')})"
+        )
+    if stages:
+        short = "" if progress.stage == stages else "; evaluated in the last, which it did not reach"
+        lines.append(f"ended in stage {progress.stage} of {stages}{short}")
+    return lines

@@ -1,0 +1,205 @@
+"""PPO's updates with gradients computed without autograd: what SB3's `PPO.train` computes, but for rounding.
+
+J. Schulman et al., Proximal Policy Optimization Algorithms, 2017, https://arxiv.org/abs/1707.06347. Below, what a
+gradient is of stands in its name: `to_mean` is the gradient of the loss with respect to the mean.
+"""
+
+from __future__ import annotations
+
+import collections
+import functools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.distributions import DiagGaussianDistribution, StateDependentNoiseDistribution
+from stable_baselines3.common.utils import explained_variance
+from torch import Tensor
+
+from rlctl.environments.dict_spaces import join, split
+from rlctl.training.updates.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
+from rlctl.training.updates.side_by_side import SideBySide
+
+_FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
+
+
+class PpoUpdate:
+    """Updates a PPO model whose networks are multi-layer perceptrons and whose actions are normally distributed."""
+
+    def __init__(self, model: PPO) -> None:
+        policy: Any = model.policy
+        self._model: Any = model
+        self._policy = policy
+        self._actor = Mlp(_actor_modules(policy))
+        self._critic = Mlp(_critic_modules(policy))
+        self._gradients = share_gradients(policy.parameters())
+        self._side_by_side = SideBySide([self._actor, self._critic], model.batch_size)
+
+    @staticmethod
+    def supports(model: Any) -> bool:
+        """Return whether a model can be updated so; otherwise SB3 does it."""
+        policy = model.policy
+        if type(model) is not PPO or not policy.share_features_extractor:
+            return False
+        distribution = policy.action_dist
+        if isinstance(distribution, StateDependentNoiseDistribution):
+            plain = distribution.full_std and not (
+                distribution.use_expln or distribution.learn_features or distribution.bijector
+            )
+        else:
+            plain = type(distribution) is DiagGaussianDistribution
+        networks = is_mlp(_actor_modules(policy)) and is_mlp(_critic_modules(policy))
+        return bool(plain) and networks and not list(policy.features_extractor.parameters())
+
+    @torch.no_grad()
+    def train(self) -> None:
+        """Update the policy with the rollout in the model's buffer, and log what SB3 logs."""
+        model, policy = self._model, self._policy
+        model._update_learning_rate(policy.optimizer)
+        clip_range = model.clip_range(model._current_progress_remaining)
+        clip_range_vf = None
+        if model.clip_range_vf is not None:
+            clip_range_vf = model.clip_range_vf(model._current_progress_remaining)
+        data = self._read_buffer()
+        logged: dict[str, list[float]] = collections.defaultdict(list)
+        for _ in range(model.n_epochs):
+            logged["approx_kl"] = []
+            finished = all(
+                self._update(batch, clip_range, clip_range_vf, logged) for batch in _shuffle(data, model.batch_size)
+            )
+            model._n_updates += 1
+            if not finished:
+                break
+        self._log(logged, clip_range, clip_range_vf)
+
+    def _read_buffer(self) -> dict[str, Tensor]:
+        """Return a rollout, shape (steps * environments, ...) each; of the observations what the networks get."""
+        buffer, device = self._model.rollout_buffer, self._model.device
+
+        def to_tensor(rows: NDArray[Any]) -> Tensor:
+            return torch.as_tensor(buffer.swap_and_flatten(rows), device=device)
+
+        observations = join({key: to_tensor(rows) for key, rows in split(buffer.observations).items()})
+        data = {name: to_tensor(getattr(buffer, name)) for name in _FIELDS}
+        data |= {name: data[name].flatten() for name in _FIELDS[1:]}
+        data["actions"] = data["actions"].float()  # the buffer has the type of the space
+        return {"features": self._policy.extract_features(observations), **data}
+
+    def _update(
+        self, batch: dict[str, Tensor], clip_range: float, clip_range_vf: float | None, logged: dict[str, list[float]]
+    ) -> bool:
+        """Learn from a minibatch; return False, and do not, where the policy has moved further than `target_kl`."""
+        model = self._model
+        of_actor, of_critic = self._side_by_side.run(
+            [
+                functools.partial(self._compute_actor_gradients, batch, clip_range),
+                functools.partial(self._compute_critic_gradients, batch, clip_range_vf),
+            ]
+        )
+        losses = of_actor | of_critic
+        for name, loss in losses.items():
+            logged[name].append(loss)
+        entropy_loss = model.ent_coef * losses["entropy_loss"]
+        logged["loss"] = [losses["policy_gradient_loss"] + entropy_loss + model.vf_coef * losses["value_loss"]]
+        if model.target_kl is not None and losses["approx_kl"] > 1.5 * model.target_kl:
+            return False
+        self._step()
+        return True
+
+    def _compute_actor_gradients(self, batch: dict[str, Tensor], clip_range: float) -> dict[str, float]:
+        """Set the gradients of the actor's weights; return the losses that SB3 logs."""
+        model, size = self._model, len(batch["actions"])
+        actor = self._actor.run(batch["features"])
+        std = self._compute_std(actor)
+        z = (batch["actions"] - actor[-1]) / std
+        log_std = std.log()
+        log_prob = (z.square() * -0.5 - log_std - LOG_SQRT_TAU).sum(1)
+        entropy = (log_std.expand_as(z) + (0.5 + LOG_SQRT_TAU)).sum(1)
+
+        advantages = batch["advantages"]
+        if model.normalize_advantage and size > 1:
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        log_ratio = log_prob - batch["log_probs"]
+        ratio = log_ratio.exp()
+        unclipped, clipped = advantages * ratio, advantages * ratio.clamp(1 - clip_range, 1 + clip_range)
+        # Where the clipped term is the smaller one, the loss does not depend on the policy.
+        to_log_prob = (unclipped * (unclipped <= clipped) / -size).unsqueeze(1)
+        self._actor.backpropagate(actor, to_log_prob * z / std)
+        self._set_std_gradient(actor, std, to_log_prob * (z.square() - 1) - model.ent_coef / size)
+        return {
+            "policy_gradient_loss": -torch.minimum(unclipped, clipped).mean().item(),
+            "entropy_loss": -entropy.mean().item(),
+            "clip_fraction": ((ratio - 1).abs() > clip_range).float().mean().item(),
+            "approx_kl": (ratio - 1 - log_ratio).mean().item(),
+        }
+
+    def _compute_critic_gradients(self, batch: dict[str, Tensor], clip_range_vf: float | None) -> dict[str, float]:
+        """Set the gradients of the critic's weights; return its loss."""
+        critic = self._critic.run(batch["features"])
+        values = critic[-1].flatten()
+        to_value = values - batch["returns"]
+        if clip_range_vf is not None:
+            moved = values - batch["values"]
+            to_value = batch["values"] + moved.clamp(-clip_range_vf, clip_range_vf) - batch["returns"]
+        loss = to_value.square().mean().item()
+        if clip_range_vf is not None:
+            to_value = to_value * (moved.abs() <= clip_range_vf)
+        self._critic.backpropagate(critic, to_value.unsqueeze(1) * (2 * self._model.vf_coef / len(values)))
+        return {"value_loss": loss}
+
+    def _compute_std(self, actor: list[Tensor]) -> Tensor:
+        """Return the standard deviation of actions: of all alike, or with gSDE of each, shape (batch, actions)."""
+        policy = self._policy
+        if not policy.use_sde:
+            return torch.exp(policy.log_std)
+        variance = actor[-2].square() @ torch.exp(2 * policy.log_std) + float(policy.action_dist.epsilon)
+        return variance.sqrt()
+
+    def _set_std_gradient(self, actor: list[Tensor], std: Tensor, to_log_std: Tensor) -> None:
+        """Set the gradient of `log_std` from that of the logarithm of `_compute_std`, shape (batch, actions)."""
+        parameter = self._policy.log_std
+        if not self._policy.use_sde:
+            torch.sum(to_log_std, 0, out=parameter.grad)
+            return
+        # std^2 = latent^2 @ exp(2 log_std) + epsilon; no gradient flows into the latent values, as in SB3.
+        torch.mul(actor[-2].square().t() @ (to_log_std / std.square()), (2 * parameter).exp(), out=parameter.grad)
+
+    def _step(self) -> None:
+        gradients, limit = self._gradients, self._model.max_grad_norm
+        norm = gradients.norm().item()
+        if not norm <= limit:
+            gradients *= limit / (norm + 1e-6)
+        self._policy.optimizer.step()
+
+    def _log(self, logged: dict[str, list[float]], clip_range: float, clip_range_vf: float | None) -> None:
+        model, logger = self._model, self._model.logger
+        buffer = model.rollout_buffer
+        for name, values in logged.items():
+            logger.record(f"train/{name}", np.mean(values))
+        variance = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        logger.record("train/explained_variance", variance)
+        logger.record("train/std", self._policy.log_std.exp().mean().item())
+        logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
+        logger.record("train/clip_range", clip_range)
+        if clip_range_vf is not None:
+            logger.record("train/clip_range_vf", clip_range_vf)
+
+
+def _shuffle(data: dict[str, Tensor], size: int) -> Iterator[dict[str, Tensor]]:
+    """Yield minibatches of an epoch, in the order that SB3's buffer has them."""
+    total = len(data["actions"])
+    order = torch.from_numpy(np.random.permutation(total))  # noqa: NPY002 (SB3's generator: checkpoints hold its state)
+    shuffled = {name: rows[order] for name, rows in data.items()}
+    for first in range(0, total, size):
+        yield {name: rows[first : first + size] for name, rows in shuffled.items()}
+
+
+def _actor_modules(policy: Any) -> list[torch.nn.Module]:
+    return [*policy.mlp_extractor.policy_net, policy.action_net]
+
+
+def _critic_modules(policy: Any) -> list[torch.nn.Module]:
+    return [*policy.mlp_extractor.value_net, policy.value_net]

@@ -1,0 +1,165 @@
+"""The worker environments as Stable-Baselines3 wants them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from rlctl.environments.dict_spaces import split_space
+from rlctl.errors import EpisodeFailed
+from rlctl.policy.acting import Exploration
+from rlctl.rollout.messages import EpisodeResult, Play
+from rlctl.rollout.seeds import Stream, episode_seed
+from rlctl.rollout.shared_arrays import SegmentArrays
+from rlctl.rollout.workers import Workers
+
+
+class ActionHistory:
+    """Stores the actions of each environment's running episode; `episodes` are those so far, shape (steps, ...)."""
+
+    def __init__(self, episodes: Iterable[NDArray[Any]]) -> None:
+        self._parts = [[actions] for actions in episodes]
+
+    def add_segment(self, actions: NDArray[Any], ended: Iterable[tuple[int, int]]) -> None:
+        """Store a segment, shape (n_envs, steps, ...), in which episodes ended: (environment, row) each, by row."""
+        last = dict(ended)
+        for env, rows in enumerate(actions):
+            if env in last:
+                self._parts[env] = []
+            self._parts[env].append(rows[last.get(env, -1) + 1 :].copy())
+
+    def of(self, env: int) -> NDArray[Any]:
+        """Return the actions of an environment's episode so far, shape (steps, ...)."""
+        return np.concatenate(self._parts[env])
+
+
+def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
+    """Return how many observations, shape (n_envs, steps, ...), are outside their space, and what is wrong with one."""
+    outside: Any = False  # of each observation, once there is one
+    message = ""
+    for key, box in split_space(space).items():
+        if not isinstance(box, spaces.Box) or box.dtype == np.uint8:
+            continue
+        values = observations[key]
+        wrong = ((values < box.low) | (values > box.high)).reshape(*values.shape[:2], -1)
+        if wrong.any():
+            outside |= wrong.any(axis=2)
+            env, step, element = np.argwhere(wrong)[0].tolist()
+            value, low, high = (each.ravel()[element] for each in (values[env, step], box.low, box.high))
+            name = f"observation {key!r}" if key else "observation"
+            message = f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
+    return int(np.count_nonzero(outside)), message
+
+
+class WorkerVecEnv(VecEnv):
+    """Steps `Workers` for SB3. Every episode's seed follows from its address; SB3's own seeding is not used."""
+
+    def __init__(self, workers: Workers, run_seed: int) -> None:
+        self.workers = workers
+        self.run_seed = run_seed
+        self.episodes_started = [0] * workers.n_envs
+        """Per environment, how many episodes have begun: the next one's number."""
+        self.history = ActionHistory(workers.arrays.segment.action[:, :0])
+        """What was done in the running episodes."""
+        self.outside, self.outside_message = 0, ""
+        """Observations outside their space since it was set to 0, and what was wrong with one."""
+        self.ended: list[EpisodeResult] = []
+        """Episodes that ended since it was emptied."""
+        self.last_segment: SegmentArrays | None = None
+        """What `finish` returned last; its arrays are overwritten by the next."""
+        self.waited_s = 0.0
+        """Time spent waiting for the environments to play [s], since it was set to 0."""
+        self._steps = 0
+        super().__init__(workers.n_envs, *workers.info.spaces())
+
+    def _seed(self, env: int, episode: int) -> int:
+        return episode_seed(self.run_seed, Stream.TRAIN, env, episode)
+
+    def reset(self) -> Any:
+        try:
+            self.workers.reset({env: self._seed(env, number) for env, number in enumerate(self.episodes_started)})
+        except EpisodeFailed as error:
+            error.actions = []
+            raise
+        self.episodes_started = [number + 1 for number in self.episodes_started]
+        self.history = ActionHistory(self.workers.arrays.segment.action[:, :0])
+        return self.workers.observations()
+
+    def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
+        """Put each environment into its running episode by replaying the actions.
+
+        `actions` has shape (steps, ...) per environment. Return the environments whose episode ended on the way,
+        which they would not if they were deterministic.
+        """
+        self.episodes_started = list(episodes_started)
+        seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
+        episodes = dict(enumerate(zip(seeds, actions, strict=True)))
+        ended = self.workers.replay_actions(episodes, doing="replaying episodes", may_fail=True)
+        self.history = ActionHistory(actions)
+        return ended
+
+    def start(self, steps: int, exploration: Exploration) -> None:
+        """Begin to play `steps` steps of each environment."""
+        self._steps = steps
+        going_on, following = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
+        self.workers.start_playing(Play(steps, going_on, following, self.run_seed, exploration=exploration))
+
+    def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
+        """Wait for what `start` has begun; `check` is called several times a second."""
+        began = time.monotonic()
+        try:
+            ended = self.workers.finish_playing(check=check)
+        except EpisodeFailed as error:
+            error.actions = self._failed_actions(error)
+            raise
+        self.waited_s += time.monotonic() - began
+        segment, steps = self.workers.arrays.segment, self._steps
+        for result in ended:
+            self.episodes_started[result.env] += 1
+        self.history.add_segment(segment.action[:, :steps], [(each.env, each.row) for each in ended])
+        self.ended += ended
+        seen = {key: rows[:, 1 : steps + 1] for key, rows in segment.observation.items()}
+        count, message = _count_outside(self.observation_space, seen)
+        self.outside, self.outside_message = self.outside + count, self.outside_message or message
+        self.last_segment = segment.first(steps, ended)
+        return self.last_segment
+
+    def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any]:
+        """Return the actions of a failed episode, that of the failed step last."""
+        arrays = self.workers.arrays
+        rows = int(arrays.inside[error.env, 2]) + 1
+        if error.step <= rows:
+            return arrays.segment.action[error.env, rows - error.step : rows].copy()
+        return np.concatenate([self.history.of(error.env), arrays.segment.action[error.env, :rows]])
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        raise NotImplementedError("workers play segments; nothing steps them one by one")
+
+    def step_wait(self) -> Any:
+        raise NotImplementedError("workers play segments; nothing steps them one by one")
+
+    def close(self) -> None:
+        self.workers.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        if attr_name == "render_mode":
+            return [None for _ in self._get_indices(indices)]
+        raise AttributeError(f"worker environments do not hand out attributes: {attr_name}")
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise AttributeError(f"worker environments take no attributes: {attr_name}")
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        if method_name == "compute_reward":  # of SB3's hindsight replay; its infos are empty
+            rewards = self.workers.compute_rewards(*method_args[:2])
+            return [rewards for _ in self._get_indices(indices)]
+        raise AttributeError(f"worker environments hand out no methods: {method_name}")
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]

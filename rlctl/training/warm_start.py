@@ -1,0 +1,121 @@
+"""`rlctl train TASK --from POLICY`: begins with the weights and the normalisation of a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rlctl.environments import registry
+from rlctl.environments.info import EnvInfo
+from rlctl.errors import UsageError
+from rlctl.policy.network import select_actor_tensors
+from rlctl.policy.policy import PolicyInfo, read_info, read_policy
+from rlctl.policy.shipped import PRETRAINED
+from rlctl.recipe.recipe import Recipe
+from rlctl.run.lookup import find_policy
+
+# They change what the same tensors compute.
+_SAME_FUNCTION = ("activation_fn", "use_sde", "squash_output", "use_expln", "clip_mean", "batch_norm_eps")
+_TARGETS = {"td3": ("actor.", "actor_target."), "ddpg": ("actor.", "actor_target."), "dqn": ("q_net.", "q_net_target.")}
+
+
+def find_source(text: str, recipe: Recipe) -> dict[str, Any]:
+    """Find the policy to begin with, and return what `run.json` says of it as `from`.
+
+    `text` is a run, a policy file, or the name of a task, which stands for the policy that it ships. Raises
+    `UsageError` for an ONNX file and for a policy of another algorithm than the recipe's.
+    """
+    if Path(text).suffix == ".onnx":
+        raise UsageError(f"--from {text}: an ONNX file cannot be trained on; give the run or its .safetensors file")
+    ships = registry.find(text) is not None and not (Path(text) / "run.json").is_file()
+    file = find_policy(text, PRETRAINED if ships else "best").file
+    info = read_info(file)
+    if info.algo != recipe.algo:
+        raise UsageError(
+            f"--from {file}: a policy of {info.algo}, and the recipe trains {recipe.algo}; add --algo {info.algo}, or "
+            "begin with another policy"
+        )
+    return {
+        "policy": str(file.resolve()),
+        "task": info.spec.task,
+        "algo": info.algo,
+        "training_steps": info.training_steps,
+    }
+
+
+def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
+    """Put weights and normalisation of `find_source`'s policy into a model; return a message about it.
+
+    Raises `ArtifactError` for other spaces and `UsageError` for another network or normalisation; they name what
+    differs.
+    """
+    file = Path(source["policy"])
+    info, tensors = read_policy(file)
+    info.check_fits(env, file)
+    weights = {name.removeprefix("policy/"): each for name, each in tensors.items() if name.startswith("policy/")}
+    _check_network(file, info, model, weights)
+    whole = len(select_actor_tensors(info, tensors)) < len(tensors)
+    _load_weights(info, model, weights)
+    _load_normalization(file, info, model, tensors)
+    text = f"begins with {file} ({info.algo}, {info.training_steps:,} steps on {info.spec.task})"
+    if whole:
+        return f"{text}: its actor, critic and normalisation"
+    return (
+        f"{text}: its actor and normalisation; it has no critic, so that a fresh one is learnt, and the first updates "
+        "may lower the score"
+    )
+
+
+def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> None:
+    from rlctl.policy.torch_policy import describe_network
+
+    ours = describe_network(model.policy)
+    network = {name: tuple(each.shape) for name, each in model.policy.state_dict().items()}
+    wrong = [name for name, each in weights.items() if network.get(name) != each.shape]
+    needed = select_actor_tensors(info, dict.fromkeys(f"policy/{name}" for name in network))  # type: ignore[arg-type]
+    wrong += [name for name in (each.removeprefix("policy/") for each in needed) if name not in weights]
+    keys = dict.fromkeys([*info.policy_kwargs, *ours]) if wrong else _SAME_FUNCTION
+    different = [key for key in keys if _as_plain(info.policy_kwargs.get(key)) != _as_plain(ours.get(key))]
+    if not wrong and not different:
+        return
+    parts = [
+        f"policy_kwargs.{key} is {info.policy_kwargs.get(key)} there and {ours.get(key)} here" for key in different
+    ]
+    raise UsageError(f"--from {file}: another network: {'; '.join(parts) or f'tensor {wrong[0]} differs'}")
+
+
+def _as_plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _load_weights(info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> None:
+    import torch
+
+    state = {name: torch.from_numpy(each.copy()) for name, each in weights.items()}
+    actor, target = _TARGETS.get(info.algo, ("", ""))
+    if actor and not any(name.startswith(target) for name in state):
+        state |= {target + name.removeprefix(actor): each for name, each in state.items() if name.startswith(actor)}
+    model.policy.load_state_dict(state, strict=False)  # what may be missing is the critic
+
+
+def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mapping[str, Any]) -> None:
+    from rlctl.training.snapshot import observation_statistics
+
+    normalizer = model.get_vec_normalize_env()
+    statistics = observation_statistics(normalizer)
+    if list(statistics) != info.normalized_keys:
+        there, here = ("normalises" if each else "does not normalise" for each in (info.normalized_keys, statistics))
+        raise UsageError(
+            f"--from {file}: it {there} observations, and the recipe {here} them; "
+            f"add --set normalize.observation={str(bool(info.normalized_keys)).lower()}"
+        )
+    if statistics and normalizer.clip_obs != info.clip_observation:
+        raise UsageError(
+            f"--from {file}: it clips observations at {info.clip_observation:g}, the recipe at "
+            f"{normalizer.clip_obs:g}; add --set normalize.clip_observation={info.clip_observation:g}"
+        )
+    for key, each in statistics.items():
+        each.mean[...] = tensors[f"normalize/{key}/mean"]
+        each.var[...] = tensors[f"normalize/{key}/var"]
+        each.count = max(float(info.training_steps), 1.0)  # observations seen; new ones count as much as each of them

@@ -1,0 +1,187 @@
+"""A step of a tuning: Optuna proposes values, a training tries them, and those that fall behind are stopped."""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+from typing import Any
+
+import optuna
+from optuna.trial import TrialState
+
+from rlctl.environments.spec import merge
+from rlctl.errors import UsageError
+from rlctl.storage import files
+from rlctl.training.request import TrainRequest
+from rlctl.training.seeds import list_options
+from rlctl.training.trainings import Trainings
+from rlctl.tuning.space import get_value, nest
+from rlctl.tuning.tuning import Trial, Tuning, find_best
+
+_RANDOM_SHARE = 3  # a third of a step's trials are random, so that there is something to learn from
+_EVALUATIONS_UNJUDGED = 2
+_TRIALS_UNJUDGED = 3
+_MOST_REPEATS = 50
+_STATES = {"done": TrialState.COMPLETE, "pruned": TrialState.PRUNED, "failed": TrialState.FAIL}
+
+optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+
+class StepSearch:
+    """Searches the dimensions of one step; what earlier steps found is kept. Several threads may `run_next`."""
+
+    def __init__(self, tuning: Tuning, number: int, recipe: dict[str, Any], trainings: Trainings) -> None:
+        """Begin, or go on with, step `number`, from 1. `recipe` is the task's, with defaults, as plain data."""
+        self._tuning, self._number, self._trainings = tuning, number, trainings
+        self._dimensions = tuning.steps[number - 1]
+        self._distributions = {each.key: each.make_distribution() for each in self._dimensions}
+        best = find_best([each for each in tuning.trials if each.step < number])
+        assert best is not None  # the recipe as it is
+        self._recipe, self._kept = recipe, best.values
+        self._study = optuna.create_study(
+            direction="maximize",
+            sampler=optuna.samplers.TPESampler(
+                seed=tuning.seed + number, n_startup_trials=max(2, tuning.trials_per_step // _RANDOM_SHARE)
+            ),
+            pruner=optuna.pruners.MedianPruner(0, n_warmup_steps=_EVALUATIONS_UNJUDGED, n_min_trials=_TRIALS_UNJUDGED),
+        )
+        self._lock = threading.Lock()
+        own = [each for each in tuning.trials if each.step == number]
+        self._begun = [each for each in own if each.state == "begun"]
+        # What the best so far has of these dimensions is known already.
+        for trial in (best, *(each for each in own if each.state != "begun")):
+            self._add(trial)
+
+    def count_waiting(self) -> int:
+        """Return how many trials are still to be trained, those that were begun included."""
+        sizes = [len(each.choices) or math.inf for each in self._dimensions]
+        most = min(self._tuning.trials_per_step, math.prod(sizes) - 1)  # the best so far has one of them
+        finished = [each for each in self._tuning.trials if each.step == self._number and each.state != "begun"]
+        return max(0, int(most) - len(finished))
+
+    def run_next(self) -> None:
+        """Train the next trial, and say what came of it."""
+        if self._trainings.stopped_by is not None:
+            return
+        with self._lock:
+            proposal = self._propose()
+        if proposal is not None:
+            trial, asked = proposal
+            train(self._tuning, trial, self._trainings, _Pruning(self._tuning, trial, asked))
+            with self._lock:
+                if trial.state != "begun":
+                    self._study.tell(asked, trial.score if trial.state == "done" else None, _STATES[trial.state])
+                self._tuning.save()
+
+    def _propose(self) -> tuple[Trial, optuna.Trial] | None:
+        """Return a trial and Optuna's; None where all that Optuna proposes has been tried."""
+        if self._begun:
+            trial = self._begun.pop(0)
+            self._study.enqueue_trial(self._list_drawn(trial))
+            return trial, self._study.ask(self._distributions)
+        for _ in range(_MOST_REPEATS):
+            asked = self._study.ask(self._distributions)
+            drawn = {each.key: each.to_value(asked.params[each.key]) for each in self._dimensions}
+            values = {**self._kept, **drawn}
+            values = {key: value for key, value in values.items() if value != get_value(self._recipe, key)}
+            known = next((each for each in self._tuning.trials if each.values == values), None)
+            if known is None:
+                trial = Trial(len(self._tuning.trials), self._number, values)
+                self._tuning.trials.append(trial)
+                self._tuning.save()
+                return trial, asked
+            # A training more of the same would tell little; Optuna is told what came of the first.
+            state = _STATES.get(known.state, TrialState.FAIL)
+            self._study.tell(asked, known.score if state == TrialState.COMPLETE else None, state)
+        return None
+
+    def _list_drawn(self, trial: Trial) -> dict[str, Any]:
+        """Return what Optuna would have drawn for a trial; None for a value that it never draws."""
+        content = merge(self._recipe, nest(trial.values))
+        return {each.key: each.from_value(get_value(content, each.key)) for each in self._dimensions}
+
+    def _add(self, trial: Trial) -> None:
+        """Let Optuna know of a trial that has ended, if it could have drawn its values."""
+        drawn = self._list_drawn(trial)
+        if None in drawn.values():
+            return
+        state = _STATES[trial.state]
+        self._study.add_trial(
+            optuna.trial.create_trial(
+                state=state,
+                value=trial.score if state == TrialState.COMPLETE else None,
+                params=drawn,
+                distributions=self._distributions,
+                intermediate_values=dict(enumerate(self._tuning.list_scores(trial))),
+            )
+        )
+
+
+class _Pruning:
+    """Whether a trial is so far behind the others that it is not worth its time: asked while it trains."""
+
+    def __init__(self, tuning: Tuning, trial: Trial, asked: optuna.Trial) -> None:
+        self._tuning, self._trial, self._asked = tuning, trial, asked
+        self._reported = 0
+        self.decided = False
+
+    def is_hopeless(self) -> bool:
+        """Report the evaluations since the last call; decide."""
+        scores = self._tuning.list_scores(self._trial)
+        for number in range(self._reported, len(scores)):
+            self._asked.report(scores[number], number)
+            self.decided = self.decided or self._asked.should_prune()
+        self._reported = len(scores)
+        return self.decided
+
+
+def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning | None = None) -> None:
+    """Train a trial, or go on with it, and write down how it ended; after a signal it is left as begun.
+
+    Without `pruning` raises `UsageError` as soon as an evaluation does not have the metric.
+    """
+    lines: list[str] = []
+
+    def lacks_metric() -> bool:
+        return bool(tuning.list_scores(trial, "return")) and not tuning.list_scores(trial)
+
+    def receive(line: str) -> None:
+        lines.append(line)
+        if line.startswith("error: interrupted"):
+            behind = "stopped: below the median of the other trials" if pruning else f"stopped: no {tuning.metric}"
+            line = behind if trainings.stopped_by is None else "interrupted"
+        print(f"trial {trial.number}: {line}", file=sys.stderr, flush=True)
+
+    changes = [f"{key.rpartition('.')[2]}={value}" for key, value in trial.values.items()]
+    print(f"trial {trial.number}: {', '.join(changes) or 'the recipe as it is'}", file=sys.stderr, flush=True)
+    code = trainings.train(_make_arguments(tuning, trial), receive, pruning.is_hopeless if pruning else lacks_metric)
+    if pruning is None and lacks_metric():
+        raise UsageError(f"--metric {tuning.metric}: this task reports no success (no is_success); use --metric return")
+    run = tuning.find_run(trial)
+    finished = run is not None and run.status().get("status") == "finished"
+    if code == 0 and finished:
+        trial.score = tuning.measure(trial)
+        trial.state = "done" if trial.score is not None else "failed"
+        trial.problem = "" if trial.score is not None else f"no evaluation has a {tuning.metric}: is it reported?"
+    elif trainings.stopped_by is not None:
+        return
+    elif pruning is not None and pruning.decided:
+        trial.state, trial.score = "pruned", tuning.measure(trial)
+    else:
+        errors = [line for line in lines if line.startswith("error: ")] or [f"error: exit code {code}", *lines[-1:]]
+        trial.state, trial.problem = "failed", errors[0].removeprefix("error: ")
+    if run is not None:
+        # Replay buffers of dozens of trainings that nobody goes on with; their policies stay.
+        files.remove_tree(run.checkpoint(0).parent)
+
+
+def _make_arguments(tuning: Tuning, trial: Trial) -> list[str]:
+    run = tuning.find_run(trial)
+    if run is not None and run.checkpoints():
+        return ["train", "--resume", str(run.path)]
+    settings = merge(tuning.settings, nest(trial.values))
+    # The recipe as it is has had the environment checked.
+    request = TrainRequest(tuning.task, config=tuning.config, settings=settings, check=trial.number == 0)
+    seed = tuning.seed + trial.number
+    return ["train", tuning.task, *list_options(request), f"--seed={seed}", "--output", str(tuning.path)]

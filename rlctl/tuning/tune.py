@@ -1,0 +1,158 @@
+"""`rlctl tune TASK`: hyperparameters for a task, a few at a time, by trainings that are compared.
+
+A ladder as practitioners climb it: the learning rate first, then rollout and minibatch, then the discount; each step
+keeps the best so far. Values are proposed by TPE (Bergstra et al. 2011, https://papers.nips.cc/paper/4443), and trials
+that are below the median of the others at the same evaluation are stopped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rlctl import output
+from rlctl.environments.spec import merge
+from rlctl.errors import TaskError, UsageError
+from rlctl.recipe.hyperparameters import ON_POLICY
+from rlctl.recipe.recipe import Recipe
+from rlctl.recipe.sources import find_config, resolve_with_stages
+from rlctl.run.directory import ROOT, RunLock, create_group_folder
+from rlctl.training.start import preserve_process_state
+from rlctl.training.trainings import Trainings, choose_jobs
+from rlctl.tuning.space import Dimension, fill_parameters, list_usual_steps, nest, parse_search
+from rlctl.tuning.tuning import Metric, Trial, Tuning, load
+
+_FEWEST_EVALUATIONS = 6
+_EVALUATIONS = 10
+_OF_THE_RETURN = ("task", "reward_weights", "events", "randomize")
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneRequest:
+    """The arguments of `rlctl tune`."""
+
+    task: str
+    config: Path | None = None
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    search: Sequence[str] = ()
+    """`KEY=LOW:HIGH` or `KEY=A,B,C`, all searched together; none: the usual ladder."""
+    trials: int = 8
+    """Per step of the ladder."""
+    metric: Metric = "return"
+    root: Path = ROOT
+
+
+def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
+    """Search hyperparameters; return every trial.
+
+    Raises `UsageError` without optuna, or for a search that is none; `RecipeError` for values that a recipe cannot
+    have; `TaskError` if the recipe as it is cannot be trained; `Interrupted` after a signal.
+    """
+    _require_optuna()
+    with preserve_process_state():
+        recipe = resolve_with_stages(request.task, request.config, request.settings)
+    steps = [parse_search(request.search)] if request.search else list_usual_steps(recipe)
+    for dimension in (each for step in steps for each in step):
+        _check(dimension, request)
+    tuning = Tuning(
+        path=create_group_folder(request.task, "tune", request.root),
+        task=request.task,
+        config=None if request.config is None else find_config(request.config).absolute(),
+        settings=_evaluate_often_enough(recipe, request.settings),
+        metric=request.metric,
+        trials_per_step=request.trials,
+        seed=recipe.seed,
+        steps=steps,
+    )
+    tuning.save()
+    with RunLock(tuning.path):
+        return _search(tuning, jobs)
+
+
+def resume(path: Path, *, jobs: int | None = None) -> Tuning:
+    """Go on with a tuning; trials that were interrupted go on where they stopped."""
+    _require_optuna()
+    load(path)  # before a lock is written into a folder that is none
+    with RunLock(path):
+        return _search(load(path), jobs)
+
+
+def _require_optuna() -> None:
+    try:
+        import optuna  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise UsageError(f"rlctl tune needs {error.name}: pip install 'rlctl[tune]'") from None
+
+
+def _check(dimension: Dimension, request: TuneRequest) -> None:
+    """Raise `UsageError` for a key that cannot be searched, and `RecipeError` for a value that it cannot have."""
+    first = dimension.key.partition(".")[0]
+    if dimension.key in ("seed", "total_timesteps", "stop_success") or first in ("eval", "checkpoint"):
+        raise UsageError(
+            f"--search {dimension.key}: no hyperparameter; it would be the same policy, measured otherwise"
+        )
+    if first in _OF_THE_RETURN and request.metric == "return":
+        raise UsageError(
+            f"--search {dimension.key}: it changes what is trained for, so that returns are not comparable; "
+            "give --metric success"
+        )
+    for value in dimension.ends():
+        resolve_with_stages(request.task, request.config, merge(request.settings, nest({dimension.key: value})))
+
+
+def _evaluate_often_enough(recipe: Recipe, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings, with evaluations more often where too few would come to compare trials by."""
+    every = recipe.eval.every_steps or recipe.total_timesteps
+    if recipe.total_timesteps // every >= _FEWEST_EVALUATIONS:
+        return dict(settings)
+    return merge(settings, {"eval": {"every_steps": max(1, recipe.total_timesteps // _EVALUATIONS)}})
+
+
+def _search(tuning: Tuning, jobs: int | None) -> Tuning:
+    # It imports optuna, which may not be there.
+    from rlctl.tuning.search import StepSearch, train
+
+    to_go_on = f"rlctl tune --resume {shlex.quote(str(tuning.path))}"
+    with preserve_process_state():
+        recipe = resolve_with_stages(tuning.task, tuning.config, tuning.settings)
+    output.print_notes([_describe(tuning, recipe, jobs), *_warn_of_long_rollouts(recipe)])
+    if not tuning.trials:
+        tuning.trials.append(Trial(0, 0, {}))
+    first = tuning.trials[0]
+    if first.state in ("begun", "failed"):
+        trainings = Trainings(1)
+        trainings.run([lambda: train(tuning, first, trainings)], to_go_on)
+        tuning.save()
+        if first.state == "failed":
+            raise TaskError(f"{tuning.path}: the recipe as it is failed: {first.problem}")
+    content = recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
+    for number in range(1, len(tuning.steps) + 1):
+        trainings = Trainings(choose_jobs(jobs, tuning.trials_per_step))
+        step = StepSearch(tuning, number, content, trainings)
+        trainings.run([step.run_next] * step.count_waiting(), to_go_on)
+    return tuning
+
+
+def _warn_of_long_rollouts(recipe: Recipe) -> list[str]:
+    rollout = int(fill_parameters(recipe)["n_steps"]) * recipe.n_envs
+    if recipe.algo not in ON_POLICY or rollout * _FEWEST_EVALUATIONS <= recipe.total_timesteps:
+        return []
+    evaluations = output.format_count(math.ceil(recipe.total_timesteps / rollout), "evaluation")
+    return [
+        f"warning: a trial is judged by {evaluations}, which come between rollouts, of {rollout:,} steps here "
+        "(n_steps x n_envs); -n makes it longer"
+    ]
+
+
+def _describe(tuning: Tuning, recipe: Recipe, jobs: int | None) -> str:
+    names = "; then ".join(" and ".join(each.name for each in step) for step in tuning.steps)
+    at_a_time = choose_jobs(jobs, tuning.trials_per_step)
+    return (
+        f"{tuning.path}: {names}; at most {output.format_count(tuning.trials_per_step, 'trial')} "
+        f"{'each, ' if len(tuning.steps) > 1 else ''}of {recipe.total_timesteps:,} steps, {at_a_time} at a time; "
+        "-n makes them shorter, --trials fewer, --jobs more at a time"
+    )

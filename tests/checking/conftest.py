@@ -1,0 +1,32 @@
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rlctl.checking.families import episodes
+
+pytest.register_assert_rewrite("tests.checking.judging")
+
+
+@pytest.fixture(autouse=True)
+def _cut_endless_episodes(monkeypatch):
+    """Cut episodes that do not end as soon as that is judged, by steps: how many there is time for differs."""
+    monkeypatch.setattr(episodes, "ENDLESS_STEPS", episodes.ENOUGH_STEPS)
+    monkeypatch.setattr(episodes, "LATER_ENDLESS_STEPS", 100)
+
+
+@pytest.fixture
+def busy():
+    """Three processes that keep a processor busy, which this process shares with them."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    code = "print('begun', flush=True)\nwhile True: pass"
+    processes = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) for _ in range(3)]
+    for each in processes:
+        assert each.stdout.readline() == b"begun\n"
+    yield processes
+    os.sched_setaffinity(0, before)
+    for each in processes:
+        each.kill()
+        each.communicate()

@@ -1,0 +1,114 @@
+"""Judges an environment in this process, and the cases that every rule has: one that breaks it, one that does not."""
+
+import dataclasses
+import functools
+import sys
+from pathlib import Path
+from typing import Any
+
+import pybullet
+
+from rlctl.checking import child, families
+from rlctl.checking.bullet_worlds import find_clients
+from rlctl.checking.check import judge
+from rlctl.checking.finding import RULES
+from rlctl.checking.records import Records
+from rlctl.environments.spec import EnvSpec
+
+FOLDER = Path(__file__).parent
+SECONDS = 10 * families.PROCESS_S
+"""For the experiments of a process: a slow machine judges as a fast one does."""
+sys.dont_write_bytecode = False  # each experiment imports its environment's file anew
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A mistake: what is found in an environment that makes it, and a twin that does not make it."""
+
+    broken: str
+    """`file.py:Class` in this folder, or any other task."""
+    expected: frozenset[tuple[str, str]]
+    """Every finding: rule and severity."""
+    twin: str = "broken_envs.py:Clean"
+
+    @property
+    def rules(self) -> tuple[str, ...]:
+        return tuple(sorted(rule for rule, _ in self.expected))
+
+
+def case(broken: str, *expected: tuple[str, str], **settings: Any) -> Case:
+    return Case(broken, frozenset(expected), **settings)
+
+
+def records_of(task, *experiments):
+    """What some experiments find out, or all."""
+    records = Records(_path(task))
+    for name, process in families.PROCESSES.items():
+        wanted = [each.name for each in process.experiments if not experiments or each.name in experiments]
+        for message in _run(task, name, wanted):
+            records.add(message)
+    return records
+
+
+def shared_records_of(task, *experiments):
+    """What some experiments find out, each in a process of its own, and once for all tests: many have one twin."""
+    records = Records(_path(task))
+    for experiment in families.EXPERIMENTS:
+        if experiment == "build" or (experiment in experiments and records.built):
+            for message in _play(task, experiment):
+                records.add(message)
+    return records
+
+
+@functools.cache
+def _play(task, experiment):
+    (process,) = [
+        name for name, each in families.PROCESSES.items() if families.EXPERIMENTS[experiment] in each.experiments
+    ]
+    return _run(task, process, [experiment])
+
+
+def _run(task, process, experiments):
+    """Run experiments of a process, which begins with nothing that an earlier one left."""
+    for client in find_clients():  # of an environment that was not closed
+        pybullet.disconnect(client)
+    for module in [module for module in sys.modules if module.startswith("broken_")]:
+        del sys.modules[module]
+    return list(child.run(process, EnvSpec(_path(task)), experiments, SECONDS)) if experiments else []
+
+
+def _path(task):
+    return str(FOLDER / task) if ".py:" in task else task
+
+
+def verdict_of(task, *rules):
+    """The verdict by some rules, from the experiments that they need; or by all, from one process after the other."""
+    records = shared_records_of(task, *families.find_needs(rules)) if rules else _whole(task)
+    verdict = judge(records, rules or tuple(RULES))
+    assert verdict.crashed == {}
+    return verdict
+
+
+@functools.cache
+def _whole(task):
+    return records_of(task)
+
+
+def findings(task, *rules):
+    return verdict_of(task, *rules).findings
+
+
+def found(task, *rules):
+    return {(finding.rule, str(finding.severity)) for finding in findings(task, *rules)}
+
+
+def rules_of(family):
+    """The rules of a family."""
+    return [rule for rule in RULES if rule.startswith(family)]
+
+
+def check_case(case):
+    """The mistake is found by its rules, and nothing by them in the twin. That no other rule finds anything in it is
+    tested in test_all_rules.py."""
+    assert found(case.broken, *case.rules) == case.expected
+    assert found(case.twin, *case.rules) == set()

@@ -1,0 +1,80 @@
+"""Actions that do nothing."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from rlctl.checking.action_trials import find_dimensions
+from rlctl.checking.leaves import find_leaves
+from tests.checking.judging import case, check_case, findings, found, rules_of, verdict_of
+
+FILE = "broken_actions.py"
+CASES = [
+    case(f"{FILE}:DeadAction", ("RL701", "warning"), twin=f"{FILE}:LateAction"),
+    case(f"{FILE}:NoAction", ("RL701", "error")),
+    case(f"{FILE}:DeadChoice", ("RL701", "error"), twin=f"{FILE}:Choice"),
+    case(f"{FILE}:CostlyAction", ("RL701", "warning"), twin=f"{FILE}:HiddenAction"),
+    case(f"{FILE}:CopiedAction", ("RL701", "info")),
+]
+CLEAN = [f"{FILE}:Switch"]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+def test_actions_are_not_judged_where_step_returns_nothing_to_read():
+    verdict = verdict_of("broken_actions.py:ReturnsNothing", "RL701")
+    assert verdict.findings == []
+    assert "(RL201)" in verdict.not_judged["RL701"]
+
+
+@pytest.mark.parametrize("task", CLEAN)
+def test_clean_is_clean(task):
+    assert found(task, *rules_of("RL7")) == set()
+
+
+def the_finding(name, rule):
+    (finding,) = findings(f"{FILE}:{name}", rule)
+    return finding
+
+
+def test_dead_actions_are_named():
+    finding = the_finding("DeadAction", "RL701")
+    assert finding.message == (
+        "action[1] without any effect: at its lowest and highest value, over 60 steps from two seeds, no observation, "
+        "reward or end changes"
+    )
+    assert finding.evidence == {
+        "value": ["action[1]"],
+        "seed": 1000,
+        "seeds": [1000, 1001],
+        "steps": 60,
+    }
+    assert the_finding("NoAction", "RL701").message.startswith("no action has any effect: at its lowest")
+
+
+def test_a_first_episode_unlike_the_others_hides_nothing():
+    assert the_finding("DeadLater", "RL701").evidence["value"] == ["action[1]"]
+
+
+def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
+    finding = the_finding("Watched", "RL701")
+    assert finding.message.startswith("action[0], action[1] changes nothing but its own step's reward")
+    assert finding.severity == "info"
+
+
+def test_what_is_not_repeatable_is_not_judged():
+    verdict = verdict_of("broken_repeats.py:NoisyStep", "RL701")
+    assert verdict.not_judged["RL701"] == "equal seeds and actions give unequal episodes (RL3)"
+
+
+def test_ends_of_whole_numbers_are_whole_numbers():
+    """As floats, those of 64 bits would not fit into the action."""
+    for dtype in (np.int64, np.uint64):
+        bounds = np.iinfo(dtype)
+        (dimension,) = find_dimensions(find_leaves(spaces.Box(bounds.min, bounds.max, (1,), dtype)))
+        assert dimension.ends == (bounds.min, bounds.max)
+    (unbounded,) = find_dimensions(find_leaves(spaces.Box(-np.inf, 5.0, (), np.float32)))
+    assert unbounded.ends == (-1.0, 5.0)

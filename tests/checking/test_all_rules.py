@@ -1,0 +1,24 @@
+"""Every case of the other files by all rules: no rule but the expected finds anything. Minutes; hence slow."""
+
+from importlib import import_module
+
+import pytest
+
+from tests.checking.judging import FOLDER, found
+
+MODULES = [import_module(f"tests.checking.{file.stem}") for file in sorted(FOLDER.glob("test_*.py"))]
+CASES = [case for module in MODULES for case in getattr(module, "CASES", [])]
+CLEAN = [task for module in MODULES for task in getattr(module, "CLEAN", [])]
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    assert found(case.broken) == case.expected
+    assert not {rule for rule, _ in found(case.twin)} & set(case.rules)
+
+
+@pytest.mark.parametrize("task", CLEAN)
+def test_clean_is_clean(task):
+    assert found(task) == set()

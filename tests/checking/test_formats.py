@@ -1,0 +1,275 @@
+"""What comes out: text, JSON, SARIF and annotations, and what can be chosen: rules, waivers, strictness."""
+
+import dataclasses
+import json
+import os
+import re
+import sys
+from pathlib import Path
+
+import jsonschema
+import pydantic
+import pytest
+import sarif_pydantic
+from gymnasium import spaces
+
+from rlctl.checking import families
+from rlctl.checking.check import Report, Verdict, judge
+from rlctl.checking.finding import FAMILIES, RULES, choose_rules, find_rule
+from rlctl.checking.formats import FORMATS, choose, github, plain, rules, sarif, structured
+from rlctl.checking.leaves import find_leaves
+from rlctl.checking.messages import Built
+from rlctl.checking.records import Records
+from rlctl.errors import UsageError
+from tests import fork_server
+from tests.checking.judging import records_of
+
+ROOT = Path(__file__).parent.parent.parent
+HERE = "tests/checking"
+
+
+PROBE = [each.name for each in families.PROCESSES["probe"].experiments]
+
+
+def report_of(task, rules=tuple(RULES), experiments=None):
+    records = records_of(task, *(experiments or {"build", *families.find_needs(rules)}))
+    return Report(task, judge(records, rules), records, 1.0, 20.0)
+
+
+def test_arrays_without_elements_have_no_row():
+    leaves = find_leaves(spaces.Dict(nothing=spaces.Box(-1, 1, (0,)), some=spaces.Box(-1, 1, (2,))))
+    records = Records("any", Built(leaves, leaves, "", ""))
+    assert [row.name for row in structured.observation_rows(records)] == ["observation['some']"]
+    assert [row.name for row in structured.action_rows(records)] == ["action['some']"]
+
+
+def rlctl(*arguments, folder=ROOT, **environment):
+    command = [sys.executable, "-m", "rlctl", "check-env", *arguments]
+    variables = {**os.environ, **environment}
+    return fork_server.for_commands().run(command, cwd=folder, timeout=250, env=variables)
+
+
+@pytest.fixture(scope="module")
+def broken():
+    return report_of("broken_envs.py:NanReward", experiments=PROBE)
+
+
+@pytest.fixture(scope="module")
+def unbuilt():
+    return report_of("broken_loading.py:NoFile", experiments=["build"])
+
+
+@pytest.fixture(scope="module")
+def waiving():
+    return report_of("broken_waivers.py:Wide", ["RL106"])
+
+
+@pytest.fixture(scope="module")
+def crashed():
+    return Report("any", Verdict(crashed={"RL999": "Traceback ..."}), Records("any"), 1.0, 20.0)
+
+
+@pytest.fixture(params=["broken", "unbuilt", "waiving", "crashed"])
+def report(request):
+    return request.getfixturevalue(request.param)
+
+
+def test_every_report_fits_the_schema(report):
+    schema = json.loads(structured.SCHEMA.read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(json.loads(structured.text(report)), schema)
+
+
+def test_the_schema_refuses_what_is_no_report(broken):
+    schema = json.loads(structured.SCHEMA.read_text())
+    for change in ({"exit_code": 2}, {"extra": 1}, {"findings": [{"rule": "RL1"}]}, {"speed": {}}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate({**structured.content(broken), **change}, schema)
+
+
+NOT_IN_THE_VALIDATOR = {"exitCode", "suppressions", "toolExecutionNotifications"}
+"""Keys of SARIF 2.1.0 (its sections 3.20.7, 3.27.23 and 3.20.21) that the validator's models lack."""
+
+
+def extras(model):
+    """Every key that SARIF does not have, which the validator lets pass."""
+    if isinstance(model, pydantic.BaseModel):
+        found = set(model.model_extra or {})
+        return found.union(*(extras(value) for _, value in model))
+    if isinstance(model, (list, dict)):
+        return set().union(*(extras(each) for each in (model.values() if isinstance(model, dict) else model)))
+    return set()
+
+
+def test_every_report_is_valid_sarif(report):
+    log = sarif_pydantic.Sarif.model_validate_json(sarif.text(report))
+    assert extras(log) <= NOT_IN_THE_VALIDATOR
+    assert log.version == "2.1.0"
+    (run,) = log.runs
+    assert [result.rule_id for result in run.results or []] == [
+        each.rule for each in (*report.verdict.findings, *report.verdict.waived)
+    ]
+    for result in run.results or []:
+        assert run.tool.driver.rules[result.rule_index].id == result.rule_id
+    assert run.invocations[0].execution_successful is (not report.verdict.crashed)
+
+
+def test_sarif_places_a_finding_at_the_class(broken):
+    result = json.loads(sarif.text(broken))["runs"][0]["results"][0]
+    place = result["locations"][0]["physicalLocation"]
+    file = ROOT / HERE / "broken_envs.py"
+    assert file.as_uri().endswith(place["artifactLocation"]["uri"])
+    assert file.read_text().splitlines()[place["region"]["startLine"] - 1] == "class NanReward(Clean):"
+    assert result["level"] == "error"
+
+
+def test_sarif_tells_what_is_waived_and_why(waiving):
+    (result,) = json.loads(sarif.text(waiving))["runs"][0]["results"]
+    assert result["suppressions"] == [
+        {"kind": "inSource", "justification": "the actions are Newtons, as the real motor has them"}
+    ]
+
+
+def test_annotations_point_at_the_class(broken, monkeypatch):
+    monkeypatch.setenv("GITHUB_WORKSPACE", str(ROOT))
+    line, last = github.text(broken).splitlines()
+    assert re.match(
+        r"::error file=tests/checking/broken_envs.py,line=\d+,title=RL601 reward not finite::"
+        r"the reward is nan at step 13%0Afix: ",
+        line,
+    )
+    assert last.startswith("broken_envs.py:NanReward: 1 error; ") or "NanReward: 1 error" in last
+
+
+def test_annotations_escape_what_would_end_them(broken):
+    assert github._property("50 %: a, b\n") == "50 %25%3A a%2C b%0A"
+    assert github._data("50 %: a, b\n") == "50 %25: a, b%0A"
+
+
+def test_outside_the_repository_there_is_no_place_to_annotate(broken, monkeypatch, tmp_path):
+    monkeypatch.setenv("GITHUB_WORKSPACE", str(tmp_path))
+    assert github.text(broken).startswith("::error title=RL601")
+
+
+def test_text_has_the_finding_its_numbers_and_its_fix(broken):
+    text = plain.text(broken)
+    assert text.startswith("error RL601  reward not finite\n  the reward is nan at step 13\n  seed 1000, episode 0, ")
+    assert "\n  fix: Find the division, logarithm or diverging simulation behind it.\n" in text
+    assert "\x1b" not in text
+
+
+def test_waived_findings_are_listed_with_the_reason_and_do_not_count(waiving):
+    assert waiving.verdict.findings == []
+    assert [finding.rule for finding in waiving.verdict.waived] == ["RL106"]
+    assert (
+        "waived RL106 (2 of 2 actions are not in [-1, 1]: action[0] is in [-2, 2]): the actions are Newtons"
+        in plain.text(waiving)
+    )
+    assert ", 1 waived; " in plain.summary(waiving)
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("NoReason", "RL106 is waived without a reason"),
+        ("NoSuchRule", r"no rule 'RL1006'. Did you mean 'RL106'\?"),
+        ("NoDictionary", r"no rule \"\('RL106',\)\""),
+    ],
+)
+def test_a_waiver_that_is_none_is_refused(task, message):
+    with pytest.raises(UsageError, match=message):
+        report_of(f"broken_waivers.py:{task}", ["RL106"])
+
+
+def test_strict_counts_warnings():
+    report = report_of("broken_repeats.py:UnseededLater", ["RL308"])
+    assert report.exit_code == 0
+    assert dataclasses.replace(report, strict=True).exit_code == 1
+
+
+def test_a_crash_wins(crashed):
+    assert crashed.exit_code == 70
+
+
+def test_rules_are_chosen_by_family_and_id():
+    assert {rule[:3] for rule in choose_rules(["RL3"])} == {"RL3"}
+    assert choose_rules(["rl301,RL501"]) == ["RL301", "RL501"]
+    assert "RL106" not in choose_rules([], ["RL106"])
+    assert choose_rules() == list(RULES)
+    with pytest.raises(UsageError, match=r"--select RL35: no such rule. Did you mean 'RL3"):
+        choose_rules(["RL35"])
+    with pytest.raises(UsageError, match="leave no rule"):
+        choose_rules(["RL301"], ["RL3"])
+
+
+def test_unchosen_rules_cost_nothing_and_say_nothing(broken):
+    verdict = judge(broken.records, choose_rules(["RL3"]))
+    assert verdict.findings == []
+    assert {*verdict.judged, *verdict.not_judged} >= set(choose_rules(["RL3"]))
+    assert not any(rule.startswith("RL6") for rule in verdict.judged)
+
+
+def test_rules_are_found_by_id_in_any_case():
+    assert find_rule("rl304").id == "RL304"
+    with pytest.raises(UsageError, match=r"no rule 'RL3'. The family has: RL301, "):
+        find_rule("RL3")
+
+
+def test_formats_that_do_not_go_together():
+    assert choose(None, None, None) == ("text", None)
+    assert choose(None, None, "-") == ("json", "-")
+    assert choose("sarif", "x.sarif", None) == ("sarif", "x.sarif")
+    assert set(FORMATS) == {"text", "json", "sarif", "github"}
+    with pytest.raises(UsageError, match="--json FILE is --format json"):
+        choose("sarif", None, "-")
+
+
+def test_command_lists_rules_without_a_task():
+    run = rlctl("--list")
+    assert run.returncode == 0
+    for rule in RULES.values():
+        assert f"{rule.id}  {rule.severity}" in run.stdout
+    for title in FAMILIES.values():
+        assert title in run.stdout
+
+
+def test_command_explains_a_rule_without_a_task():
+    run = rlctl("--explain", "RL304")
+    assert run.returncode == 0
+    assert run.stdout.startswith("RL304  a new instance differs\nerror, determinism\n")
+    assert "fix: " in run.stdout
+    assert rlctl("--explain", "RL9999").returncode == 2
+    assert rlctl().returncode == 2
+
+
+def test_command_writes_a_file_whole_and_says_so(tmp_path):
+    file = tmp_path / "report.sarif"
+    run = rlctl(f"{HERE}/broken_envs.py:NanReward", "--select", "RL601", "--format", "sarif", "-o", str(file))
+    assert (run.returncode, run.stdout) == (1, "")
+    assert run.stderr.rstrip().endswith(f"written to {file}")
+    assert sarif_pydantic.Sarif.model_validate_json(file.read_text()).runs[0].results[0].rule_id == "RL601"
+
+
+@pytest.mark.parametrize("form", sorted(FORMATS))
+def test_every_format_says_why_nothing_could_be_built(form, unbuilt):
+    assert unbuilt.exit_code == 3
+    assert "RL007" in FORMATS[form](unbuilt)
+    assert "gains.yaml" in FORMATS[form](unbuilt)
+
+
+def test_command_says_why_nothing_could_be_built():
+    run = rlctl(f"{HERE}/broken_loading.py:NoFile", "--format", "github")
+    assert run.returncode == 3
+    assert run.stdout.startswith("::error ")
+    assert "RL007" in run.stdout
+
+
+def test_command_refuses_a_waiver_without_a_reason():
+    run = rlctl(f"{HERE}/broken_waivers.py:NoReason", "--select", "RL106")
+    assert (run.returncode, run.stdout) == (2, "")
+    assert "RL106 is waived without a reason" in run.stderr
+
+
+def test_the_page_of_the_rules_is_current():
+    page = (ROOT / "docs" / "rules.md").read_text()
+    assert page == rules.render_page(), "write it again: python -m rlctl.checking.formats.rules > docs/rules.md"

@@ -1,0 +1,93 @@
+"""Attributes, pictures, windows, and ends of episodes."""
+
+from pathlib import Path
+
+import pytest
+
+from rlctl.checking.check import check
+from rlctl.environments.spec import EnvSpec
+from tests.checking.judging import case, check_case, findings, verdict_of
+
+FILE = "broken_interface.py"
+CASES = [
+    case(f"{FILE}:NewSpaces", ("RL404", "warning")),
+    case(f"{FILE}:TakesNoMode", ("RL215", "warning"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:RenderRaises", ("RL215", "warning"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:RenderNeedsGraphics", ("RL215", "info"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:RenderFloats", ("RL215", "warning"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:RenderNothing", ("RL215", "warning"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:Falls", ("RL506", "warning"), twin=f"{FILE}:FallsInTime"),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+def messages(name, rule):
+    return [each.message for each in findings(f"{FILE}:{name}", rule)]
+
+
+def test_a_space_that_is_made_anew_is_named():
+    assert messages("NewSpaces", "RL404") == [
+        "action_space is a new object each time it is read, so that seeding it has no effect"
+    ]
+
+
+def test_pictures_are_told():
+    (message,) = messages("RenderFloats", "RL215")
+    assert message == (
+        "with render_mode='rgb_array' render returns an array of float64 and shape (20, 30, 3), not a uint8 array of "
+        "shape (height, width, 3)"
+    )
+    (message,) = messages("TakesNoMode", "RL215")
+    assert message.startswith("metadata promises the render mode rgb_array, but ")
+    assert message.endswith("takes no render_mode")
+    (message,) = messages("RenderNothing", "RL215")
+    assert message.startswith("with render_mode='rgb_array' render returns a NoneType")
+
+
+def test_a_library_that_is_not_installed_is_not_the_environments_fault():
+    verdict = verdict_of(f"{FILE}:RenderWithoutLibrary", "RL215")
+    assert verdict.findings == []
+    assert "library_for_pictures" in verdict.not_judged["RL215"]
+
+
+def test_no_limit_is_told_with_what_is_known():
+    (message,) = messages("Falls", "RL506")
+    assert message.startswith("no time limit: step always returns truncated=False; all 16 episodes ended with ")
+
+
+@pytest.mark.parametrize(
+    ("name", "rule", "severity", "text"),
+    [
+        ("Gui", "RL216", "error", "in the constructor, because there is no display: 'cannot connect to X server'"),
+        ("GuiInReset", "RL216", "error", "in reset, because there is no display: 'cannot connect to X server'"),
+    ],
+)
+def test_what_ends_the_process_is_said_once(name, rule, severity, text, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    wanted = ["RL004", "RL208", "RL216", "RL403"]
+    task = str(Path(__file__).parent / FILE) + f":{name}"
+    report = check(EnvSpec(task), env_timeout_s=10, rules=wanted)
+    (finding,) = report.verdict.findings
+    assert (finding.rule, finding.severity) == (rule, severity)
+    assert text in finding.message
+
+
+def test_what_ends_the_process_leaves_nothing_else_unjudged():
+    """Another process does what comes after asking for rewards, which ends the first."""
+    task = str(Path(__file__).parent / "broken_goals.py") + ":EndsInComputeReward"
+    verdict = check(EnvSpec(task), env_timeout_s=10, rules=["RL208", "RL405", "RL614"]).verdict
+    (finding,) = verdict.findings
+    assert (finding.rule, finding.severity) == ("RL208", "error")
+    assert finding.message == "the process ended with exit code 9 in compute_reward"
+    assert (verdict.judged, verdict.not_judged.keys()) == (["RL208", "RL405"], {"RL614"})
+
+
+def test_what_ends_the_process_while_rendering_is_an_error():
+    task = str(Path(__file__).parent / FILE) + ":EndsInRender"
+    (finding,) = check(EnvSpec(task), env_timeout_s=10, rules=["RL208", "RL215"]).verdict.findings
+    assert (finding.rule, finding.severity) == ("RL215", "error")
+    assert finding.message == "rendering without a window: the process ended with exit code 9 in render"

@@ -1,0 +1,85 @@
+"""RL0: from a name to an environment, and what the environment says about itself."""
+
+import sys
+import types
+from pathlib import Path
+
+import pybullet_data
+import pytest
+
+from tests.checking.judging import case, check_case, findings
+
+ERROR = "error"
+CASES = [
+    case("broken_import.py:Anything", ("RL001", ERROR)),
+    case("broken_loading.py:Raising", ("RL002", ERROR)),
+    case("broken_envs.py:NoEnvironment", ("RL003", ERROR)),
+    case("broken_envs.py:Cleen", ("RL005", ERROR)),
+    case("broken_loading.py:NeedsArguments", ("RL006", ERROR)),
+    case("broken_loading.py:NoFile", ("RL007", ERROR)),
+    case("broken_loading.py:NoModel", ("RL007", ERROR)),
+    case("broken_loading.py:NoModelAtReset", ("RL007", ERROR)),
+    case("broken_old_gym.py:Pushed", ("RL008", ERROR)),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+def test_arguments_are_named_and_how_to_give_them():
+    (finding,) = findings("broken_loading.py:NeedsArguments", "RL006")
+    assert "missing 1 required positional argument: 'gain'" in finding.message
+    assert "(--set task.gain=...)" in finding.fix
+
+
+def test_a_missing_class_gets_the_closest_name():
+    (finding,) = findings("broken_envs.py:Cleen", "RL005")
+    assert "has no 'Cleen'. Did you mean 'Clean'?" in finding.message
+
+
+def test_a_missing_model_is_named_with_the_search_path():
+    (finding,) = findings("broken_loading.py:NoModel", "RL007")
+    data = Path(pybullet_data.getDataPath())
+    assert finding.evidence["file"] == "kuka_iiwa/modell.urdf"
+    assert finding.evidence["searched"] == [str(Path.cwd()), str(data)]
+    assert finding.message.startswith("the constructor does not find 'kuka_iiwa/modell.urdf', looked for in ")
+
+
+def test_a_missing_model_of_a_reset_is_named():
+    (finding,) = findings("broken_loading.py:NoModelAtReset", "RL007")
+    assert finding.message.startswith("reset does not find 'robot.urdf', looked for in ")
+    assert finding.evidence["searched"][0] == str(Path.cwd())
+
+
+def test_an_id_that_only_the_old_gym_knows(monkeypatch):
+    old = types.ModuleType("gym")
+    old.envs = types.SimpleNamespace(registry=types.SimpleNamespace(env_specs={"Pushed-v0": object()}))
+    monkeypatch.setitem(sys.modules, "gym", old)
+    (finding,) = findings("Pushed-v0", "RL008")
+    assert finding.rule == "RL008"
+    assert "registered with the old gym" in finding.message
+
+
+def test_a_class_of_the_old_gym(monkeypatch, tmp_path):
+    old = types.ModuleType("gym")
+    old.Env = type("Env", (), {"__module__": "gym.core"})
+    monkeypatch.setitem(sys.modules, "gym", old)
+    file = tmp_path / "of_old_gym.py"
+    file.write_text(
+        "import gym, numpy as np\nfrom gymnasium import spaces\n"
+        "class Pushed(gym.Env):\n"
+        "    observation_space = action_space = spaces.Box(-1, 1, (2,), np.float32)\n"
+        "    def reset(self): return np.zeros(2, np.float32)\n"
+        "    def step(self, action): return np.zeros(2, np.float32), 0.0, True, {}\n"
+    )
+    assert [finding.rule for finding in findings(f"{file}:Pushed", "RL003", "RL008")] == ["RL008"]
+
+
+def test_an_id_whose_module_imports_what_is_not_there(monkeypatch, tmp_path):
+    (tmp_path / "registers_with_gym.py").write_text("import gym\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    (finding,) = findings("registers_with_gym:Pushed-v0", "RL008")
+    assert finding.rule == "RL008"
+    assert "No module named 'gym'" in finding.message

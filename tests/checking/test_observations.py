@@ -1,0 +1,49 @@
+"""What an observation holds: nothing that never changes, and nothing hidden."""
+
+import numpy as np
+import pytest
+
+from tests.checking.judging import case, check_case, findings, found, rules_of
+
+BROKEN = "broken_observations.py"
+CASES = [
+    case(f"{BROKEN}:ConstantElement", ("RL110", "info"), twin=f"{BROKEN}:Wide"),
+    case(f"{BROKEN}:ConstantCounter", ("RL110", "warning"), twin=f"{BROKEN}:Counter"),
+    case(f"{BROKEN}:HiddenGoal", ("RL114", "warning"), twin=f"{BROKEN}:SeenGoal"),
+    case(f"{BROKEN}:HiddenGoalNoisyStart", ("RL114", "warning"), twin=f"{BROKEN}:NoisyReward"),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+CLEAN = [f"{BROKEN}:{name}" for name in ("Wide", "Counter", "SomeFlags", "SeenGoal", "NoisyReward", "ShownChance")]
+
+
+@pytest.mark.parametrize("task", CLEAN)
+def test_clean_is_clean(task):
+    assert found(task, *rules_of("RL1")) == set()
+
+
+def finding_of(name):
+    (case,) = [each for each in CASES if each.broken == f"{BROKEN}:{name}"]
+    (finding,) = findings(case.broken, *case.rules)
+    return finding
+
+
+def test_constant_elements_are_named_with_their_value():
+    finding = finding_of("ConstantElement")
+    assert finding.message == "1 of 4 elements of the observation never changed: observation[2] (0.25)"
+    assert finding.evidence == {"value": 1, "expected": 0, "elements": ["observation[2]"]}
+    assert finding_of("ConstantCounter").evidence["elements"] == ["observation['step']"]
+
+
+def test_two_episodes_show_what_is_hidden():
+    evidence = finding_of("HiddenGoal").evidence
+    # After the first step with the zero action: minus the distances from the start to two goals.
+    goals = [np.random.default_rng(evidence[seed]).uniform(-1, 1, 2) for seed in ("seed", "other_seed")]
+    distances = [float(np.linalg.norm(np.array([0.5, -0.3]) - goal)) for goal in goals]
+    assert [evidence["value"], evidence["expected"]] == pytest.approx([-distance for distance in distances], abs=0.5)
+    assert evidence["seed"] != evidence["other_seed"]

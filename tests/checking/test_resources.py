@@ -1,0 +1,72 @@
+"""What an instance takes and does not give back, and what instances share."""
+
+import pytest
+
+from rlctl.checking.check import judge
+from rlctl.checking.families import isolation
+from rlctl.checking.finding import NotJudged
+from tests.checking.judging import case, check_case, findings, records_of
+
+FILE = "broken_resources.py"
+CASES = [
+    case(f"{FILE}:LeavesBodies", ("RL405", "error"), twin="broken_repeats.py:OwnWorld"),
+    case(f"{FILE}:KeepsFiles", ("RL405", "warning")),
+    case(f"{FILE}:KeepsThreads", ("RL405", "warning")),
+    case(f"{FILE}:KeepsMemory", ("RL405", "warning"), twin=f"{FILE}:Caches"),
+    case(f"{FILE}:ClassSpaces", ("RL404", "warning")),
+    case(f"{FILE}:ClassObservations", ("RL404", "info")),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+def the_finding(name, rule):
+    (finding,) = findings(f"{FILE}:{name}", rule)
+    return finding
+
+
+def test_each_reset_leaves_a_client(monkeypatch):
+    monkeypatch.setattr(isolation, "MOST_RESETS", 12)  # each is slow: PyBullet connects anew
+    (finding,) = judge(records_of(f"{FILE}:Reconnects", "build", "leaks"), ["RL405"]).findings
+    assert finding.severity == "error"
+    assert finding.evidence["per_reset"] == 1.0
+    assert finding.evidence["value"] - finding.evidence["expected"] == finding.evidence["resets"] == 9
+    assert finding.message.startswith("PyBullet clients grow with every reset: from ")
+    assert judge(records_of(f"{FILE}:ReconnectsProperly", "build", "leaks"), ["RL405"]).findings == []
+
+
+def test_memory_is_counted():
+    finding = the_finding("KeepsMemory", "RL405")
+    # 50,000 numbers of 8 bytes.
+    assert finding.evidence["per_reset"] == pytest.approx(400_000, rel=0.1)
+    assert finding.evidence["resets"] == 90
+
+
+def found_in(resets, bodies=None, **memory):
+    series = {"bodies in the PyBullet world": bodies} if bodies else {}
+    return [finding.message for finding in isolation.find_growth(isolation.Counts(resets, series, **memory))]
+
+
+def test_what_changes_or_fills_once_is_no_leak():
+    assert found_in(20, [3, 7, 5, 9, 4] * 4) == []
+    assert found_in(20, [*range(10), *[10] * 10]) == []
+    assert found_in(20, [5] * 19 + [6]) == []
+    (message,) = found_in(20, list(range(20)))
+    assert message == "bodies in the PyBullet world grow with every reset: from 2 to 19 in 17 resets"
+
+
+def test_memory_needs_resets_and_a_second_half():
+    mib = 2**20
+    # Measured after every ten resets.
+    assert found_in(40, memory=[100 * mib, 103 * mib, 107 * mib, 110 * mib])
+    assert not found_in(20, memory=[100 * mib, 110 * mib])
+    assert not found_in(40, memory=[100 * mib, 107 * mib, 109 * mib, 110 * mib])
+    assert not found_in(40, memory=[100 * mib, 102 * mib, 105 * mib, 107 * mib])
+
+
+def test_too_few_resets_are_not_judged():
+    with pytest.raises(NotJudged, match="there was time for only 4 resets"):
+        found_in(4, [1, 2, 3, 4])

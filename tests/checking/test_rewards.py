@@ -1,0 +1,142 @@
+"""The reward: its size, its terms, what it makes worth doing, and success; and the search that they need."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from rlctl.checking.episode import action_at
+from rlctl.checking.families.rewards import discounted_steps, discounted_sum
+from rlctl.checking.families.search import compare_returns
+from tests.checking.judging import case, check_case, findings, found, rules_of, shared_records_of
+
+BROKEN = "broken_rewards.py"
+
+
+def broken(name, *expected, twin=None):
+    return case(f"{BROKEN}:{name}", *expected, twin=f"{BROKEN}:{twin}" if twin else "broken_envs.py:Clean")
+
+
+CASES = [
+    broken("ConstantReward", ("RL602", "warning")),
+    broken("SparseNeverFound", ("RL602", "info"), ("RL611", "info")),
+    broken("LargeReward", ("RL603", "warning"), twin="FinalBonus"),
+    broken("HugeOnce", ("RL603", "warning"), twin="FinalBonus"),
+    broken("Falls", ("RL604", "warning"), twin="FallsBadly"),
+    broken("FallsUntold", ("RL604", "warning"), ("RL609", "info"), twin="FallsBadly"),
+    broken("Hovering", ("RL605", "warning"), twin="FinishingPays"),
+    broken("HoveringUntold", ("RL605", "warning"), ("RL609", "info"), twin="PaysProgress"),
+    broken("AliveBonus", ("RL606", "warning"), twin="Paid"),
+    broken("AliveUntold", ("RL606", "info"), twin="Paid"),
+    broken("SuccessUntold", ("RL609", "info"), twin="SuccessArray"),
+    broken("SuccessMisnamed", ("RL609", "info")),
+    broken("SuccessAtStart", ("RL610", "warning")),
+    broken("SuccessNever", ("RL611", "info")),
+    broken("WrongSlice", ("RL612", "warning"), twin="TimePenalty"),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+CLEAN = [
+    f"{BROKEN}:{name}"
+    for name in (
+        *("FinalBonus", "FallsBadly", "FinishingPays", "PaysProgress", "Terms", "SparseTerm"),
+        *("TimePenalty", "Paid", "SuccessArray"),
+    )
+]
+
+
+@pytest.mark.parametrize("task", CLEAN)
+def test_clean_is_clean(task):
+    assert found(task, *rules_of("RL6")) == set()
+
+
+def test_goal_that_ends_the_episode_is_no_failure():
+    assert found(f"{BROKEN}:EndsAtUntoldGoal", *rules_of("RL6")) == {("RL609", "info")}
+
+
+def finding_of(name):
+    (case,) = [each for each in CASES if each.broken == f"{BROKEN}:{name}"]
+    (finding,) = findings(case.broken, *case.rules)
+    return finding
+
+
+def test_worth_is_discounted():
+    # 1 + 0.99 * 2 + 0.9801 * 3 = 5.9203; -(1 + 0.99 + 0.9801) = -2.9701
+    assert discounted_sum(np.array([1.0, 2.0, 3.0])) == pytest.approx(5.9203)
+    assert discounted_steps(-1.0, 3) == pytest.approx(-2.9701)
+
+
+def test_falling_is_compared_with_going_on():
+    evidence = finding_of("Falls").evidence
+    mean, last, steps = evidence["mean_reward"], evidence["value"], evidence["step"]
+    # The fall is beyond 1.5 m in one direction, so at least that far from the middle.
+    assert -2.2 < last <= -1.5
+    # It costs more than a usual step, and saves the 50 - steps that are left.
+    saved = last - mean - 0.99 * mean * (1 - 0.99 ** (50 - steps)) / 0.01
+    assert 0 < evidence["gain"] <= saved
+
+
+def test_stopping_is_compared_from_where_it_begins():
+    episode = shared_records_of("broken_envs.py:Clean", "search").role("search")[0]
+    finished = dataclasses.replace(episode, rewards=np.array([0.0, 0.0, 9.0]))
+    stopped = dataclasses.replace(episode, rewards=np.array([0.0, 0.0, 5.0, 5.0]), ended="steps")
+    stop = compare_returns(finished, stopped, at=2, longest=6)
+    # From the third step on: 9, against 5 for each of the steps 3 to 6, the last two of them not played.
+    assert (stop.step, stop.per_step) == (3, 5.0)
+    assert (stop.finishing, stop.stopping) == pytest.approx((9.0, 5 * (1 + 0.99 + 0.9801 + 0.970299)))
+    ended = dataclasses.replace(stopped, ended="truncated")
+    assert compare_returns(finished, ended, at=2, longest=6).stopping == pytest.approx(5 * 1.99)
+
+
+def test_hovering_is_found_and_placed():
+    finding = finding_of("Hovering")
+    # Between 9.6 (0.4 from the goal) and 9.9 (0.1 from it) per step.
+    assert 9.6 < finding.evidence["per_step"] < 9.9
+    assert finding.message.startswith("finishing at step ")
+    assert f" from step {finding.evidence['step']} on; " in finding.message
+
+
+def test_doing_nothing_earns_the_bonus():
+    evidence = finding_of("AliveBonus").evidence
+    # 50 steps of 1: (1 - 0.99^50) / 0.01 = 39.4994
+    assert evidence["value"] == pytest.approx(39.4994, abs=1e-4)
+    assert (evidence["term"], evidence["share"]) == ("alive", 1.0)
+
+
+def test_constant_penalty_is_named():
+    evidence = finding_of("WrongSlice").evidence
+    # -0.05 * 5
+    assert (evidence["term"], evidence["value"]) == ("effort", -0.25)
+
+
+def test_numbers_become_actions_of_every_kind():
+    space = spaces.Dict(
+        {
+            "arm": spaces.Box(np.array([-1.0, 0.0], np.float32), np.array([1.0, np.inf], np.float32)),
+            "gear": spaces.Discrete(3, start=1),
+            "more": spaces.Tuple([spaces.MultiDiscrete([2, 4]), spaces.MultiBinary(2)]),
+        }
+    )
+    for numbers, arm, gear, more in [
+        (np.zeros(7), [-1.0, 0.0], 1, ([0, 0], [0, 0])),
+        (np.full(7, 0.5), [0.0, 0.5], 2, ([1, 2], [1, 1])),
+        (np.ones(7), [1.0, 1.0], 3, ([1, 3], [1, 1])),
+    ]:
+        action = action_at(space, numbers)
+        assert space.contains(action)
+        assert action["arm"].tolist() == arm
+        assert action["gear"] == gear
+        assert tuple(part.tolist() for part in action["more"]) == more
+
+
+def test_search_finds_what_chance_does_not():
+    lives = shared_records_of("reach", "search").role("search")
+    assert any(life.infos["is_success"].values.any() for life in lives if life.actions == "searched")
+    assert len({life.seed for life in lives if life.actions == "searched"}) == 1
+    assert sum(life.steps for life in lives) <= 6200

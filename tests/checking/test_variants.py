@@ -1,0 +1,71 @@
+"""RL0, variants: the events and the stages of a task."""
+
+import pytest
+
+from tests.checking.judging import FOLDER, case, check_case, findings, records_of
+
+ERROR = "error"
+SOUND = "broken_variants.py:Sound"
+CASES = [
+    case("broken_variants.py:WrongBody", ("RL011", ERROR), twin=SOUND),
+    case("broken_variants.py:OwnChance", ("RL011", ERROR), twin=SOUND),
+    case("broken_variants.py:BreaksDown", ("RL011", ERROR), twin="broken_variants.py:NeedsItsEvents"),
+    case("broken_variants.py:Misspelled", ("RL013", "warning"), twin=SOUND),
+    case("broken_variants.py:WrongKey", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:WrongParameter", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:WrongEvent", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:OtherSpaces", ("RL012", ERROR), twin=SOUND),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+@pytest.mark.parametrize(
+    ("name", "rule", "message"),
+    [
+        ("WrongBody", "RL011", "with randomize=true: events.mass: no body 'amr'. Did you mean 'arm'? "),
+        ("OwnChance", "RL011", "with randomize=true: equal seeds and actions give unequal episodes"),
+        ("BreaksDown", "RL011", "with randomize=true: RuntimeError: a gear broke (broken_variants.py:"),
+        ("WrongKey", "RL012", "stages: stage 1: no key 'taks'. Did you mean 'task'?"),
+        ("WrongParameter", "RL012", "stage 1 of 2: task.tolerence: WrongParameter has no parameter 'tolerence'."),
+        ("WrongEvent", "RL012", "stage 2 of 2: events: this task has no event 'masss'. Did you mean 'mass'?"),
+        ("OtherSpaces", "RL012", "stage 2 of 2: its observation space is Box"),
+    ],
+)
+def test_what_is_wrong_is_named(name, rule, message):
+    (finding,) = findings(f"broken_variants.py:{name}", rule)
+    assert finding.message.startswith(message), finding.message
+
+
+def test_names_that_have_no_effect_are_found():
+    assert {finding.message for finding in findings("broken_variants.py:Misspelled", "RL013")} == {
+        "Misspelled.episode_seconds is used by nothing. Did you mean 'episode_s'?",
+        "Misspelled.is_terminate is used by nothing. Did you mean 'is_terminated'?",
+    }
+
+
+def test_a_task_that_randomises_is_judged_so(rlctl):
+    task = f"{FOLDER}/broken_variants.py:BreaksDown"
+    done = rlctl("check-env", task, "--select", "RL011,RL301", "--set", "randomize=true")
+    assert "not judged: RL011: the task raises whatever the events (RL2)" in done.stdout
+    assert "not judged: RL301: the episode broke off (RL201, RL207)" in done.stdout
+
+
+def test_an_error_of_the_task_layer_is_named_as_one():
+    (finding,) = findings("broken_variants.py:NotFinite", "RL207")
+    assert finding.message == "step 1 raised TaskError: NotFinite: reward term 'distance' is nan at step 1"
+
+
+def test_stages_of_a_packaged_recipe_are_judged(tmp_path, write_module):
+    task = write_module("swing.py", "from rlctl_manipulation.reach import Reach\nclass Swing(Reach): pass\n")
+    task.with_suffix(".yaml").write_text("stages: [{task: {episode: 1}, promote: {success: 0.5}}, {}]\n")
+    (finding,) = findings(f"{task}:Swing", "RL012")
+    assert finding.message.startswith("stage 1 of 2: task.episode: Swing has no parameter 'episode'.")
+
+
+def test_a_plain_environment_has_neither():
+    records = records_of("broken_envs.py:Clean", "variants")
+    assert not records.findings

@@ -1,0 +1,81 @@
+"""Streams that are closed or not UTF-8, and memory that is refused."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rlctl import output
+from rlctl.cli import error_boundary
+
+RLCTL = f"{sys.executable} -m rlctl"
+
+
+def shell(command, **environment):
+    return subprocess.run(
+        ["bash", "-c", command], env={**os.environ, **environment}, capture_output=True, timeout=250, check=False
+    )
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "ascii:strict", "latin-1:strict"])
+def test_a_terminal_that_is_not_utf8(encoding):
+    commands = [["--help"], ["tasks"], ["eval", "nothing_of_the_name_é"]]
+    code = f"import sys; from rlctl.cli import run; print([run(each) for each in {commands!r}], file=sys.stderr)"
+    done = shell(f'{sys.executable} -c "{code}"', PYTHONIOENCODING=encoding, PYTHONUTF8="0")
+    assert done.stderr.endswith(b"[0, 0, 5]\n"), done.stderr
+    assert b"Traceback" not in done.stderr
+
+
+def test_what_others_named_is_printed_as_it_is(capsys):
+    output.err().print("arms.py:Robot: no joint [left]")
+    assert capsys.readouterr().err == "arms.py:Robot: no joint [left]\n"
+
+
+def test_progress_in_ascii(monkeypatch, capsys):
+    from rlctl.training.display import sparkline
+
+    assert sparkline([0.0, 0.5, 1.0]) == "▁▅█"
+    monkeypatch.setattr("rlctl.output.is_utf8", lambda: False)
+    assert sparkline([0.0, 0.5, 1.0]).isascii()
+
+
+def test_stderr_is_closed(tmp_path):
+    done = shell(f"cd {tmp_path}; {RLCTL} eval 2>&-; echo $?")
+    assert done.stdout == b"5\n"
+    done = shell(f"cd {tmp_path}; {RLCTL} tasks show reach 2>&-; echo $?")
+    assert done.stdout.endswith(b"\n0\n")
+
+
+INTERRUPTED = """
+import os, signal, sys, threading, time
+from rlctl.cli import run
+
+def interrupt():
+    while "rlctl.evaluation.evaluate" not in sys.modules:  # the command has begun
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGINT)
+
+threading.Thread(target=interrupt).start()
+sys.exit(run(["eval", "reach", "--pretrained", "--episodes", "100000"]))
+"""
+
+
+def test_an_interruption_is_said():
+    done = shell(f"{sys.executable} -c '{INTERRUPTED}'")
+    assert done.returncode == 130
+    assert done.stderr == b"interrupted\n"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        OSError(12, "Cannot allocate memory"),
+        ImportError("libtorch_cpu.so: failed to map segment from shared object"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:119] DefaultCPUAllocator: can't allocate memory: you tried"),
+    ],
+)
+def test_memory_that_is_refused(error, capsys):
+    assert error_boundary.report_unexpected(error) == 5
+    assert capsys.readouterr().err.startswith("error: not enough memory (")

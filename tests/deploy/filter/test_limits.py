@@ -1,0 +1,147 @@
+"""`limits.yaml`: what is wrong in it is said with its line, what was expected, and the closest name."""
+
+import pytest
+from gymnasium import spaces
+
+from rlctl.deploy import SafetyFilter, read_limits
+from rlctl.environments.info import EnvInfo, space_to_json
+from rlctl.errors import ArtifactError, RecipeError
+from rlctl.joints import Joints
+from tests.deploy.conftest import make_arm, observe_at
+
+GOOD = """
+command: position
+joints: [shoulder, elbow]
+limits:
+  all: {speed: 2.0}
+  elbow: {position: [-1, 1], speed: 1.0}
+measured: {position: positions}
+home: [0, 0]
+sensors: {goal: {range: [-2, 2], frozen_s: 0.5}}
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def written(text):
+        file = tmp_path / "limits.yaml"
+        file.write_text(text)
+        return file
+
+    return written
+
+
+def test_a_whole_file(write, arm):
+    limits = read_limits(write(GOOD))
+    assert limits.limits["elbow"].position == (-1.0, 1.0)
+    SafetyFilter(arm, limits)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("comand: step", "limits.yaml:1: no key 'comand'. Did you mean 'command'? Keys here: command, scale"),
+        (
+            "command: steps",
+            "limits.yaml:1: command: expected position or step or speed or torque or action, got 'steps'. "
+            "Did you mean 'step'?",
+        ),
+        (
+            "limits:\n  elbow: {position: [1, -1]}",
+            "limits.yaml:2: limits.elbow.position: the lower bound 1 is not below the upper one, -1; write [low, high]",
+        ),
+        (
+            "limits:\n  elbow: {speed: 90 deg/s}",
+            "limits.yaml:2: limits.elbow.speed: write the number alone, in rad/s or m/s, got '90 deg/s'",
+        ),
+        ("limits:\n  elbow: {speed: -1}", "limits.elbow.speed: expected a number > 0 [rad/s or m/s], got -1"),
+        ("limits:\n  elbow: {sped: 1}", "no key 'limits.elbow.sped'. Did you mean 'speed'?"),
+        ("- 1", "a limits file is a mapping"),
+        ("blend_in_s: .nan", "blend_in_s: expected a number >= 0 [s], got nan"),
+    ],
+)
+def test_what_is_wrong_in_a_file(write, text, message):
+    with pytest.raises(RecipeError) as error:
+        read_limits(write(text))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("elbow: {", "elbo: {"), "limits: no joint 'elbo'. Did you mean 'elbow'? Known: shoulder, elbow."),
+        (
+            ("goal: {", "gaol: {"),
+            "limits: sensors: no observation 'gaol'. Did you mean 'goal'? Known: positions, goal.",
+        ),
+        (("position: positions", "position: goal"), "measured.position: goal has 3 elements, the action has 2"),
+        (("measured: {position: positions}\n", ""), "write measured: {position: NAME}"),
+        (("home: [0, 0]", "home: [0]"), "home: 1 numbers, the action has 2 elements"),
+        (("home: [0, 0]", "home: [0, 2]"), "home: it is outside the limits of position"),
+        (("home: [0, 0]", "on_fault: home"), "on_fault: home: where that is must be said"),
+        (("joints: [shoulder, elbow]", "joints: [elbow, elbow]"), "1 different names, the action has 2 elements"),
+        (("command: position", "command: torque"), "with command: torque only torque, rate, action can be limited"),
+        (("[-1, 1]", "[20, 30]"), "elbow: no action keeps these limits and the policy's own action bounds"),
+        (("home: [0, 0]", "safe_action: [0, 0]"), "safe_action: of positions, steps and speeds it is to keep still"),
+        (("home: [0, 0]", "scale: [1, 1, 1]"), "scale has 3 numbers, the action 2"),
+    ],
+)
+def test_limits_that_a_policy_cannot_have(write, arm, change, message):
+    with pytest.raises(RecipeError) as error:
+        SafetyFilter(arm, write(GOOD.replace(*change)))
+    assert message in str(error.value)
+
+
+def test_what_the_task_knows_of_its_joints(write, arm):
+    known = Joints(
+        ["hip", "knee"],
+        default_positions=[0.5, -1.0],
+        action_scale=[0.25, 0.5],
+        low=[-1, -2],
+        high=[0.6, 0],
+        max_speed=[9, 9],
+    )  # fmt: skip
+    arm = arm.model_copy(update={"joints": known})
+    safety = SafetyFilter(arm, write("command: position\nlimits: {knee: {position: [-1.5, -0.5]}}"))
+    safety.observe(observe_at(0, 0))
+    # 0.5 + 0.25 * 0.2 and -1 + 0.5 * 0.2 are within; 0.5 + 0.25 * 2 = 1 is not below 0.6, which is 0.4 of the action.
+    assert safety.limit([0.2, 0.2]) == pytest.approx([0.2, 0.2])
+    assert safety.limit([2.0, -9.0]) == pytest.approx([0.4, -1.0])
+    assert [(event.name, event.limit) for event in list(safety.events)[-2:]] == [
+        ("hip.position", pytest.approx(0.6)),
+        ("knee.position", pytest.approx(-1.5)),
+    ]
+    with pytest.raises(RecipeError, match="the action's order is hip, knee"):
+        SafetyFilter(arm, write("joints: [knee, hip]"))
+    with pytest.raises(RecipeError, match="action 0 is to keep still"):
+        SafetyFilter(arm, write("{command: speed, offset: 1}"))
+
+
+def test_a_joint_without_limits_of_its_own(write, arm):
+    known = Joints(["hip", "knee"], low=[0, -2], high=[-1, 0], max_speed=[0, 9], max_torque=[0, 3])
+    arm = arm.model_copy(update={"joints": known})
+    safety = SafetyFilter(arm, write("command: step\nmeasured: {position: positions}"))
+    safety.observe(observe_at(0, 0))
+    assert safety.limit([5.0, 5.0]) == pytest.approx([5.0, 0.0])
+    assert SafetyFilter(arm, write("command: torque")).limit([5.0, 5.0]) == pytest.approx([5.0, 3.0])
+
+
+def test_actions_from_minus_1_to_1_need_a_scale(write, arm):
+    normalised = arm.model_copy(update={"action_space": space_to_json(spaces.Box(-1, 1, (2,)))})
+    with pytest.raises(RecipeError, match=r"^limits: scale: how much torque is 1 of the action\? "):
+        SafetyFilter(normalised, write("command: torque\nlimits: {all: {torque: 8}}"))  # 1 of it may be 10 N m
+    safety = SafetyFilter(normalised, write("command: torque\nscale: 10\nlimits: {all: {torque: 8}}"))
+    safety.observe(observe_at(0, 0))
+    assert safety.limit([0.9, 0.1]) == pytest.approx([0.8, 0.1])
+
+
+def test_without_a_control_dt(write):
+    info = EnvInfo(observation_space=make_arm().observation_space, action_space=space_to_json(spaces.Box(-1, 1, (2,))))
+    with pytest.raises(RecipeError, match="does not say its control_dt"):
+        SafetyFilter(info, write("lowpass_hz: 2"))
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(ArtifactError, match="no such file"):
+        read_limits(tmp_path / "none.yaml")

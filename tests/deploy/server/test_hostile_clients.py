@@ -1,0 +1,131 @@
+"""Clients that flood, send gigabytes, half a frame or die neither block nor end the others."""
+
+import os
+import socket
+import struct
+import threading
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given, settings
+
+from rlctl.deploy.server import messages
+from rlctl.deploy.server.measurements import read_memory
+from tests.deploy.conftest import REPEATABLE
+from tests.deploy.server.serving import OBSERVATION, RunningServer, write_policy
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    file = write_policy(tmp_path_factory.mktemp("served") / "policy.safetensors")
+    running = RunningServer(file, watchdog=False, max_clients=8)
+    yield running
+    running.close()
+
+
+def open_socket(server):
+    connection = socket.create_connection(("127.0.0.1", server.port), timeout=120)
+    connection.sendall(
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+    )
+    return connection, connection.recv(65536)
+
+
+def frame(content, length=None):
+    """A masked binary frame."""
+    length = len(content) if length is None else length
+    return b"\x82" + bytes([0x80 | 127]) + struct.pack(">Q", length) + b"\0\0\0\0" + content
+
+
+def read_all(connection):
+    received = b""
+    while chunk := connection.recv(65536):
+        received += chunk
+    return received
+
+
+def works(server):
+    with server.client() as client:
+        return client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
+
+
+def test_a_gigabyte(server):
+    before = read_memory()
+    connection, _ = open_socket(server)
+    connection.sendall(frame(b"x" * 1000, length=2**30))
+    assert b"\x03\xf1" in read_all(connection)  # close code 1009: too big
+    assert read_memory() - before < 50e6
+    assert works(server)
+
+
+def test_half_a_frame_and_death(server):
+    for content in (frame(b"x" * 100, length=200), b"\x82", frame(b"")[:5]):
+        connection, _ = open_socket(server)
+        connection.sendall(content)
+        assert works(server)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.close()  # resets the connection
+    assert works(server)
+
+
+def test_a_flood_that_reads_nothing(server):
+    content = frame(messages.pack(OBSERVATION)) * 200
+    connections = [open_socket(server)[0] for _ in range(3)]
+    done = threading.Event()
+
+    def flood(connection):
+        connection.settimeout(0.2)
+        try:
+            while not done.is_set():
+                connection.sendall(content)
+        except OSError:  # the server reads no more
+            done.wait(30)
+
+    threads = [threading.Thread(target=flood, args=(each,)) for each in connections]
+    for thread in threads:
+        thread.start()
+    before = read_memory()
+    assert works(server)
+    done.set()
+    for thread in threads:
+        thread.join()
+    for connection in connections:
+        connection.close()
+    assert read_memory() - before < 50e6
+
+
+def test_two_hundred_connections(server):
+    with server.client() as client:
+        opened = [open_socket(server) for _ in range(100)]
+        idle = [socket.create_connection(("127.0.0.1", server.port), timeout=120) for _ in range(100)]
+        for connection in idle:
+            connection.sendall(b"POST /act HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\n{")
+        assert client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
+        answers = [first.split(b"\r\n")[0] for _, first in opened]
+        assert answers.count(b"HTTP/1.1 101 Switching Protocols") <= 7
+        assert answers.count(b"HTTP/1.1 503 Service Unavailable") >= 93
+        for connection in [*idle, *(each for each, _ in opened)]:
+            connection.close()
+
+
+@settings(REPEATABLE, max_examples=100)
+@given(st.one_of(st.binary(max_size=200), st.integers(0, 255).map(lambda byte: bytes([byte]) * 50)))
+def test_any_bytes_are_a_message_or_not(content):
+    for read in (messages.unpack, messages.parse_json):
+        try:
+            read(content)
+        except messages.MessageError:
+            continue
+
+
+def test_arrays_come_back(tmp_path):
+    import numpy as np
+
+    for value in (np.arange(6, dtype=np.int16).reshape(2, 3), np.zeros((0, 3)), np.array(True), np.float32(1.5)):
+        back = messages.unpack(messages.pack({"a": value}))["a"]
+        assert back.dtype == value.dtype
+        np.testing.assert_array_equal(back, value)
+    with pytest.raises(TypeError, match="cannot be sent"):
+        messages.pack(np.array([1j]))
+    assert messages.unpack(messages.pack({"a": os.name})) == {"a": os.name}

@@ -1,0 +1,128 @@
+"""A file may name environments; nothing else of this machine is imported or called because a file says so."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save
+
+from rlctl.environments import named_task
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.policy.policy import compute_digest, read_policy
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
+from rlctl.storage import files
+from rlctl.training.request import TrainRequest, run_training
+from tests.training.conftest import ENVS, SMALL_PPO
+
+ENV = """
+import gymnasium
+from gymnasium import spaces
+
+class Mine(gymnasium.Env):
+    def __init__(self, size=1):
+        self.observation_space = self.action_space = spaces.Box(-1, 1, (size,))
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, True, {}
+
+def make_mine():
+    return Mine()
+
+class Outer:
+    Inner = Mine
+"""
+
+
+@pytest.mark.parametrize("kind", [named_task.POLICY, named_task.EPISODE, named_task.RUN])
+@pytest.mark.parametrize(
+    "task",
+    [
+        "os:system", "posix:system", "builtins:exec", "subprocess:Popen", "subprocess:run", "shutil:rmtree",
+        "runpy:run_path", "antigravity:geohash", "numpy:load", "numpy.lib.npyio:load", "torch:load", "yaml:unsafe_load",
+        "rlctl.storage.files:write_text", "rlctl.training.request:run_training", "gymnasium:make", "antigravity:Env-v0",
+        "gymnasium.spaces:Box", "os:\0", "sys:modules",
+    ],
+)  # fmt: skip
+def test_functions_and_classes_of_other_things_are_not_called(task, kind):
+    with pytest.raises(ArtifactError, match=rf"^{kind} names .* as its task, and .*: not run") as caught:
+        EnvSpec(task, {"command": "true", "cmd": "true"}, named_by=kind).make()
+    assert len(str(caught.value).splitlines()) == 1
+    assert ("--task" in str(caught.value)) == (kind == named_task.POLICY)
+    assert "antigravity" not in sys.modules
+
+
+def test_a_script_is_not_run(write_module, tmp_path):
+    mark = tmp_path / "ran"
+    script = write_module("deploy.py", f"open({str(mark)!r}, 'w')\ndef wipe(command): raise SystemExit\n")
+    for task in (f"{script}:Env", f"{script}:wipe"):
+        with pytest.raises(ArtifactError, match="not run"):
+            EnvSpec(task, named_by=named_task.POLICY).make()
+        if task.endswith("Env"):
+            assert not mark.exists()
+
+
+@pytest.mark.parametrize("name", ["Mine", "make_mine", "Outer.Inner"])
+def test_environments_of_the_users_own_are_made(name, write_module):
+    file = write_module(f"own_{name.replace('.', '_').lower()}.py", ENV)
+    env = EnvSpec(f"{file}:{name}", named_by=named_task.POLICY).make()
+    assert env.observation_space.shape == (1,)
+
+
+@pytest.mark.parametrize("task", ["reach", "Pendulum-v1", f"{ENVS}:Line", "rlctl_manipulation.reach:Reach"])
+def test_what_is_installed_is_made(task):
+    env = EnvSpec(task, named_by=named_task.EPISODE).make()
+    env.reset(seed=0)
+    env.close()
+
+
+def test_what_does_not_exist_is_a_usage_error():
+    for task in ("reech", "no_such_module:Env", "NoSuchEnv-v0"):
+        with pytest.raises(UsageError):
+            EnvSpec(task, named_by=named_task.POLICY).make()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    root = tmp_path_factory.mktemp("runs")
+    return run_training(TrainRequest(f"{ENVS}:Line", settings={**SMALL_PPO, "total_timesteps": 64}, root=root)).run
+
+
+def test_a_policy_that_names_a_function_runs_nothing(run, tmp_path):
+    info, _ = read_policy(run.best_policy)
+    mark = tmp_path / "ran"
+    spec = {"task": "os:system", "parameters": {"command": f"touch {mark}"}, "named_by": ""}
+    evil = {**json.loads(info.model_dump_json()), "spec": spec}
+    path = tmp_path / "evil.safetensors"
+    text, tensors = json.dumps(evil), load_file(run.best_policy)
+    path.write_bytes(save(tensors, metadata={"rlctl": text, "sha256": compute_digest(text, tensors)}))
+    with pytest.raises(ArtifactError, match=r"^a policy file names 'os:system' as its task"):
+        run_evaluation(EvalRequest(str(path), episodes=1), Gates())
+    assert not mark.exists()
+    task = f"{ENVS}:Line"
+    assert run_evaluation(EvalRequest(str(path), task=task, episodes=1), Gates()).episodes
+
+
+def test_an_episode_that_names_a_function_runs_nothing(tmp_path):
+    mark, path = tmp_path / "ran", tmp_path / "000000.npz"
+    spec = EnvSpec("os:system", {"command": f"touch {mark}"})
+    info = EpisodeInfo(spec=spec, seed=1, total_reward=0.0)
+    save_episode(path, RecordedEpisode(info, np.zeros((1, 1)), np.zeros((2, 1)), np.zeros(1), np.zeros((1, 0))))
+    with pytest.raises(ArtifactError, match=r"^a recorded episode names 'os:system' as its task"):
+        load_episode(path).info.spec.make()
+    assert not mark.exists()
+
+
+def test_a_run_that_names_a_function_runs_nothing(run, tmp_path):
+    mark = tmp_path / "ran"
+    run.write_status({"task": "os:system"})
+    recipe = run.recipe().model_copy(update={"task": {"command": f"touch {mark}"}})
+    files.write_sealed(run.recipe_file, recipe.to_yaml())
+    with pytest.raises(ArtifactError, match=r"^run.json names 'os:system' as its task"):
+        run_training(TrainRequest(None, resume=str(run.path), settings={"total_timesteps": 256}, force=True))
+    assert not mark.exists()

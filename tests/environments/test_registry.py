@@ -1,0 +1,296 @@
+"""From what the user typed to an environment, and what is said when there is none."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rlctl
+from rlctl.environments import registry
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import RecipeError, TaskError, UsageError
+
+ENV = """
+    import gymnasium, numpy as np
+    from gymnasium.spaces import Box
+
+    class MyEnv(gymnasium.Env):
+        observation_space, action_space = Box(-1, 1, (2,)), Box(-1, 1, (1,))
+
+        def __init__(self, gain=1.0):
+            self.gain, self.count = gain, 0
+
+        def reset(self, *, seed=None, options=None):
+            self.count = 0
+            return np.full(2, 0.0, np.float32), {}
+
+        def step(self, action):
+            self.count += 1
+            return np.full(2, 0.1 * self.count, np.float32), 0.0, False, False, {}
+
+    def make_it(gain=2.0):
+        return MyEnv(gain)
+
+    class NoEnv:
+        pass
+
+    number = 3
+"""
+
+
+@pytest.fixture(autouse=True)
+def _own_imports(tmp_path, monkeypatch):
+    """Work in `tmp_path`, and forget what was imported from it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def my_env(write_module):
+    return write_module("my_env.py", ENV)
+
+
+def error(kind, task, *arguments, **options):
+    with pytest.raises(kind) as caught:
+        EnvSpec(task, *arguments, **options).make()
+    return str(caught.value)
+
+
+def test_every_form_of_a_task(my_env, write_module):
+    write_module("package/__init__.py", "")
+    write_module("package/envs.py", ENV)
+    for task in ("my_env.py:MyEnv", f"{my_env}:MyEnv", "my_env:MyEnv", "package.envs:MyEnv", "package.envs:make_it"):
+        env = EnvSpec(task).make()
+        assert type(env).__name__ == "MyEnv", task
+    assert EnvSpec("my_env.py:MyEnv", {"gain": 4.0}).make().gain == 4.0
+    assert EnvSpec("package.envs:make_it").make().gain == 2.0
+    for task in ("reach", "rlctl_manipulation.reach:Reach"):
+        env = EnvSpec(task).make()
+        assert type(env.unwrapped.task).__name__ == "Reach"
+        env.close()
+    assert type(EnvSpec("Pendulum-v1").make().unwrapped).__name__ == "PendulumEnv"
+
+
+def test_a_file_is_imported_once(my_env):
+    assert registry.load("my_env.py:MyEnv") is registry.load(f"{my_env}:MyEnv") is registry.load("my_env:MyEnv")
+
+
+def test_a_file_may_import_its_neighbours(write_module):
+    write_module("there/parts.py", ENV)
+    write_module("there/whole.py", "from parts import MyEnv\n")
+    assert EnvSpec("there/whole.py:MyEnv").make().gain == 1.0
+
+
+def test_files_of_one_name_in_many_folders(write_module):
+    for number in range(3):
+        write_module(f"v{number}/same.py", ENV.replace("gain=1.0", f"gain={number}"))
+    for _ in range(2):
+        classes = [registry.load(f"v{number}/same.py:MyEnv") for number in range(3)]
+        assert [cls().gain for cls in classes] == [0, 1, 2]
+        assert [sys.modules[cls.__module__].MyEnv for cls in classes] == classes
+
+
+@pytest.mark.parametrize("name", ["random", "types", "json", "turtle"])
+def test_a_file_named_like_a_standard_module(write_module, name):
+    write_module(f"envs/{name}.py", ENV)
+    assert EnvSpec(f"envs/{name}.py:MyEnv").make().gain == 1.0
+    again = subprocess.run([sys.executable, "-c", f"import {name}; print({name}.__file__)"], capture_output=True)
+    assert b"envs" not in again.stdout
+    if name in sys.modules:
+        assert not hasattr(sys.modules[name], "MyEnv")
+
+
+def test_python_api_takes_parameters():
+    env = rlctl.make("reach", tolerance=0.02)
+    assert env.unwrapped.task.tolerance == 0.02
+    env.close()
+
+
+def test_an_unknown_name_gives_the_closest():
+    assert error(UsageError, "reech").startswith("no task 'reech'. Did you mean 'reach'? Installed: ")
+    assert error(UsageError, "reech").endswith("Other forms: package.module:Class, path/to/file.py:Class, Pendulum-v1.")
+    assert UsageError("").exit_code == 2
+
+
+def test_a_folder_is_named_as_one(my_env, tmp_path):
+    (tmp_path / "my-arm").mkdir()
+    with pytest.raises(UsageError, match=r"^my-arm is a folder, not a task: pip install -e my-arm"):
+        registry.load("my-arm")
+
+
+def test_places_that_are_not_there(my_env, tmp_path):
+    assert error(UsageError, "my_env.py:MyEnvs") == (
+        "my_env.py has no 'MyEnvs'. Did you mean 'MyEnv'? It defines: MyEnv, NoEnv."
+    )
+    assert error(UsageError, "your_env.py:E") == f"task 'your_env.py:E': no file {tmp_path / 'your_env.py'}"
+    assert error(UsageError, "nowhere.envs:E") == (
+        f"task 'nowhere.envs:E': no module 'nowhere.envs' is installed or under {tmp_path}"
+    )
+    assert error(UsageError, "my_env.py:number") == "my_env.py:number: number is a int, not a class or a function"
+    assert error(TaskError, "my_env.py:NoEnv") == (
+        "my_env.py:NoEnv: NoEnv is neither a Gymnasium environment (reset, step, spaces) nor "
+        "a subclass of rlctl.task.Task"
+    )
+
+
+def test_a_vectorised_environment_is_named_as_one(my_env, write_module):
+    write_module("many.py", "import gymnasium\n\ndef make():\n    return gymnasium.make_vec('CartPole-v1', 2)\n")
+    with pytest.raises(TaskError, match=r"many.py:make: CartPoleVectorEnv is a vectorised environment\nGive a single"):
+        EnvSpec("many.py:make").make()
+
+
+def test_gymnasium_ids(write_module, monkeypatch):
+    assert error(UsageError, "Pendulun-v1") == (
+        "Gymnasium has no environment 'Pendulun-v1'. Did you mean 'Pendulum-v1'?"
+    )
+    assert error(UsageError, "Pendulum-v9") == (
+        "Gymnasium has no environment 'Pendulum-v9'. Did you mean 'Pendulum-v1'?"
+    )
+    assert error(UsageError, "nopackage:Env-v0").startswith("Gymnasium: nopackage:Env-v0: No module named 'nopackage'")
+    registers = "\n".join(
+        f"    gymnasium.register('{name}', entry_point=MyEnv)" for name in ("brings/My-v0", "brings/Plain")
+    )
+    write_module("brings.py", f"{ENV}\n{registers}\n")
+    for task in ("brings:brings/My-v0", "brings:brings/Plain"):
+        env = EnvSpec(task, {"gain": 5.0}).make()
+        assert env.unwrapped.gain == 5.0
+    assert EnvSpec("Pendulum-v1", {"g": 1.0, "max_episode_steps": 7}).make().spec.max_episode_steps == 7
+
+
+def test_a_gymnasium_id_whose_class_cannot_be_imported(write_module):
+    write_module("registers.py", "import gymnasium\ngymnasium.register('Late-v0', entry_point='late:Late')\n")
+    write_module("late.py", "1 / 0\n")
+    assert error(TaskError, "registers:Late-v0") == (
+        "task 'registers:Late-v0': import failed: ZeroDivisionError: division by zero (late.py:1)"
+    )
+
+
+def test_parameters_that_are_not_there(my_env):
+    assert error(RecipeError, "my_env.py:MyEnv", {"gian": 1}) == (
+        "task.gian: my_env.py:MyEnv has no parameter 'gian'. Did you mean 'gain'? It has: gain."
+    )
+    assert error(RecipeError, "reach", {"tolerence": 0.1}) == (
+        "task.tolerence: Reach has no parameter 'tolerence'. Did you mean 'tolerance'? "
+        "It has: tolerance, goal_low, goal_high, start_noise."
+    )
+    assert error(RecipeError, "Pendulum-v1", {"gg": 1}).startswith(
+        "task.gg: Pendulum-v1 has no parameter 'gg'. Did you mean 'g'?"
+    )
+
+
+def test_parameters_of_another_type():
+    assert error(RecipeError, "reach", {"tolerance": "abc"}) == ("task.tolerance: expected a number, got 'abc'")
+
+
+def test_what_only_tasks_have(my_env):
+    assert error(RecipeError, "my_env.py:MyEnv", reward_weights={"a": 1.0}) == (
+        "reward_weights: my_env.py:MyEnv is a plain Gymnasium environment; only tasks have them"
+    )
+    assert error(RecipeError, "my_env.py:MyEnv", events={"a": {}}).startswith("events: my_env.py:MyEnv is a plain")
+
+
+def test_make_randomises_when_it_is_asked_to(my_env):
+    import rlctl
+
+    def acting(**options):
+        env = rlctl.make("reach", **options)
+        env.close()
+        return set(env.unwrapped.events)
+
+    assert acting() == set()
+    assert acting(events={"mass": {"factor": (0.9, 1.1)}}) == {"mass"}
+    assert acting(randomize=True) > {"mass"}
+    with pytest.raises(RecipeError, match=r"^randomize: my_env\.py:MyEnv is a plain Gymnasium environment"):
+        rlctl.make("my_env.py:MyEnv", randomize=True)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("raise RuntimeError('no robot')", "import failed: RuntimeError: no robot (broken.py:1)"),
+        ("raise SystemExit(0)", "import failed: SystemExit: 0 (broken.py:1)"),
+        (
+            "import nothing_like_it",
+            "import failed: ModuleNotFoundError: No module named 'nothing_like_it' (broken.py:1)",
+        ),
+        ("import os; os._exit(7)", "import failed: SystemExit: os._exit(7)"),
+        ("x = = 1", "import failed: SyntaxError: invalid syntax (broken.py, line 1)"),
+        ("class E:\n    def __init__(self): 1 / 0", "ZeroDivisionError: division by zero (broken.py:2)"),
+    ],
+)
+def test_a_plugin_that_raises(write_module, source, message):
+    write_module("broken.py", source)
+    for _ in range(2):  # a half-imported module is not kept
+        with pytest.raises(TaskError) as caught:
+            EnvSpec("broken.py:E").make()
+        assert str(caught.value) == f"task 'broken.py:E': {message}"
+        assert ("Traceback" in caught.value.details) == ("SyntaxError" not in message)
+        assert 'broken.py", line' in caught.value.details
+        assert "importlib" not in caught.value.details
+        assert caught.value.exit_code == 3
+
+
+def test_an_alarm_in_a_module(rlctl, write_module):  # a process of its own: here, an alarm ends tests that hang
+    write_module("early.py", "import signal, time; signal.setitimer(signal.ITIMER_REAL, 0.01); time.sleep(60)")
+    done = rlctl("tasks", "show", "early.py:E")
+    assert done.returncode == 3
+    assert "import failed: TimeoutError: an alarm that the module sets goes off while it is imported" in done.stderr
+    write_module("late.py", "import signal; signal.alarm(60)\nclass E: pass")
+    done = rlctl("tasks", "show", "late.py:E")
+    assert done.stderr.startswith("warning: task 'late.py:E': its module sets an alarm; cancelled\n")
+
+
+def test_hints_that_cannot_be_read(write_module):
+    write_module(
+        "late.py",
+        """
+        from __future__ import annotations
+        from dataclasses import dataclass
+        from rlctl.task import Task
+
+        @dataclass
+        class Late(Task):
+            size: Missing = 1
+        """,
+    )
+    assert error(TaskError, "late.py:Late", {"size": 2}).startswith(
+        "task 'Late': NameError: name 'Missing' is not defined"
+    )
+
+
+def test_frames_are_stacked_oldest_first(my_env):
+    env = EnvSpec("my_env.py:MyEnv", frame_stack=3).make()
+    assert env.observation_space.shape == (6,)
+    assert env.reset(seed=0)[0].tolist() == [0.0] * 6
+    env.step(np.zeros(1))
+    observation = env.step(np.zeros(1))[0]
+    np.testing.assert_allclose(observation, [0, 0, 0.1, 0.1, 0.2, 0.2], atol=1e-7)
+    assert error(RecipeError, "FrozenLake-v1", frame_stack=2).startswith("frame_stack: only flat and image observ")
+
+
+def test_recipes_lie_beside_the_module(my_env, write_module):
+    assert registry.find_recipe_file("my_env.py:MyEnv") is None
+    recipe = write_module("my_env.yaml", "algo: sac")
+    assert registry.find_recipe_file("my_env.py:MyEnv") == Path("my_env.yaml")
+    assert registry.find_recipe_file("my_env:MyEnv") == recipe
+    assert registry.find_recipe_file("reach").name == "reach.yaml"
+    assert registry.find_recipe_file("rlctl_manipulation.reach:Reach") == registry.find_recipe_file("reach")
+    assert registry.find_recipe_file("Pendulum-v1") is None
+    assert registry.find_recipe_file("nothing") is None
+
+
+def test_folder_names_of_tasks():
+    names = {"reach": "reach", "a/b.py:MyEnv": "MyEnv", "pkg:ns/Env-v1": "ns-Env-v1", "x.py:../../..": "task"}
+    assert {task: registry.make_slug(task) for task in names} == names
+
+
+def test_where_a_task_comes_from():
+    assert registry.find_origin("reach") == {"distribution": "rlctl", "version": rlctl.__version__}
+    assert registry.find_origin("Pendulum-v1") == {}

@@ -1,0 +1,212 @@
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from rlctl.environments.spec import EnvChanges
+from rlctl.errors import AnswerIsNo, UsageError
+from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.group import GroupScore, SeedScore
+from rlctl.evaluation.report import as_json
+from rlctl.evaluation.score import measure_score
+from rlctl.evaluation.statistics import Spread, mean_terms, success_interval, success_rate
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.runs.summary import read_table
+from rlctl.training.request import TrainRequest, run_training
+from tests import fork_server
+from tests.training.conftest import ENVS, SMALL_PPO
+
+
+@pytest.fixture(scope="module")
+def reach_run(tmp_path_factory):
+    """A barely trained policy for reach: evaluation does not care how good it is."""
+    root = tmp_path_factory.mktemp("runs")
+    settings = {**SMALL_PPO, "eval": {"episodes": 2, "every_steps": 256}}
+    return run_training(TrainRequest("reach", settings=settings, root=root)).run
+
+
+@pytest.fixture(scope="module")
+def evaluation(reach_run):
+    return run_evaluation(EvalRequest(str(reach_run.path), episodes=6), Gates())
+
+
+def result(success, total=1.0, terms=None):
+    return EpisodeResult(0, 0, total, 10, success, terms or {}, None)
+
+
+def test_wilson_interval_by_hand():
+    results = [result(True)] * 8 + [result(False)] * 2
+    assert success_rate(results) == 0.8
+    # p = 0.8, n = 10, z = 1.959964: centre (p + z^2 / 2n) / (1 + z^2 / n) = (0.8 + 0.192073) / 1.384146 = 0.716741
+    # half width z / (1 + z^2 / n) * sqrt(p q / n + z^2 / 4 n^2) = 1.416010 * sqrt(0.016 + 0.00960365) = 0.226577
+    assert success_interval(results) == pytest.approx((0.490162, 0.943318), abs=1e-5)
+    # At the ends: [0, z^2 / (n + z^2)] and [n / (n + z^2), 1], z^2 = 3.841459.
+    assert success_interval(results[8:]) == (0.0, pytest.approx(3.841459 / 5.841459, abs=1e-6))
+    assert success_interval(results[:8]) == (pytest.approx(8 / 11.841459, abs=1e-6), 1.0)
+
+
+def test_no_success_is_not_zero_success():
+    assert success_rate([result(None)]) is None
+    assert success_interval([result(None)]) is None
+
+
+def test_spread_by_hand():
+    # Middle half of 0 1 2 3 4 5 6 100: 2 3 4 5, mean 3.5.
+    spread = Spread.of([100, 0, 1, 2, 3, 4, 5, 6])
+    assert spread.iqm == 3.5
+    assert spread.mean == 121 / 8
+    assert (spread.min, spread.max) == (0, 100)
+    assert Spread.of([1.0, 3.0]).std == pytest.approx(2**0.5)
+    assert Spread.of([1.0]).std == 0.0
+
+
+def test_mean_terms_add_up():
+    results = [result(True, 3.0, {"a": 1.0, "b": 2.0}), result(True, 5.0, {"a": 5.0, "b": 0.0})]
+    assert mean_terms(results) == {"a": 3.0, "b": 1.0}
+
+
+def test_an_episode_does_not_depend_on_what_runs_beside_it(reach_run, evaluation):
+    alone = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, n_envs=1), Gates())
+    assert [episode.result.total_reward for episode in alone.episodes] == [
+        episode.result.total_reward for episode in evaluation.episodes
+    ]
+    assert len({episode.result.seed for episode in evaluation.episodes}) == 6
+
+
+def test_evaluations_of_a_training_say_how_far_bodies_overlap(reach_run):
+    assert {row["overlap"] for row in read_table(reach_run.evals_file)} == {0.0}  # the arm touches nothing
+
+
+def test_terms_add_up_to_the_return(evaluation):
+    for episode in evaluation.episodes:
+        assert sum(episode.result.terms.values()) == pytest.approx(episode.result.total_reward)
+    assert evaluation.final_distance is not None
+    assert evaluation.final_distance.min > 0
+
+
+def test_json_has_what_ci_needs(evaluation):
+    content = as_json(evaluation)
+    assert {"success_rate", "success_interval", "return", "episodes", "task", "policy", "versions"} <= content.keys()
+    assert content["return"].keys() == {"mean", "iqm", "std", "min", "max"}
+    assert content["episodes"][2].keys() >= {"index", "seed", "success", "return", "length", "terms"}
+    assert content["return"]["mean"] == pytest.approx(np.mean([each["return"] for each in content["episodes"]]))
+    json.dumps(content, allow_nan=False)
+
+
+def test_tolerance_is_a_parameter(reach_run):
+    wide = EvalRequest(str(reach_run.path), episodes=4, changes=EnvChanges({"tolerance": 10.0}))
+    assert run_evaluation(wide, Gates()).success_rate == 1.0
+
+
+def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
+    shaken = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, changes=EnvChanges(randomize=True)), Gates())
+    offered = as_json(evaluation)["events"]
+    assert offered
+    assert not any(offered.values())
+    assert as_json(evaluation)["randomized"] is False
+    assert as_json(shaken)["randomized"] is True
+    assert as_json(shaken)["events"] == dict.fromkeys(offered, True)
+    assert [each.result.total_reward for each in shaken.episodes] != [
+        each.result.total_reward for each in evaluation.episodes
+    ]
+    plain = rlctl("eval", reach_run.path, "--episodes", 2)
+    assert "2 episodes, seed 0, not randomised" in plain.stdout
+    randomised = rlctl("eval", reach_run.path, "--episodes", 2, "--set", "randomize=true")
+    assert f"2 episodes, seed 0, randomised by {', '.join(offered)}" in randomised.stdout
+
+
+def test_stochastic_repeats_with_its_seed(reach_run):
+    request = EvalRequest(str(reach_run.path), episodes=2, deterministic=False)
+    first, second = (run_evaluation(request, Gates()).returns.mean for _ in range(2))
+    assert first == second
+    assert first != run_evaluation(EvalRequest(str(reach_run.path), episodes=2), Gates()).returns.mean
+
+
+@pytest.mark.parametrize(
+    ("gates", "message"),
+    [
+        (Gates(min_success=1.0), r"success rate 0\.\d+ is below 1"),
+        (Gates(min_success_lower=1.0), r"lower bound 0\.\d+ of the success rate is below 1"),
+        (Gates(min_return=1e9), "mean return .* is below 1e"),
+        (Gates(min_success=1.0, min_return=1e9), "success rate .*; mean return"),
+    ],
+)
+def test_gates(evaluation, gates, message):
+    with pytest.raises(AnswerIsNo, match=message):
+        gates.check(evaluation)
+
+
+@pytest.mark.parametrize("name", ["min_success", "min_success_lower"])
+def test_a_rate_is_between_0_and_1(name):
+    with pytest.raises(UsageError, match=r": a rate is between 0 and 1; 95 % is 0\.95$"):
+        Gates(**{name: 95})
+    with pytest.raises(UsageError, match=r": a rate is between 0 and 1$"):
+        Gates(**{name: -0.5})
+
+
+def test_a_return_to_reach_is_a_number():
+    with pytest.raises(UsageError, match="--min-return nan: every return would pass"):
+        Gates(min_return=math.nan)
+
+
+def test_a_gate_on_success_needs_success(tmp_path):
+    run = run_training(TrainRequest(f"{ENVS}:NoSuccess", settings=SMALL_PPO, root=tmp_path)).run
+    with pytest.raises(UsageError, match="--min-success: this task reports no success"):
+        run_evaluation(EvalRequest(str(run.path), episodes=2), Gates(min_success=0.5))
+    assert run_evaluation(EvalRequest(str(run.path), episodes=2), Gates(min_return=-1e9)).success_rate is None
+    seed = SeedScore(0, score=measure_score(EvalRequest(str(run.path), episodes=2)))
+    with pytest.raises(UsageError, match="--min-success: this task reports no success"):
+        GroupScore(None, [seed]).check(Gates(min_success_lower=0.5))
+
+
+def test_command_line_gate_and_pure_json(rlctl, reach_run, tmp_path):
+    done = rlctl(*("eval", str(reach_run.path), "--episodes", "3", "--min-success", "1", "--json", "-"), cwd=tmp_path)
+    assert done.returncode == 1
+    assert json.loads(done.stdout)["policy"]["training_steps"] == 256
+    assert done.stderr.strip().splitlines()[-1].startswith("error: gate missed: success rate 0")
+
+
+def test_policy_for_another_task_is_refused(rlctl, reach_run, tmp_path):
+    done = rlctl("eval", str(reach_run.best_policy), "--task", "Pendulum-v1", "--episodes", "1", cwd=tmp_path)
+    assert done.returncode == 5
+    assert "this policy is not for this task: its observation space is Box(" in done.stderr
+    assert ", the environment's is Box([-1. -1. -8.], [1. 1. 8.], (3,), float32)" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_no_run_yet(rlctl, tmp_path):
+    done = rlctl("eval", cwd=tmp_path)
+    assert done.returncode == 5
+    assert done.stderr == f"error: no run yet under {tmp_path / 'runs'}; train one: rlctl train reach\n"
+
+
+def test_a_run_without_a_best_policy(rlctl, reach_run, tmp_path):
+    run = tmp_path / "runs" / "reach" / "2026-01-01_00-00-00_s0"
+    run.mkdir(parents=True)
+    (run / "run.json").write_text('{"task": "reach"}')
+    done = rlctl("eval", "reach", cwd=tmp_path)
+    assert done.returncode == 5
+    assert "no best policy yet; train longer, or use --checkpoint last" in done.stderr
+
+
+def test_an_exported_policy_is_evaluated_alike_and_without_torch(reach_run, evaluation, tmp_path):
+    from rlctl.exporting.export import export_policy
+
+    exported = tmp_path / "policy.onnx"
+    export_policy(str(reach_run.path), ["onnx"], checkpoint="best", output=exported)
+    code = (
+        "import sys; from rlctl.cli import run\n"
+        f"code = run(['eval', {str(exported)!r}, '--task', 'reach', '--episodes', '6', '--n-envs', '1',"
+        " '--json', 'result.json'])\n"
+        "sys.exit(99 if {'torch', 'stable_baselines3', 'scipy'} & set(sys.modules) else code)"
+    )
+    done = fork_server.for_workers().run([sys.executable, "-c", code], cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    alike = json.loads((tmp_path / "result.json").read_text())["episodes"]
+    for ours, theirs in zip(alike, as_json(evaluation)["episodes"], strict=True):
+        assert [ours[key] for key in ("seed", "success", "length")] == [
+            theirs[key] for key in ("seed", "success", "length")
+        ]
+        assert ours["return"] == pytest.approx(theirs["return"], rel=1e-3)

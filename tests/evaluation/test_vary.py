@@ -1,0 +1,251 @@
+"""`rlctl eval --vary`: maps over events and parameters, with the same episodes in every cell."""
+
+import json
+
+import numpy as np
+import pytest
+
+from rlctl.environments.spec import EnvChanges, EnvSpec
+from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.evaluation.axes import change, read_axes
+from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.robustness_report import format_command
+from rlctl.evaluation.statistics import mean_interval
+from rlctl.evaluation.vary import check_gates, measure_robustness
+from rlctl.output import format_duration
+from rlctl.run.robustness import read
+from tests.evaluation.conftest import ENVS, write_run
+
+BLOCK = EnvSpec(f"{ENVS}:Block")
+
+
+@pytest.fixture(scope="module")
+def measured(block_run):
+    """The block's chance to stay, over the force of pushes and its mass."""
+    request = EvalRequest(str(block_run.path), episodes=5)
+    return measure_robustness(request, ["push=0:3:3", "mass=1:3:2"])
+
+
+def test_a_cell_is_the_evaluation_with_its_values(block_run, measured):
+    (found,) = measured.maps
+    assert [(axis.name, axis.setting, axis.values, axis.nominal) for axis in found.axes] == [
+        ("push", "events.push.force", [0.0, 1.5, 3.0], 0.0),
+        ("mass", "events.mass.factor", [1.0, 3.0], 1.0),
+    ]
+    assert [cell.values for cell in found.cells] == [[0, 1], [0, 3], [1.5, 1], [1.5, 3], [3, 1], [3, 3]]
+    changes = EnvChanges(randomize=False, events={"push": {"force": 1.5}, "mass": {"factor": 3.0}})
+    alone = run_evaluation(EvalRequest(str(block_run.path), episodes=5, changes=changes), Gates())
+    cell = found.cells[3]
+    assert (cell.success_rate, cell.success_interval) == (alone.success_rate, alone.success_interval)
+    assert cell.mean_return == alone.returns.mean
+    assert cell.return_interval == mean_interval([episode.result.total_reward for episode in alone.episodes])
+
+
+def test_nominal_and_worst_cells(measured):
+    (found,) = measured.maps
+    assert [cell.nominal for cell in found.cells] == [True, False, False, False, False, False]
+    assert measured.nominal.success_rate == found.cells[0].success_rate == 1.0
+    # The lightest block flies the furthest: 3 N for 0.1 s are 3 m/s.
+    assert measured.find_worst() == (found, found.cells[4])
+    assert found.cells[4].success_rate == 0.0
+
+
+def test_interval_of_the_mean_by_hand():
+    returns = [1.0, 2.0, 3.0, 6.0]
+    # Mean 3, standard deviation sqrt(14 / 3) = 2.160247, over sqrt(4): 1.080123; t of 3 degrees of freedom: 3.182446.
+    assert mean_interval(returns) == pytest.approx((3 - 3.437435, 3 + 3.437435), abs=1e-5)
+    assert mean_interval(returns[:1]) == (1.0, 1.0)
+
+
+def test_it_is_kept_with_the_run(block_run, measured):
+    assert read(block_run.robustness_file) == measured
+    block_run.robustness_file.write_text('{"format": 1, "task": 3}')
+    with pytest.raises(ArtifactError, match=r"robustness\.json: damaged: task"):
+        read(block_run.robustness_file)
+
+
+def test_parameters_of_the_task_are_varied_too(block_run):
+    request = EvalRequest(str(block_run.path), episodes=3)
+    result = measure_robustness(request, ["push.force=0:3:2", "limit=0.1:9:2"])
+    (found,) = result.maps
+    assert [cell.success_rate for cell in found.cells] == [1.0, 1.0, 0.0, 1.0]
+    assert [cell.nominal for cell in found.cells] == [True, False, False, False]
+    # What was measured with fewer episodes does not mix with what was there.
+    assert read(block_run.robustness_file).maps == result.maps
+
+
+def test_command_line_draws_the_map_and_gates_the_worst_cell(rlctl, block_run):
+    arguments = ("eval", block_run.path, "--episodes", 3, "--vary", "push=0:6:2", "--vary", "mass=1:2:2")
+    done = rlctl(*arguments, "--min-success", "0.5")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == (
+        "error: gate missed in the worst cell, push 6, mass 1: success rate 0.000 is below 0.5"
+    )
+    lines = done.stdout.splitlines()
+    assert lines[1:3] == [
+        "3 episodes in every cell, the same seeds (seed 0)",
+        "nominal: success 100.0% (43.9% to 100.0%), return " + lines[2].partition("return ")[2],
+    ]
+    assert [line.split() for line in lines[4:8]] == [
+        ["push", "\\", "mass", "1", "2"],
+        ["0", "100*", "100"],
+        ["6", "0<", "0"],
+        ["success", "[%];", "*", "nominal,", "<", "worst"],
+    ]
+    assert lines[9].startswith("worst: push 6, mass 1: success 0.0% (0.0% to 56.1%), return -")
+    assert lines[10] == (
+        f"the same episodes alone: rlctl eval {block_run.best_policy} --episodes 3 --seed 0 "
+        "--set randomize=false --set events.push.force=6 --set events.mass.factor=1"
+    )
+
+
+def test_the_command_for_one_cell_is_the_whole_of_it(measured):
+    (found,) = measured.maps
+    axis = found.axes[0].model_copy(update={"setting": "task.limit"})
+    cell = found.cells[0].model_copy(update={"values": [0.1234567891]})
+    found = found.model_copy(update={"axes": [axis]})
+    result = measured.model_copy(
+        update={
+            "policy_file": "my runs/best.safetensors",
+            "deterministic": False,
+            "parameters": {"goal": [1, 2], "limit": 3.0},
+            "reward_weights": {"distance": 0.5},
+            "events": {"mass": {"factor": [0.9, 1.1]}, "push": {}},
+        }
+    )
+    assert format_command(result, found, cell) == (
+        f"rlctl eval 'my runs/best.safetensors' --episodes {measured.episodes} --seed {measured.seed} --stochastic "
+        "--set 'task.goal=[1, 2]' --set task.limit=0.1234567891 --set reward_weights.distance=0.5 "
+        "--set 'events.mass.factor=[0.9, 1.1]' --set 'events.push={}' --set randomize=false"
+    )
+
+
+def test_command_line_as_json(rlctl, block_run):
+    done = rlctl("eval", block_run.path, "--episodes", 2, "--vary", "friction=0.2:1:2", "--json", "-")
+    content = json.loads(done.stdout)
+    assert content["maps"][0]["axes"][0]["nominal"] is None
+    assert [cell["values"] for cell in content["maps"][0]["cells"]] == [[0.2], [1.0]]
+
+
+def test_a_long_measurement_is_not_begun_unasked(block_run):
+    vary = ["push=0:3:1000", "mass=1:2:1000"]
+    with pytest.raises(
+        UsageError, match=r"1,000,000 cells will take about [\d.]+ (h|days): .*begin all the same: --yes"
+    ):
+        measure_robustness(EvalRequest(str(block_run.path), episodes=2), vary)
+    assert [format_duration(seconds) for seconds in (50, 600, 5400, 200_000)] == ["50 s", "10 min", "1.5 h", "2.3 days"]
+
+
+def test_gates_without_a_map_are_for_the_nominal_cell(measured):
+    alone = measured.model_copy(update={"maps": []})
+    check_gates(alone, Gates(min_success=1.0))
+    with pytest.raises(AnswerIsNo, match="in the worst cell, nominal: mean return"):
+        check_gates(alone, Gates(min_return=1.0))
+
+
+def test_all_events_over_twice_their_range():
+    maps = {axis.name: axis for (axis,) in read_axes(["all"], EnvSpec("reach"))}
+    assert "color" not in maps
+    # Twice as far from nominal: 1 for factors, 0 for noise, delays and shifts.
+    assert maps["mass"].values == pytest.approx([0.6, 0.8, 1.0, 1.2, 1.4])
+    assert maps["motor_strength"].values == pytest.approx([0.6, 0.7, 0.8, 0.9, 1.0])
+    assert maps["gravity"].values == pytest.approx([-1.0, -0.5, 0.0, 0.5, 1.0])
+    assert maps["action_delay"].values == [0, 1, 2, 3, 4]
+    assert maps["observation_delay"].values == [0, 1, 2]  # whole steps
+    # The built world's friction is not known: twice as far from the middle of (0.3, 1.5), as far as possible.
+    friction = {axis.name: axis for (axis,) in read_axes(["all"], BLOCK)}["friction"]
+    assert (friction.values[0], friction.values[-1], friction.nominal) == (0.0, pytest.approx(2.1), None)
+
+
+def test_an_event_that_acts_has_no_nominal_value():
+    spec = EnvSpec(BLOCK.task, randomize=True)
+    assert read_axes(["mass=0.5:2:4"], spec)[0][0].nominal is None
+
+
+@pytest.mark.parametrize(
+    ("vary", "message"),
+    [
+        (
+            ["masss=0.5:2:4"],
+            r"no event or number of that name\. Did you mean 'mass'\? It has: mass, friction, push, limit",
+        ),
+        (["push.forces=0:2:4"], r"event 'push' draws force, duration_s\. Did you mean 'force'\?"),
+        (["mass=0.5:2:1"], "1 value; to evaluate at one, use --set"),
+        (["mass=2:2:4"], "2 to 2 is no range"),
+        (["mass=2:0.5:4"], "2 to 0.5 is no range"),
+        (["mass=nan:2:4"], "nan to 2 is no range"),
+        (["mass=0.5:2"], "write NAME=LOWEST:HIGHEST:VALUES"),
+        (["mass"], "write NAME=LOWEST:HIGHEST:VALUES"),
+        (["mass=-1:2:4"], "-1 is not above 0"),
+        (["mass=1:2:9999999"], "at most 1,000,000 values"),
+        (["mass=1:2:2", "push=0:1:2", "friction=0:1:2"], "one or two things"),
+        (["all", "push=0:1:2"], "one or two things"),
+        (["mass=1:2:2", "mass.factor=1:2:2"], "events.mass.factor is there twice"),
+    ],
+)
+def test_bad_maps(vary, message):
+    with pytest.raises(UsageError, match=message):
+        read_axes(vary, BLOCK)
+
+
+def test_plain_environments_have_parameters_only():
+    (axis,) = read_axes(["g=9:11:3"], EnvSpec("Pendulum-v1"))[0]
+    assert (axis.setting, axis.nominal, axis.whole) == ("task.g", 10.0, False)
+    with pytest.raises(UsageError, match="Pendulum-v1 offers no events; name one of its parameters"):
+        read_axes(["all"], EnvSpec("Pendulum-v1"))
+
+
+@pytest.mark.parametrize(
+    ("vary", "values", "kind"),
+    [
+        ("typed=1:4:4", [1, 2, 3, 4], int),
+        ("typed=1:2:3", [1, 2], int),
+        ("untyped=1:4:4", [1, 2, 3, 4], int),
+        ("untyped=1:2:3", [1, 1.5, 2], float),  # its default, 2, may mean 2.0
+        ("real=1:4:4", [1, 2, 3, 4], float),
+    ],
+)
+def test_whole_numbers_of_plain_environments(vary, values, kind):
+    (axis,) = read_axes([vary], EnvSpec(f"{ENVS}:Chain"))[0]
+    assert axis.values == values
+    (value,) = change(axis, axis.values[0]).parameters.values()
+    assert type(value) is kind
+
+
+@pytest.mark.slow
+def test_map_of_a_plain_environment(tmp_path, rlctl):
+    run = write_run(tmp_path / "run", "Pendulum-v1")
+    done = rlctl("eval", run.path, "--episodes", 2, "--vary", "g=5:10:2")
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[4].split() == ["g", "return", "95", "%", "interval"]
+    assert [line.split()[0] for line in lines[5:7]] == ["5", "10"]
+    low, high = (cell.mean_return for cell in read(run.robustness_file).maps[0].cells)
+    assert low != high
+    refused = rlctl("eval", run.path, "--episodes", 2, "--vary", "g=5:10:2", "--min-success", "0.5")
+    assert refused.returncode == 2
+    assert "--min-success: this task reports no success" in refused.stderr
+
+
+def test_too_many_cells(block_run):
+    vary = ["push=0:3:2000", "mass=1:2:2000"]
+    with pytest.raises(UsageError, match="4,000,000 cells; at most 1,000,000"):
+        measure_robustness(EvalRequest(str(block_run.path), episodes=2), vary, yes=True)
+
+
+def test_events_set_in_a_standing_world_act_as_in_a_new_one():
+    changed = EnvSpec("reach", events={"mass": {"factor": 0.6}, "observation_delay": {"steps": 2}})
+    standing, fresh = EnvSpec("reach").make(), changed.make()
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, 7)).astype(np.float32)
+    try:
+        from rlctl.task.events import EventSettings
+
+        standing.reset(seed=1)
+        standing.step(actions[0])
+        standing.unwrapped.set_events(EventSettings(changes=changed.events))
+        np.testing.assert_array_equal(standing.reset(seed=2)[0], fresh.reset(seed=2)[0])
+        for action in actions:
+            np.testing.assert_array_equal(standing.step(action)[0], fresh.step(action)[0])
+    finally:
+        standing.close()
+        fresh.close()

@@ -1,0 +1,184 @@
+"""The C function does what the policy does, compiled with every warning."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import UsageError
+from rlctl.exporting.c_source import FLAGS, build_library, find_compiler, write_c
+from rlctl.exporting.export import export_policy
+from rlctl.policy.c_policy import CPolicy
+from rlctl.policy.policy import read_policy
+from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy
+from tests.exporting.test_export_graph import random_observations
+
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")
+STEPS = 30
+
+
+def write_source(path, name="policy"):
+    info, tensors = read_policy(path)
+    return info, write_c(info, tensors, name)
+
+
+@pytest.fixture
+def compiled(tmp_path):
+    """Compile a policy file, warnings are errors, and return the policy."""
+
+    def compile_policy(path):
+        info, code = write_source(path)
+        return CPolicy.load(build_library(code, info, tmp_path, [*find_compiler(), "-Werror"]))
+
+    return compile_policy
+
+
+def difference(path, policy):
+    """Largest difference between the policy file and C over an episode of random observations."""
+    torch_policy = TorchPolicy.load(path)
+    space = torch_policy.observation_space
+    stacked = torch_policy.info.spec.frame_stack
+    observations = random_observations(space, STEPS)
+    if stacked > 1:
+        size = space.shape[0] // stacked
+        frames = [observations[0][:size]] * (stacked - 1) + [row[:size] for row in observations]
+        observations = np.stack([np.concatenate(frames[step : step + stacked]) for step in range(STEPS)])
+    worst = 0.0
+    for _ in range(2):  # the second episode starts as the first
+        torch_policy.reset()
+        policy.reset()
+        for step in range(STEPS):
+            row = {key: part[step] for key, part in observations.items()} if isinstance(space, spaces.Dict) else None
+            row = observations[step] if row is None else row
+            expected, got = torch_policy.predict(row), policy.predict(row)
+            assert got.shape == expected.shape
+            assert got.dtype == expected.dtype or not isinstance(torch_policy.action_space, spaces.Box)
+            worst = max(worst, float(np.abs(got.astype(float) - expected).max()))
+    return worst
+
+
+CASES = [
+    ("ppo", "vector", "box", {}),
+    ("ppo", "vector", "box", {"use_sde": True, "policy_kwargs": {"squash_output": True, "net_arch": [16, 16]}}),
+    ("ppo", "multidiscrete", "multidiscrete", {}),
+    ("ppo", "parts", "wide", {}),
+    ("sac", "vector", "matrix", {"use_sde": True}),
+    ("td3", "double", "double", {}),
+    ("crossq", "vector", "box", {}),
+    ("dqn", "vector", "discrete", {}),
+    ("recurrent_ppo", "vector", "box", {"policy_kwargs": {"lstm_hidden_size": 8, "n_lstm_layers": 2}}),
+]
+SLOW_CASES = [
+    ("a2c", "discrete", "discrete", {}),
+    ("a2c", "multibinary", "multibinary", {}),
+    ("ddpg", "vector", "box", {}),
+    ("tqc", "vector", "box", {}),
+    ("recurrent_ppo", "vector", "discrete", {"policy_kwargs": {"lstm_hidden_size": 8}}),
+    *(("ppo", "vector", "box", {"policy_kwargs": {"activation_fn": each}}) for each in ACTIVATIONS.values()),
+]
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("algo", "observation", "action", "settings"),
+    [*CASES, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW_CASES)],
+)
+def test_c_acts_as_the_policy(algo, observation, action, settings, small, train, write, compiled):
+    spec = small(observation, action)
+    path = write(train(algo, spec, steps=0, **settings), algo, spec)
+    worst = difference(path, compiled(path))
+    assert worst <= (1e-2 if action == "wide" else 1e-5)
+
+
+@needs_compiler
+def test_hard_normalisation(small, train, write, compiled, odd_statistics):
+    model = train("ppo", small(), steps=0)
+    odd_statistics(model)
+    path = write(model, "ppo", small())
+    assert difference(path, compiled(path)) <= 1e-5
+
+
+@needs_compiler
+@pytest.mark.parametrize(("algo", "frames"), [("ppo", 3), pytest.param("recurrent_ppo", 1, marks=pytest.mark.slow)])
+def test_export_is_verified(algo, frames, small, train, write, tmp_path):
+    small_spec = small()
+    spec = EnvSpec(small_spec.task, small_spec.parameters, frame_stack=frames)
+    path = write(train(algo, spec, steps=0), algo, spec)
+    onnx, report = export_policy(str(path), ["onnx", "c"], checkpoint="best", output=None)
+    assert (onnx.path, report.path) == (path.with_suffix(".onnx"), path.with_suffix(".c"))
+    assert report.agreement.observations >= 2000
+    assert report.agreement.agrees
+    assert report.closed_loop.agrees
+    assert not report.not_verified
+    assert report.size == report.path.stat().st_size + report.details["header"].stat().st_size
+    assert report.as_json()["verified"] is True
+    assert report.latency.exported_us > 0  # a fifth of ONNX Runtime's or less, on an idle machine
+    assert "policy_state *state" in report.details["prototype"]
+    header = report.details["header"].read_text()
+    assert "#define POLICY_OBSERVATION_SIZE 3" in header
+    assert ("frames[9]" in header) == (frames == 3)
+
+
+def test_without_a_compiler_it_is_not_verified(small, train, write, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    path = write(train("ppo", small(), steps=0), "ppo", small())
+    (report,) = export_policy(str(path), ["c"], checkpoint="best", output=path.with_name("my policy-2.c"))
+    assert report.path.is_file()
+    assert report.details["header"].name == "my_policy_2.h"
+    assert report.as_json()["verified"] is False
+    assert ("not verified", "no C compiler (cc, or $CC) on this machine") in report.list_rows()
+
+
+def test_images_are_refused(small, train, write):
+    with pytest.raises(UsageError, match=r"^export --c: images cannot be written as C; rlctl export --onnx can$"):
+        write_source(write(train("ppo", small("image"), steps=0), "ppo", small("image")))
+
+
+@pytest.mark.slow
+def test_what_c_cannot_carry_is_refused_on_the_command_line(rlctl, small, train, write, tmp_path):
+    path = write(train("ppo", small("image"), steps=0), "ppo", small("image"))
+    done = rlctl("export", path.name, "--c", "--onnx", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "error: export --c: images cannot be written as C; rlctl export --onnx can\n"
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
+def test_name_of_the_output(small, train, write, tmp_path):
+    path = write(train("ppo", small(), steps=0), "ppo", small())
+    with pytest.raises(UsageError, match=r"the name of a C file ends in \.c"):
+        export_policy(str(path), ["c"], checkpoint="best", output=tmp_path / "policy.onnx")
+
+
+@needs_compiler
+def test_names_of_a_stranger_stay_in_their_comments(small, train, write, tmp_path):
+    model = train("ppo", small(), steps=0)
+    path = write(model, "ppo", small())
+    info, tensors = read_policy(path)
+    evil = '*/ #error "out"\n#error "line" /* \\'
+    env = info.env.model_copy(update={"action_meaning": evil, "robot": evil, "observation_sizes": {evil: 3}})
+    info = info.model_copy(update={"env": env})
+    code = write_c(info, tensors, "int")
+    assert code.name == "int"
+    build_library(code, info, tmp_path, [*find_compiler(), "-Werror"])
+
+
+@needs_compiler
+def test_header_is_for_c_plus_plus_too(small, train, write, tmp_path):
+    if shutil.which("c++") is None:
+        pytest.skip("no C++ compiler")
+    _, code = write_source(write(train("ppo", small(), steps=0), "ppo", small()))
+    (tmp_path / "policy.h").write_text(code.header)
+    (tmp_path / "policy.c").write_text(code.source)
+    (tmp_path / "main.cpp").write_text(
+        '#include "policy.h"\nint main() { float observation[POLICY_OBSERVATION_SIZE] = {}; '
+        "float action[POLICY_ACTION_SIZE]; policy_act(observation, action); }\n"
+    )
+    for command in (
+        [*find_compiler(), *FLAGS, "-c", "policy.c"],
+        ["c++", "main.cpp", "policy.o", "-lm", "-o", "main"],
+        ["./main"],
+    ):
+        subprocess.run(command, cwd=tmp_path, check=True)

@@ -1,0 +1,98 @@
+"""Pickles and tensors are read as plain data: nothing in them is run, and none takes all memory."""
+
+import io
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from rlctl.importing import pickle_data, sb3_model
+from rlctl.importing.pickle_data import NotPlainData, read_array
+from rlctl.importing.sb3_model import read_space, read_tensors
+
+
+@pytest.mark.parametrize("protocol", range(6))
+@pytest.mark.parametrize(
+    "value", [np.arange(6.0).reshape(2, 3), np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3)),
+              np.float32(3.5), np.zeros((0, 3)), np.array([True, False]), np.arange(3, dtype=">i4")],
+)  # fmt: skip
+def test_arrays_of_every_protocol(protocol, value):
+    read = read_array(pickle_data.read(pickle.dumps(value, protocol)))
+    assert read.dtype == value.dtype
+    np.testing.assert_array_equal(read, value)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"garbage", b"]", b"\x80\x04.", pickle.dumps([1, 2])[:-1], b"cos\nsystem\n(S'true'\ntRb.", b"0.", b"h\x01.",
+     b"t.", b"(b.", b"R.", b"N}s."],
+)  # fmt: skip
+def test_damaged_pickles_are_refused(content):
+    with pytest.raises(NotPlainData):
+        pickle_data.read(content)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(-2.0, np.array([1.0, 3.0], np.float32), (2,)),
+        spaces.Discrete(4),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.Dict({"a": spaces.Box(0, 255, (2, 2), np.uint8), "b": spaces.Discrete(2)}),
+    ],
+    ids=lambda space: type(space).__name__,
+)
+def test_spaces_of_the_old_gym_and_of_an_older_numpy(space):
+    space.seed(0)  # its generator, which is in the pickle too, is not looked at
+    content = pickle.dumps(space, 2)  # names of this protocol are plain text
+    old = content.replace(b"gymnasium.spaces", b"gym.spaces").replace(b"numpy._core", b"numpy.core")
+    assert old != content
+    assert read_space(pickle_data.read(old)) == space
+
+
+class Greeting:
+    def __reduce__(self):
+        return print, ("hello",)
+
+
+def test_objects_are_data():
+    read = pickle_data.read(pickle.dumps({"call": Greeting(), "list": [1, (2.5, "x")], "none": None}))
+    assert str(read["call"].function) == "builtins.print"
+    assert read["call"].arguments == ("hello",)
+    assert read["list"] == [1, (2.5, "x")]
+
+
+def test_tensors_cannot_reach_out_of_their_storage():
+    buffer = io.BytesIO()
+    torch.save({"a": torch.arange(6.0).reshape(2, 3).T}, buffer)
+    np.testing.assert_array_equal(read_tensors(buffer.getvalue())["a"], np.arange(6.0).reshape(2, 3).T)
+    with zipfile.ZipFile(buffer) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = next(each for each in members if each.endswith("data/0"))
+    members[name] = members[name][:8]
+    short = io.BytesIO()
+    with zipfile.ZipFile(short, "w") as archive:
+        for each, content in members.items():
+            archive.writestr(each, content)
+    with pytest.raises(NotPlainData, match="reaches out of its storage"):
+        read_tensors(short.getvalue())
+
+
+def test_tensors_cannot_repeat_their_storage_without_end(monkeypatch):
+    def saved(state):
+        buffer = io.BytesIO()
+        torch.save(state, buffer)
+        return buffer.getvalue()
+
+    repeated = torch.ones(1).expand(1_000_000, 1_000_000)
+    with pytest.raises(NotPlainData, match="larger than its storage"):
+        read_tensors(saved({"a": repeated}))
+    shared = torch.ones(100)
+    content = saved({str(number): shared for number in range(11)})
+    assert len(read_tensors(content)) == 11
+    monkeypatch.setattr(sb3_model, "LARGEST_MEMBER", 4_000)
+    with pytest.raises(NotPlainData, match="more than 4,000 bytes"):
+        read_tensors(content)

@@ -1,0 +1,112 @@
+"""Child processes: what they are given, what they print, how they end, and that nothing is left of them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from rlctl.processes.child_process import ChildProcess, LineReader
+
+HERE = "tests.processes.test_child_process"
+
+
+def answer(connection, **arguments):
+    """What children do here: they print, say what they were given, and wait."""
+    print("out")
+    print("err", file=sys.stderr, flush=True)
+    given = {**arguments, "threads": os.environ["OMP_NUM_THREADS"], "hash": os.environ.get("PYTHONHASHSEED", "")}
+    connection.send_bytes(json.dumps(given).encode())
+    if arguments.get("exits"):
+        os._exit(arguments["exits"])
+    if arguments.get("starts"):
+        child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+        connection.send_bytes(str(child.pid).encode())
+    connection.recv_bytes()
+
+
+@pytest.fixture
+def started():
+    """Starts children, and returns the lines that they print."""
+    children, lines = [], []
+
+    def start(**arguments):
+        reader = LineReader(lines.append)
+        child = ChildProcess(
+            f"{HERE}:answer",
+            arguments,
+            stdout=reader.descriptor,
+            stderr=reader.descriptor,
+            env={"PYTHONHASHSEED": "7"},
+        )
+        reader.close_descriptor()
+        children.append(child)
+        return child, reader, lines
+
+    yield start
+    for child in children:
+        child.close()
+
+
+def is_alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_until_dead(pid):
+    deadline = time.monotonic() + 60
+    while is_alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return not is_alive(pid)
+
+
+def test_a_child_gets_its_arguments_and_its_lines_are_read(started):
+    child, reader, lines = started(number=3)
+    assert json.loads(child.connection.recv_bytes()) == {"number": 3, "threads": "1", "hash": "7"}
+    child.connection.send_bytes(b"go on")
+    assert child.describe_end() == "ended with exit code 0"
+    reader.wait()
+    assert sorted(lines) == ["err", "out"]
+
+
+def test_how_a_child_ended_is_reported(started):
+    child, *_ = started(exits=9)
+    assert child.describe_end() == "ended with exit code 9"
+    child, *_ = started()
+    child.connection.recv_bytes()
+    os.kill(child.process.pid, signal.SIGABRT)
+    assert child.describe_end() == "was killed by SIGABRT"
+
+
+def test_closing_kills_what_the_child_has_started(started):
+    child, *_ = started(starts=True)
+    child.connection.recv_bytes()
+    grandchild = int(child.connection.recv_bytes())
+    child.close()
+    child.close()
+    assert child.process.poll() == -signal.SIGKILL
+    assert wait_until_dead(grandchild)
+
+
+def test_a_child_ends_with_its_parent():
+    script = (
+        f"from rlctl.processes.child_process import ChildProcess; import os, sys; "
+        f"child = ChildProcess('{HERE}:answer', {{}}, stdout=2, stderr=2); child.connection.recv_bytes(); "
+        f"print(child.process.pid, flush=True); os._exit(0)"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=250, check=True)
+    assert wait_until_dead(int(run.stdout))
+
+
+def test_a_child_does_not_end_by_ctrl_c(started):
+    child, *_ = started()
+    child.connection.recv_bytes()
+    os.kill(child.process.pid, signal.SIGINT)
+    child.connection.send_bytes(b"go on")
+    assert child.describe_end() == "ended with exit code 0"

@@ -1,0 +1,62 @@
+"""The models of the algorithms' parameters are SB3's signatures, and `docs/recipe.md` is made from them."""
+
+import inspect
+from pathlib import Path
+
+import pytest
+
+from rlctl.policy.torch_policy import ACTIVATIONS
+from rlctl.policy.torch_policy import ALGORITHMS as CLASSES
+from rlctl.recipe import reference
+from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
+from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
+from rlctl.recipe.recipe import ALGORITHMS
+
+# Set by rlctl itself, or not plain data.
+NOT_FOR_RECIPES = {
+    *("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log", "policy_kwargs", "_init_setup_model"),
+    "optimize_memory_usage",  # a checkpoint needs the whole buffer
+    "stats_window_size",  # of means that nothing shows: metrics have those since the row before
+    *("rollout_buffer_class", "rollout_buffer_kwargs", "replay_buffer_class", "replay_buffer_kwargs"),
+}
+NOT_FOR_POLICIES = {
+    *("self", "observation_space", "action_space", "lr_schedule", "optimizer_class", "optimizer_kwargs"),
+    *("features_extractor_class", "use_sde", "normalize_images"),
+}
+
+
+def defaults(function, without):
+    parameters = inspect.signature(function).parameters.items()
+    return {name: parameter.default for name, parameter in parameters if name not in without}
+
+
+def of_model(model):
+    found = {name: field.default for name, field in model.model_fields.items()}
+    if "activation_fn" in found:
+        found["activation_fn"] = ACTIVATIONS[found["activation_fn"]]
+    return found
+
+
+def test_every_algorithm_has_its_models():
+    assert tuple(ALGORITHM_PARAMETERS) == tuple(NETWORK_PARAMETERS) == ALGORITHMS == tuple(CLASSES)
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_names_and_defaults_are_those_of_sb3(algo):
+    cls = CLASSES[algo]
+    assert of_model(ALGORITHM_PARAMETERS[algo]) == defaults(cls.__init__, NOT_FOR_RECIPES)
+    for policy in cls.policy_aliases.values():
+        assert of_model(NETWORK_PARAMETERS[algo]) == defaults(policy.__init__, NOT_FOR_POLICIES)
+
+
+def test_the_page_is_current():
+    page = Path(__file__).parents[2] / "docs" / "recipe.md"
+    assert page.read_text(encoding="utf-8") == reference.render(), (
+        "write it again: python -m rlctl.recipe.reference > docs/recipe.md"
+    )
+
+
+def test_every_key_has_a_meaning_and_what_it_may_be():
+    rows = [line.split("|")[1:-1] for line in reference.render().splitlines() if line.startswith("| `")]
+    assert len(rows) > 200
+    assert all(value.strip() not in ("", "any value") and meaning.strip() for _, value, _, meaning in rows)

@@ -1,0 +1,61 @@
+"""`rlctl replay --video`: films without a display."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from rlctl.errors import UsageError
+from rlctl.replaying.replay import ReplayRequest, run_replay
+from rlctl.run.episode import save_episode
+from tests.replaying.conftest import play
+
+
+@pytest.fixture(scope="module")
+def short_episode(reached, tmp_path_factory):
+    """The first nine steps of an episode of reach."""
+    path = tmp_path_factory.mktemp("short") / "1.npz"
+    episode = reached.episode
+    steps = {"actions": episode.actions[:9], "rewards": episode.rewards[:9], "terms": episode.terms[:9]}
+    save_episode(path, dataclasses.replace(episode, observations=episode.observations[:10], **steps))
+    return path
+
+
+def test_gif_of_a_robot_and_its_goal(short_episode, tmp_path):
+    film = run_replay(ReplayRequest(str(short_episode), video=tmp_path / "reach.gif")).film
+    # 60 steps a second, 20 pictures: those of the steps 0, 3, 6 and 9, which is the end.
+    assert (film.pictures, film.width, film.height, film.rate) == (4, 400, 300, pytest.approx(20))
+    with Image.open(film.file) as image:
+        assert image.n_frames >= 4  # equal ones at the end are one
+        picture = np.array(image.convert("RGB")).astype(int)
+    red, green, blue = picture[..., 0], picture[..., 1], picture[..., 2]
+    assert ((green > 100) & (red < 60) & (blue < 120)).sum() > 20  # the goal
+    assert ((red > 180) & (green < 130) & (blue < 60)).sum() > 200  # the arm's joints
+
+
+def test_mp4_plays(short_episode, tmp_path):
+    av = pytest.importorskip("av")
+    film = run_replay(ReplayRequest(str(short_episode), video=tmp_path / "reach.mp4")).film
+    with av.open(str(film.file)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+        assert container.streams.video[0].average_rate == 30
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(pictures) == film.pictures + 15  # half a second at the end
+    assert pictures[0].shape == (480, 640, 3)
+    assert np.ptp(pictures[0]) > 100
+
+
+def test_pictures_of_a_plain_environment(tmp_path):
+    rollout, _ = play("Pixels")
+    save_episode(tmp_path / "one.npz", rollout.episode)
+    film = run_replay(ReplayRequest(str(tmp_path / "one.npz"), video=tmp_path / "film.gif")).film
+    assert (film.pictures, film.width, film.height, film.rate) == (11, 60, 40, pytest.approx(20))
+
+
+def test_an_environment_without_pictures(tmp_path):
+    rollout, _ = play("Blind")
+    save_episode(tmp_path / "one.npz", rollout.episode)
+    with pytest.raises(UsageError, match=r"^--video: no pictures: .*Blind takes no render_mode$"):
+        run_replay(ReplayRequest(str(tmp_path / "one.npz"), video=tmp_path / "film.gif"))
+    assert not (tmp_path / "film.gif").exists()

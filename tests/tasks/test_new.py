@@ -1,0 +1,179 @@
+"""`rlctl tasks new`: the plugin it writes works as it is, installed or not."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from rlctl.environments import registry
+from rlctl.errors import UsageError
+from rlctl.tasks import new
+from tests import fork_server
+
+ROOT = Path(__file__).parent.parent
+FILES = {
+    "README.md",
+    "pyproject.toml",
+    "my_arm/__init__.py",
+    "my_arm/arm.urdf",
+    "my_arm/task.py",
+    "my_arm/task.yaml",
+    "tests/test_task.py",
+}
+PATH_FORM = "my-arm/my_arm/task.py:MyArm"
+
+
+def run(*arguments: object, cwd: Path, path: Path | None = None) -> str:
+    """Run a Python module in `cwd`, with `path` before the installed packages; return its stdout."""
+    env = {**os.environ, **({"PYTHONPATH": str(path)} if path else {})}
+    command = [sys.executable, "-m", *map(str, arguments)]
+    done = fork_server.for_commands().run(command, cwd=cwd, env=env)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def written(folder: Path) -> set[str]:
+    return {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch):
+    """A plugin `my-arm` in the current folder, `tmp_path`."""
+    monkeypatch.chdir(tmp_path)
+    return new.create("my-arm")
+
+
+def test_what_is_written_and_printed(rlctl, tmp_path):
+    result = rlctl("tasks", "new", "my-arm")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert written(tmp_path / "my-arm") == FILES
+    assert [file.name for file in tmp_path.iterdir()] == ["my-arm"]  # nothing temporary is left
+    assert f"  rlctl check-env {PATH_FORM}" in result.stdout.splitlines()
+    text = "".join(file.read_text() for file in (tmp_path / "my-arm").rglob("*") if file.is_file())
+    assert "$" not in text
+
+
+def test_json(rlctl):
+    content = json.loads(rlctl("tasks", "new", "my-arm", "--json", "-").stdout)
+    assert (content["name"], content["folder"], content["target"]) == ("my-arm", "my-arm", PATH_FORM)
+    assert set(content["files"]) == {f"my-arm/{file}" for file in FILES}
+
+
+def test_it_reads_like_the_rest(plugin):
+    run("ruff", "format", "--check", "--isolated", "--line-length", "120", cwd=plugin.folder)
+    # Without RUF012: a task assigns its definition on the class, without annotations.
+    rules = "E,F,W,I,UP,B,SIM,C4,PT,RET,PIE,NPY"
+    run("ruff", "check", "--isolated", "--line-length", "120", "--select", rules, cwd=plugin.folder)
+
+
+def test_it_passes_every_check_before_it_is_installed(rlctl, plugin):
+    result = rlctl("check-env", PATH_FORM, "--strict")
+    assert result.returncode == 0, result.stdout
+    assert "no findings" in result.stdout
+
+
+def test_its_own_tests_pass_before_it_is_installed(plugin, tmp_path):
+    assert "4 passed" in run("pytest", "-q", "-p", "no:cacheprovider", "my-arm", cwd=tmp_path)
+
+
+def test_its_recipe_is_found_installed_or_not(rlctl, plugin, install, tmp_path):
+    assert registry.find_recipe_file(PATH_FORM) == Path("my-arm/my_arm/task.yaml")
+    files = {str(file): (plugin.folder / file).read_text() for file in plugin.files if file.parts[0] == "my_arm"}
+    site = install("my-arm", {"my-arm": "my_arm.task:MyArm"}, files)
+    shown = json.loads(rlctl("tasks", "show", "my-arm", "--json", "-", path=site).stdout)
+    assert shown["recipe_file"] == str(site / "my_arm/task.yaml")
+    assert (shown["distribution"], shown["recipe"]["n_envs"]) == ("my-arm", 32)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "my arm",
+            "name 'my arm': use letters, digits, - and _, with a letter first and no sign last, such as 'my-arm'",
+        ),
+        ("3d", "use letters, digits, - and _, with a letter first and no sign last, such as 'd'"),
+        ("arm-", "such as 'arm'"),
+        ("../arm", "such as 'arm'"),
+        ("", "name '': use letters"),
+        ("reach", "a task 'reach' is installed already, by rlctl "),
+        ("tests", "the plugin's tests are in a folder of that name"),
+        ("latest", "means the newest run"),
+        ("class", "class is a word of Python"),
+        ("numpy", "there is a module 'numpy' already"),
+        ("stable-baselines3", "there is a module 'stable_baselines3' already"),
+        ("sb3-contrib", "there is a module 'sb3_contrib' already"),
+    ],
+)
+def test_names_that_cannot_be(tmp_path, monkeypatch, name, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError) as caught:
+        new.create(name)
+    assert message in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "cls"),
+    [
+        ("my-arm", "my_arm", "MyArm"),
+        ("Gripper2", "gripper2", "Gripper2"),
+        ("pick_and-place", "pick_and_place", "PickAndPlace"),
+        ("box", "box", "BoxTask"),  # the template imports a Box
+        ("none", "none", "NoneTask"),
+    ],
+)
+def test_names_made_from_the_name(tmp_path, monkeypatch, name, package, cls):
+    monkeypatch.chdir(tmp_path)
+    plugin = new.create(name)
+    assert (plugin.package, plugin.cls) == (package, cls)
+    for file in tmp_path.rglob("*.py"):
+        compile(file.read_text(), file, "exec")
+
+
+def test_an_existing_folder_is_left_alone(rlctl, tmp_path):
+    (tmp_path / "my-arm").mkdir()
+    result = rlctl("tasks", "new", "my-arm")
+    assert result.returncode == 2
+    assert result.stderr == "error: my-arm exists already; choose another name, or go to another folder\n"
+    assert written(tmp_path) == set()
+
+
+def test_whole_or_not_at_all(tmp_path):
+    with pytest.raises(OSError):  # noqa: PT011 (which one depends on the system)
+        new.write_files(tmp_path / "arm", {Path("a"): "a file", Path("a/b"): "in a folder of the same name"})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_another_process_wrote_meanwhile_stays(tmp_path):
+    (tmp_path / "arm").mkdir()
+    (tmp_path / "arm" / "theirs").write_text("precious")
+    with pytest.raises(OSError):  # noqa: PT011
+        new.write_files(tmp_path / "arm", {Path("ours"): ""})
+    assert written(tmp_path) == {"arm/theirs"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_from_the_wheel_to_a_policy(tmp_path):
+    options = ("--no-deps", "--no-build-isolation", "--quiet")
+    run("pip", "wheel", *options, "--wheel-dir", tmp_path / "dist", ROOT, cwd=tmp_path)
+    (wheel,) = (tmp_path / "dist").glob("rlctl-*.whl")
+    site = tmp_path / "site"
+    run("pip", "install", "--no-deps", "--quiet", "--target", site, wheel, cwd=tmp_path)
+    files = json.loads(run("rlctl", "tasks", "new", "my-arm", "--json", "-", cwd=tmp_path, path=site))["files"]
+    assert set(files) == {f"my-arm/{file}" for file in FILES}
+
+    run("pip", "install", *options, "--target", site, "./my-arm", cwd=tmp_path)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    shown = json.loads(run("rlctl", "tasks", "show", "my-arm", "--json", "-", cwd=empty, path=site))
+    assert shown["file"] == str(site / "my_arm/task.py")
+    run("rlctl", "check-env", "my-arm", "--strict", cwd=empty, path=site)
+    run("pytest", "-q", "-p", "no:cacheprovider", tmp_path / "my-arm", cwd=empty, path=site)
+    for seed in range(3):
+        result = json.loads(run("rlctl", "train", "my-arm", "--seed", seed, "--json", "-", cwd=empty, path=site))
+        assert result["best"]["episodes"] == 40
+        assert result["best"]["success_rate"] >= 0.95

@@ -1,0 +1,163 @@
+"""A run that was killed and resumed is the run that was never stopped, bit for bit."""
+
+import pytest
+
+from rlctl.recipe import recipe as recipes
+from rlctl.rollout.workers import available_cores
+from rlctl.training import saving
+from rlctl.training.vec_env import WorkerVecEnv
+from tests.training.comparing import Killed, assert_same_run, rows
+from tests.training.conftest import FAULTY, SMALL
+
+ON_POLICY = {"ppo": {"n_steps": 16, "batch_size": 32, "n_epochs": 2}, "a2c": {"n_steps": 16}}
+ON_POLICY["recurrent_ppo"] = ON_POLICY["ppo"]
+OFF_POLICY = {"learning_starts": 24, "batch_size": 16, "buffer_size": 200, "train_freq": 4, "gradient_steps": 2}
+SHORT = {"total_timesteps": 128, "eval": {"episodes": 3, "every_steps": 64}}
+
+
+def settings(algo, **changes):
+    if algo in ON_POLICY:
+        return recipes.merge({**SMALL, "algo": algo, "algo_kwargs": ON_POLICY[algo]}, changes)
+    given = {**SMALL, **SHORT, "algo": algo, "algo_kwargs": OFF_POLICY, "policy_kwargs": {"net_arch": [16]}}
+    return recipes.merge(given, changes)
+
+
+SDE = {"algo_kwargs": {"use_sde": True}}
+NORMALIZED = {"normalize": {"observation": True, "reward": True}}
+STAGES = {
+    "stages": [{"task": {"tolerance": 0.5}, "promote": {"success": 0.5, "window": 6}}, {"task": {"tolerance": 0.3}}]
+}
+CASES = {
+    "ppo": ("Line", settings("ppo")),
+    "ppo with gSDE": ("Line", settings("ppo", **SDE)),
+    "ppo, resampled gSDE": ("Line", settings("ppo", algo_kwargs={"use_sde": True, "sde_sample_freq": 4})),
+    "ppo, falling rate": ("Line", settings("ppo", algo_kwargs={"learning_rate": "lin_1e-3", "clip_range": "lin_0.2"})),
+    "ppo, discrete": ("Discrete", settings("ppo")),
+    "ppo, dict": ("DictObservation", settings("ppo")),
+    "ppo, image": ("Image", settings("ppo", total_timesteps=192)),
+    "ppo, frame stack": ("Line", settings("ppo", frame_stack=3)),
+    "ppo, curriculum": ("Staged", settings("ppo", **STAGES)),
+    "ppo, stochastic evaluation": ("Line", settings("ppo", eval={"deterministic": False}, **SDE)),
+    "ppo, other observations than declared": (f"{FAULTY}:Outside", settings("ppo")),
+    "ppo, on reach": ("reach", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
+    "ppo, on hopper": ("hopper", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
+    "a2c": ("Line", settings("a2c")),
+    "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
+    "sac": ("Line", settings("sac", algo_kwargs={"train_freq": 1}, policy_kwargs={"net_arch": [256, 256]})),
+    "sac with gSDE": ("Line", settings("sac", **SDE)),
+    "sac, normalised": ("Line", settings("sac", **NORMALIZED)),
+    "sac, dict": ("DictObservation", settings("sac", **NORMALIZED)),
+    "sac, curriculum": ("Staged", settings("sac", **STAGES)),
+    "sac, several steps": ("Line", settings("sac", algo_kwargs={"n_steps": 3})),
+    "sac, one environment": ("Line", settings("sac", n_envs=1)),
+    "sac, hindsight": ("Plane", settings("sac", her={}, task={"steps": 7})),
+    "sac, hindsight, normalised": ("Plane", settings("sac", her={}, task={"steps": 7}, **NORMALIZED)),
+    "dqn, hindsight": ("Corridor", settings("dqn", her={"goal_selection_strategy": "final"}, task={"steps": 7})),
+    "td3": ("Line", settings("td3")),
+    "ddpg": ("Line", settings("ddpg")),
+    "dqn": ("Discrete", settings("dqn", algo_kwargs={"target_update_interval": 20})),
+    "tqc": ("Line", settings("tqc")),
+    "crossq": ("Line", settings("crossq")),
+}
+# A kind of state each: noise matrices, stages, a world of PyBullet with contacts, hidden states, whole episodes with
+# their goals and statistics, a target network. Killed trainings of plain ppo and sac are in tests/crash.
+QUICK = {
+    *("ppo with gSDE", "ppo, curriculum", "ppo, on hopper", "recurrent_ppo", "sac, hindsight, normalised", "dqn"),
+}
+
+
+@pytest.fixture
+def kill_after(monkeypatch):
+    """End the training in the middle of a step, so many steps of each environment after it began."""
+
+    def kill(steps):
+        done = asked = 0
+        started, finished = WorkerVecEnv.start, WorkerVecEnv.finish
+
+        def killed():
+            raise Killed
+
+        def start(env, count, exploration):
+            nonlocal asked
+            asked = count
+            started(env, count, exploration)
+
+        def finish(env, check=None):
+            nonlocal done
+            segment = finished(env, killed if done + asked > steps else check)  # while the workers play
+            done += segment.reward.shape[1]
+            return segment
+
+        def undo():
+            monkeypatch.setattr(WorkerVecEnv, "start", started)
+            monkeypatch.setattr(WorkerVecEnv, "finish", finished)
+
+        monkeypatch.setattr(WorkerVecEnv, "start", start)
+        monkeypatch.setattr(WorkerVecEnv, "finish", finish)
+        return undo
+
+    return kill
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
+@pytest.mark.usefixtures("every_boundary")
+def test_killed_and_resumed(train, resume, kill_after, case):
+    env, given = CASES[case]
+    whole = train(env, given).run
+    undo = kill_after(0)  # in the first step
+    with pytest.raises(Killed):
+        train(env, given)
+    undo()
+    run = newest_other_than(whole)
+    assert [int(each.name) for each in run.checkpoints()] == [0]
+    for steps in (37, 11) if given["algo"] in ON_POLICY else (13, 5):
+        undo = kill_after(steps)
+        with pytest.raises(Killed):
+            resume(run)
+        undo()
+        assert int(run.checkpoints()[-1].name) > 0
+    resume(run)
+    assert_same_run(whole, run)
+
+
+@pytest.mark.usefixtures("every_boundary")
+def test_on_one_core_and_resumed_on_all(train, resume, kill_after, use_cores):
+    env, given = CASES["ppo"]
+    whole = train(env, given).run
+    undo = kill_after(37)
+    with use_cores(1):
+        assert available_cores() == 1
+        with pytest.raises(Killed):
+            train(env, given)
+    undo()
+    run = newest_other_than(whole)
+    with use_cores():
+        resume(run)
+    assert_same_run(whole, run)
+
+
+def newest_other_than(run):
+    from rlctl.run.directory import RunDirectory
+
+    (other,) = (each for each in run.path.parent.iterdir() if each != run.path)
+    return RunDirectory(other)
+
+
+@pytest.mark.parametrize(
+    ("case", "steps", "evaluated"), [("ppo", 40, "128"), pytest.param("dqn", 20, "64", marks=pytest.mark.slow)]
+)
+def test_an_evaluation_after_the_last_checkpoint(train, resume, kill_after, monkeypatch, case, steps, evaluated):
+    monkeypatch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e-9)
+    env, given = CASES[case]
+    whole = train(env, given).run
+    undo = kill_after(steps)
+    with pytest.raises(Killed):
+        train(env, given)
+    undo()
+    run = newest_other_than(whole)
+    assert [int(each.name) for each in run.checkpoints()] == [0]
+    assert [row["steps"] for row in rows(run.evals_file)] == [evaluated]
+    resume(run)
+    assert_same_run(whole, run)

@@ -1,0 +1,33 @@
+"""A replay buffer in files: what checkpoints name is there."""
+
+import shutil
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from rlctl.training.replay_segments import ReplaySegments, check
+
+BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+def fill(buffer, steps):
+    for number in range(steps):
+        value = np.full((1, 2), number, np.float32)
+        buffer.add(value, value, value, np.zeros(1), np.zeros(1), [{}])
+
+
+def test_what_is_removed_while_training_is_written_again(tmp_path):
+    buffer = ReplayBuffer(50, BOX, BOX, device="cpu")
+    segments = ReplaySegments(tmp_path / "replay", buffer)
+    segments.folder.mkdir()
+    fill(buffer, 20)
+    segments.save(20)
+    shutil.rmtree(segments.folder)
+    segments.folder.mkdir()
+    fill(buffer, 5)
+    named = segments.save(25)
+    check(segments.folder, named)
+    read = ReplaySegments(segments.folder, ReplayBuffer(50, BOX, BOX, device="cpu"))
+    read.load(named, 25)
+    np.testing.assert_array_equal(read.buffer.observations[:25], buffer.observations[:25])

@@ -1,0 +1,182 @@
+"""`rlctl train --seeds`: runs of several seeds in a group, their scores, and what is wrong with some of them."""
+
+import json
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from rlctl.errors import ArtifactError, Interrupted, RecipeError, UsageError
+from rlctl.evaluation.evaluate import EvalRequest, Gates
+from rlctl.evaluation.group import as_json, evaluate_group
+from rlctl.run.group import find_group, parse_seeds, read_group
+from rlctl.run.lookup import find_policy, find_run
+from rlctl.runs.comparison import find_runs_of
+from rlctl.runs.listing import list_runs
+from rlctl.runs.removal import plan_removal
+from rlctl.training.request import TrainRequest
+from rlctl.training.seeds import list_options, train_seeds
+from tests.training.conftest import ENVS, TINY
+
+LINE = f"{ENVS}:Line"
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("0-4", [0, 1, 2, 3, 4]), ("3", [3]), ("5,0, 7-8", [5, 0, 7, 8]), ("2-2", [2])]
+)
+def test_seeds(text, seeds):
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("3-1", "--seeds 3-1: 3-1 goes down; write 1-3"),
+        ("0,0", "--seeds 0,0: seed 0 is there twice"),
+        ("0-3,2", "--seeds 0-3,2: seed 2 is there twice"),
+        ("", "--seeds : write a range or a list, such as 0-4 or 0,3,7"),
+        ("-1", "--seeds -1: write a range"),
+        ("0-5000", "--seeds 0-5000: at most 1000 seeds"),
+    ],
+)
+def test_what_is_no_seeds(text, message):
+    with pytest.raises(UsageError) as caught:
+        parse_seeds(text)
+    assert str(caught.value).startswith(message)
+
+
+@pytest.fixture(scope="module")
+def group(tmp_path_factory):
+    """Two seeds of PPO on the line, side by side."""
+    root = tmp_path_factory.mktemp("runs")
+    result = train_seeds(TrainRequest(LINE, settings=TINY, root=root), "4-5", jobs=2, episodes=3)
+    assert result.failed == {}
+    return result.score.group
+
+
+def test_each_seed_is_an_ordinary_run(group):
+    assert group.path.name.endswith("_seeds")
+    for seed in (4, 5):
+        run = group.find_run(seed)
+        assert run.status()["seed"] == seed
+        assert run.recipe().algo_kwargs["n_steps"] == 16
+        assert "train" in run.status()["command"]
+    content = json.loads(group.scores_file.read_text())
+    assert [(each["seed"], each["steps"], each["algo"]) for each in content["seeds"]] == [
+        (4, 128, "ppo"),
+        (5, 128, "ppo"),
+    ]
+    assert content["seeds"][0]["score"]["episodes"] == 3
+    scores = [each["score"]["mean_return"] for each in content["seeds"]]
+    assert content["return"]["mean"] == pytest.approx(sum(scores) / 2)
+
+
+def test_runs_of_a_group_are_found(group):
+    root = group.path.parent.parent
+    newest = find_run(LINE, root).path
+    assert newest.parent == group.path
+    assert find_policy(LINE, root=root).run.path == newest
+    assert (root / "latest").resolve().parent == group.path.resolve()
+    names = [run.name for run in list_runs("Line", root=root)]
+    assert sorted(names) == sorted(f"Line/{group.path.name}/{group.find_run(seed).path.name}" for seed in (4, 5))
+    with pytest.raises(UsageError, match="a group of runs; name one of them"):
+        find_run(str(group.path), root)
+    assert f"it is one of a group: {group.path}" in find_policy("latest", root=root).notes
+    assert find_policy(str(newest), root=root).notes == ()
+
+
+def test_the_newest_thing_trained_is_the_group(group, monkeypatch, tmp_path):
+    root = group.path.parent.parent
+    one = group.find_run(5).path
+    assert [find_group(word, root) for word in ("latest", LINE, str(group.path))] == [group.path] * 3
+    assert find_group(str(one), root) is None
+    assert find_group(str(root / "latest"), root) is None
+    (tmp_path / "runs").symlink_to(root)
+    monkeypatch.chdir(tmp_path)
+    assert [run.path.name for run in find_runs_of("latest")] == [group.find_run(seed).path.name for seed in (4, 5)]
+    assert [run.path for run in find_runs_of(str(one))] == [one]
+
+
+def test_resume_latest_goes_on_with_the_group(group, rlctl):
+    """One run was stopped before its first checkpoint: both are in the table at the end."""
+    root = group.path.parent.parent
+    one = group.find_run(4)
+    before = one.status()
+    one.write_status({"status": "interrupted"})
+    try:
+        done = rlctl("train", "--resume", "latest", "-o", root)
+    finally:
+        one.write_status(before)
+    assert done.returncode == 0, done.stderr
+    assert f"{group.path}: 2 seeds, 1 done, 1 at a time" in done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines()[-5:-3]] == ["4", "5"]
+
+
+def test_a_group_that_is_being_trained_is_not_removed(group):
+    with group.find_run(4).lock(), pytest.raises(UsageError, match="this run is being trained; nothing was removed"):
+        plan_removal([str(group.path)], root=group.path.parent.parent)
+
+
+def test_what_is_done_stays_and_a_damaged_run_stops_no_other(group, tmp_path):
+    file = group.find_run(5).status_file
+    content = file.read_text()
+    before = group.find_run(4).last_policy.stat().st_mtime_ns
+    file.write_text("{")
+    try:
+        result = train_seeds(TrainRequest(None, resume=str(group.path)), None, episodes=2)
+        assert result.failed == {5: 5}
+        with pytest.raises(Exception, match="1 of 2 seeds failed: seed 5 with exit code 5") as caught:
+            result.check()
+        assert caught.value.exit_code == 5
+        scores = evaluate_group(read_group(group.path), EvalRequest(None, episodes=2))
+        assert [each.score is None for each in scores.seeds] == [False, True]
+        assert "run.json: damaged" in as_json(scores)["seeds"][1]["problem"]
+        with pytest.raises(ArtifactError, match="1 of 2 seeds without a score, the first seed 5: "):
+            scores.check(Gates())
+    finally:
+        file.write_text(content)
+    assert group.find_run(4).last_policy.stat().st_mtime_ns == before
+
+
+@pytest.mark.slow
+def test_a_signal_stops_all_with_checkpoints(tmp_path):
+    """In a thread the signal is sent; the handler is in the main thread, as on the command line."""
+    settings = {**TINY, "total_timesteps": 10_000_000}
+
+    def interrupt():
+        deadline = time.monotonic() + 250
+        while time.monotonic() < deadline and len(list(tmp_path.glob("*/*/*/metrics.csv"))) < 2:
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(Interrupted, match=r"interrupted; go on with: rlctl train --resume .*_seeds") as caught:
+        train_seeds(TrainRequest(LINE, settings=settings, root=tmp_path), "0-1", jobs=2)
+    assert caught.value.exit_code == 130
+    (path,) = tmp_path.glob("*/*_seeds")
+    for seed in (0, 1):
+        run = read_group(path).find_run(seed)
+        assert run.status()["status"] == "interrupted"
+        assert run.checkpoints()
+
+
+def test_what_is_wrong_for_every_seed_is_said_at_once(tmp_path):
+    request = TrainRequest(LINE, settings={"algo_kwargs": {"gama": 1}}, root=tmp_path)
+    with pytest.raises(RecipeError, match="gamma"):
+        train_seeds(request, "0-1")
+    with pytest.raises(UsageError, match="--seeds and --seed: give one of the two"):
+        train_seeds(TrainRequest(LINE, settings={"seed": 1}, root=tmp_path), "0-1")
+    with pytest.raises(ArtifactError, match=r"not a group of runs: it has no group\.json"):
+        train_seeds(TrainRequest(None, resume=str(tmp_path)), None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_options_of_a_request():
+    settings = {"algo": "sac", "algo_kwargs": {"gamma": 0.97}, "task": {}, "n_envs": 2}
+    request = TrainRequest("reach", settings=settings, check=True, initial_policy="reach", device="cuda")
+    assert list_options(request) == [
+        '--set=algo="sac"', '--set=algo_kwargs={"gamma": 0.97}', "--set=task={}", "--set=n_envs=2", "--from=reach",
+        "--device=cuda",
+    ]  # fmt: skip

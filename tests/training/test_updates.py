@@ -1,0 +1,194 @@
+"""Updates whose gradients are computed without autograd: Stable-Baselines3's own, but for rounding."""
+
+import os
+import threading
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from rlctl.environments.dict_spaces import split
+from rlctl.training.updates import choose_learner
+from rlctl.training.updates.ppo import PpoUpdate
+from rlctl.training.updates.sac import SacUpdate
+from rlctl.training.updates.tqc import TqcUpdate
+
+pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+
+VECTOR = spaces.Box(-np.inf, np.inf, (5,), np.float32)
+ACTIONS = spaces.Box(-1, 1, (3,), np.float32)
+
+
+class Still(gym.Env):
+    """Spaces; it is never stepped."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+
+def make_ppo(observations=VECTOR, actions=ACTIONS, policy="MlpPolicy", network=None, **settings):
+    """A model with a rollout of made-up numbers that is no multiple of the minibatches."""
+    network = {"net_arch": [16, 16], **(network or {})}
+    settings = {"n_steps": 25, "batch_size": 16, "n_epochs": 3, "learning_rate": 1e-2, "seed": 0, **settings}
+    model = PPO(
+        policy, DummyVecEnv([lambda: Still(observations, actions)] * 2), policy_kwargs=network, device="cpu", **settings
+    )
+    model.set_logger(Logger(None, []))
+    rng, buffer = np.random.default_rng(0), model.rollout_buffer
+    for rows in (
+        *split(buffer.observations).values(),
+        buffer.actions,
+        buffer.advantages,
+        buffer.returns,
+        buffer.values,
+    ):
+        rows[...] = rng.standard_normal(rows.shape)
+    buffer.log_probs[...] = rng.normal(-4, 1, buffer.log_probs.shape)
+    buffer.full = True
+    return model
+
+
+def weights(model):
+    return {name: value.clone() for name, value in model.policy.state_dict().items()}
+
+
+def assert_same_weights(one, other, before):
+    assert any((one[name] - before[name]).abs().max() > 1e-3 for name in before)
+    for name in one:
+        torch.testing.assert_close(one[name], other[name], rtol=1e-4, atol=1e-5, msg=name)
+
+
+PPO_CASES = {
+    "tanh": {},
+    "relu": {"network": {"activation_fn": torch.nn.ReLU}},
+    "gSDE": {"use_sde": True},
+    "gSDE, relu, no hidden layer of the critic": {
+        "use_sde": True,
+        "network": {"activation_fn": torch.nn.ReLU, "net_arch": {"pi": [8], "vf": []}},
+    },
+    "clipped values and gradients, entropy": {"clip_range_vf": 0.2, "ent_coef": 0.1, "max_grad_norm": 0.1},
+    "advantages as they are": {"normalize_advantage": False},
+    "stopped by target_kl": {"target_kl": 8.0},
+    "actions in float64": {"actions": spaces.Box(-1, 1, (3,), np.float64)},
+    "dict": {"observations": spaces.Dict({"a": VECTOR, "b": VECTOR}), "policy": "MultiInputPolicy"},
+}
+
+
+@pytest.mark.parametrize("name", PPO_CASES)
+def test_ppo_updates_as_sb3(name):
+    one, other = make_ppo(**PPO_CASES[name]), make_ppo(**PPO_CASES[name])
+    before = weights(one)
+    assert PpoUpdate.supports(other)
+    set_random_seed(1)
+    one.train()
+    set_random_seed(1)
+    PpoUpdate(other).train()
+    assert_same_weights(weights(one), weights(other), before)
+    expected, logged = one.logger.name_to_value, other.logger.name_to_value
+    assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
+
+
+def make_off_policy(algorithm=SAC, observations=VECTOR, policy="MlpPolicy", network=None, **settings):
+    """A model with a replay buffer of made-up numbers."""
+    settings = {"batch_size": 16, "learning_rate": 1e-2, "buffer_size": 200, "seed": 0, **settings}
+    network = {"net_arch": [16, 16], **(network or {})}
+    envs = DummyVecEnv([lambda: Still(observations, ACTIONS)])
+    model = algorithm(policy, envs, policy_kwargs=network, device="cpu", **settings)
+    model.set_logger(Logger(None, []))
+    rng, buffer = np.random.default_rng(0), model.replay_buffer
+    both = (buffer.observations, buffer.next_observations)
+    for rows in (*(part for each in both for part in split(each).values()), buffer.actions, buffer.rewards):
+        rows[...] = rng.uniform(-1, 1, rows.shape)
+    buffer.dones[...] = rng.random(buffer.dones.shape) < 0.1
+    buffer.full = True
+    return model
+
+
+SAC_CASES = {
+    "relu": {},
+    "tanh, another entropy, seldom followed": {
+        "network": {"activation_fn": torch.nn.Tanh},
+        "target_entropy": -1.0,
+        "target_update_interval": 3,
+    },
+    "gSDE": {"use_sde": True},
+    "gSDE, clipped mean": {"use_sde": True, "network": {"clip_mean": 0.02}},
+    "fixed entropy coefficient, three critics": {"ent_coef": 0.2, "network": {"n_critics": 3}},
+    "several steps": {"n_steps": 3},
+    "dict": {"observations": spaces.Dict({"a": VECTOR, "b": VECTOR}), "policy": "MultiInputPolicy"},
+}
+
+
+TQC_CASES = {
+    "tqc": {"network": {"n_quantiles": 7, "n_critics": 3}},
+    "tqc, gSDE, nothing dropped": {"use_sde": True, "top_quantiles_to_drop_per_net": 0},
+}
+OFF_POLICY_CASES = {name: (SacUpdate, SAC, case) for name, case in SAC_CASES.items()}
+OFF_POLICY_CASES |= {name: (TqcUpdate, TQC, case) for name, case in TQC_CASES.items()}
+
+
+@pytest.mark.parametrize("name", OFF_POLICY_CASES)
+def test_off_policy_updates_as_sb3(name):
+    update, algorithm, case = OFF_POLICY_CASES[name]
+    one, other, first = (make_off_policy(algorithm, **case) for _ in range(3))
+    before = weights(one)
+    assert update.supports(other)
+    learner = update(other)
+    for steps in (1, 7):
+        set_random_seed(steps)
+        one.train(gradient_steps=steps, batch_size=16)
+        set_random_seed(steps)
+        learner.train(gradient_steps=steps, batch_size=16)
+        set_random_seed(steps)
+        first.train(gradient_steps=1, batch_size=16)
+        # The critics' loss is that of the first update, which stands for eight.
+        expected = {**one.logger.name_to_value, "train/critic_loss": first.logger.name_to_value["train/critic_loss"]}
+        assert dict(other.logger.name_to_value) == pytest.approx(expected, rel=1e-3, abs=1e-4)
+    assert_same_weights(weights(one), weights(other), before)
+
+
+WIDE = {"network": {"net_arch": [300, 300]}, "batch_size": 128}
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC])
+def test_wide_networks_are_updated_on_two_cores_to_the_same_bit(algorithm):
+    def train():
+        set_random_seed(1)
+        model = make_ppo(**WIDE) if algorithm is PPO else make_off_policy(algorithm, **WIDE)
+        learner, arguments = choose_learner(model), {} if algorithm is PPO else {"gradient_steps": 3, "batch_size": 128}
+        before = threading.active_count()
+        learner.train(**arguments)
+        return weights(model), threading.active_count() - before
+
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        on_one, threads = train()
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert threads == 0
+    on_two, threads = train()
+    assert threads == (1 if len(cores) > 1 else 0)
+    assert all(torch.equal(on_one[name], on_two[name]) for name in on_one)
+
+
+def test_what_sb3_updates_itself():
+    image = spaces.Box(0, 255, (3, 36, 36), np.uint8)
+    elu = {"activation_fn": torch.nn.ELU}
+    ppo = [make_ppo(actions=spaces.Discrete(3)), make_ppo(image, policy="CnnPolicy"), make_ppo(network=elu)]
+    sac = [make_off_policy(network=elu), make_off_policy(network={"net_arch": []}), make_off_policy(TQC)]
+    sac += [make_off_policy(observations=image, policy="CnnPolicy")]
+    sac += [make_off_policy(use_sde=True, network={"use_expln": True})]
+    assert [PpoUpdate.supports(model) for model in ppo] == [False] * 3
+    assert [SacUpdate.supports(model) for model in sac] == [False] * 5

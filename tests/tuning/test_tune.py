@@ -1,0 +1,275 @@
+"""`rlctl tune`: what is tried, what is kept, what is stopped, and a tuning that goes on after an interruption.
+
+Trainings are played by a function that writes what a run would; one test trains.
+"""
+
+import argparse
+import json
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+import yaml
+
+from rlctl.errors import ArtifactError, Interrupted, RecipeError, TaskError, UsageError
+from rlctl.run import directory
+from rlctl.run.directory import RunDirectory
+from rlctl.run.group import read_group
+from rlctl.run.lookup import find_run
+from rlctl.runs.listing import list_runs
+from rlctl.runs.removal import plan_removal
+from rlctl.training.trainings import Trainings
+from rlctl.tuning.tune import TuneRequest, resume, tune
+from tests.training.conftest import ENVS, TINY
+
+LINE = f"{ENVS}:Line"
+BEST_RATE = 1e-3
+RATES = "algo_kwargs.learning_rate=1e-5:1e-1"
+
+
+class PlayedTrainings:
+    """Takes the place of `Trainings.train`: a run whose return is the better, the nearer its values are to the best."""
+
+    def __init__(self, monkeypatch):
+        self.calls, self.fails, self.interrupts_at, self.asked = [], lambda settings: False, None, []
+        self.success = "0.5"
+        self.lock = threading.Lock()
+        monkeypatch.setattr(Trainings, "train", lambda trainings, *arguments: self.train(trainings, *arguments))
+
+    def train(self, trainings, arguments, receive, is_hopeless=None):
+        parser = argparse.ArgumentParser()
+        for name in ("--set", "--seed", "--output", "--resume"):
+            parser.add_argument(name, action="append", default=[])
+        options, _ = parser.parse_known_args(arguments[1:])
+        with self.lock:
+            self.calls.append(arguments)
+        if options.resume:
+            run = RunDirectory(Path(options.resume[0]))
+            settings = run.status()["settings"]
+        else:
+            settings = {key: json.loads(value) for key, _, value in (each.partition("=") for each in options.set)}
+            run = directory.create(LINE, int(options.seed[0]), Path(options.output[0]))
+        run.write_status({"task": LINE, "status": "running", "settings": settings})
+        run.checkpoint(64).mkdir(parents=True, exist_ok=True)
+        if self.interrupts_at == len(self.calls):
+            trainings.stopped_by = signal.SIGINT
+            return 130
+        if self.fails(settings):
+            receive("some line")
+            receive("error: it diverged")
+            receive("at step 3")
+            return 4
+        kwargs = settings.get("algo_kwargs", {})
+        score = -abs(kwargs.get("learning_rate", 3e-4) - BEST_RATE) - abs(kwargs.get("gamma", 0.9) - 0.98)
+        rows = ["steps,success,return"]
+        for step in range(1, 7):
+            rows.append(f"{step * 100},{self.success},{score * (10 - step)}")
+            run.evals_file.write_text("\n".join(rows) + "\n")
+            if is_hopeless is not None and is_hopeless():
+                receive("error: interrupted at step 3; checkpoint saved")
+                return 130
+        run.write_status({"status": "finished"})
+        return 0
+
+
+@pytest.fixture
+def played(monkeypatch):
+    return PlayedTrainings(monkeypatch)
+
+
+def begin(tmp_path, *search, jobs=1, **options):
+    settings = {**TINY, **options.pop("settings", {})}
+    return tune(TuneRequest(LINE, settings=settings, search=search, root=tmp_path / "runs", **options), jobs=jobs)
+
+
+def test_the_best_of_all_trials_is_a_recipe(played, tmp_path, rlctl):
+    tuning = begin(tmp_path, RATES, trials=12)
+    rates = [each.values["algo_kwargs.learning_rate"] for each in tuning.trials[1:]]
+    assert len(rates) == len(set(rates)) == 12
+    assert tuning.trials[0].values == {}
+    best = tuning.best
+    assert best.score == max(each.score for each in tuning.trials if each.state == "done")
+    # The mean of the last two of six evaluations, of 5 and 4 times the distance from the best rate and discount.
+    distance = abs(best.values["algo_kwargs.learning_rate"] - BEST_RATE) + abs(0.9 - 0.98)
+    assert best.score == pytest.approx(-4.5 * distance)
+    recipe = yaml.safe_load(tuning.best_file.read_text())
+    assert recipe["algo_kwargs"] == {
+        **TINY["algo_kwargs"],
+        "learning_rate": best.values["algo_kwargs.learning_rate"],
+    }
+    assert recipe.keys() == {"algo_kwargs", "n_envs"}  # neither how long nor how often evaluated
+    shown = rlctl("tune", "--resume", tuning.path)  # nothing is left to train
+    assert shown.returncode == 0
+    assert f"best: trial {best.number}, in {tuning.best_file}" in shown.stdout
+    assert shown.stdout.splitlines()[2].split()[0] == str(best.number)
+
+
+def test_too_few_evaluations_are_named(played, tmp_path, capsys):
+    begin(tmp_path, RATES, trials=1, settings={"algo_kwargs": {"n_steps": 32, "batch_size": 32}})
+    assert (
+        "warning: a trial is judged by 2 evaluations, which come between rollouts, of 64 steps"
+        in capsys.readouterr().err
+    )
+    begin(tmp_path / "longer", RATES, trials=1, settings={"total_timesteps": 1024})
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_only_the_first_trial_checks_the_environment(played, tmp_path):
+    begin(tmp_path, RATES, trials=2)
+    assert ["--no-check" in call for call in played.calls] == [False, True, True]
+    assert [call[-3] for call in played.calls] == ["--seed=0", "--seed=1", "--seed=2"]
+
+
+def test_a_step_keeps_what_the_one_before_found(played, tmp_path):
+    tuning = begin(tmp_path, trials=4)
+    by_step = {number: [each for each in tuning.trials if each.step == number] for number in range(4)}
+    # Of two rollouts and two minibatches one pair is the recipe's own.
+    assert [len(trials) for trials in by_step.values()] == [1, 4, 3, 4]
+    first = max((each for each in by_step[1] if each.state == "done"), key=lambda each: each.score)
+    if first.score > by_step[0][0].score:
+        rate = first.values["algo_kwargs.learning_rate"]
+        assert all(each.values["algo_kwargs.learning_rate"] == rate for each in by_step[2])
+    assert all("algo_kwargs.gamma" in each.values for each in by_step[3])
+
+
+def test_no_choice_is_tried_twice(played, tmp_path):
+    tuning = begin(tmp_path, "algo_kwargs.gamma=0.9,0.95,0.98", trials=20, settings={"algo_kwargs": {"gamma": 0.9}})
+    assert tuning.trials[0].values == {}
+    assert sorted(each.values["algo_kwargs.gamma"] for each in tuning.trials[1:]) == [0.95, 0.98]
+    assert tuning.best.values == {"algo_kwargs.gamma": 0.98}
+
+
+def test_a_trial_that_falls_behind_is_stopped_and_its_checkpoints_go(played, tmp_path, capsys):
+    tuning = begin(tmp_path, RATES, trials=12)
+    pruned = [each for each in tuning.trials if each.state == "pruned"]
+    assert pruned
+    middle = sorted(each.score for each in tuning.trials if each.state == "done")
+    assert all(each.score < middle[len(middle) // 2] for each in pruned)
+    shown = capsys.readouterr().err
+    assert f"trial {pruned[0].number}: stopped: below the median of the other trials" in shown
+    assert "interrupted" not in shown
+    assert not list(tuning.path.glob("*/checkpoints"))
+
+
+def test_a_trial_that_fails_stops_no_other(played, tmp_path, rlctl):
+    played.fails = lambda settings: settings.get("algo_kwargs", {}).get("learning_rate", 0) > 1e-3
+    tuning = begin(tmp_path, RATES, trials=8)
+    failed = [each for each in tuning.trials if each.state == "failed"]
+    assert failed
+    assert {each.problem for each in failed} == {"it diverged"}
+    assert len(tuning.trials) == 9
+    shown = rlctl("tune", "--resume", tuning.path)
+    assert shown.stdout.count("failed: it diverged") == len(failed)
+
+
+def test_a_recipe_that_cannot_be_trained_is_not_tuned(played, tmp_path):
+    played.fails = lambda settings: True
+    with pytest.raises(TaskError, match="the recipe as it is failed: it diverged"):
+        begin(tmp_path, RATES)
+    assert len(played.calls) == 1
+
+
+def test_a_task_without_success_is_refused_at_its_first_evaluation(played, tmp_path, capsys):
+    played.success = ""
+    with pytest.raises(UsageError, match="--metric success: this task reports no success"):
+        begin(tmp_path, RATES, metric="success")
+    (evals,) = (tmp_path / "runs").rglob("evals.csv")
+    assert len(evals.read_text().splitlines()) == 2
+    assert "trial 0: stopped: no success\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("interrupted_at", [1, 3])
+def test_an_interrupted_tuning_goes_on(played, tmp_path, interrupted_at):
+    played.interrupts_at = interrupted_at
+    with pytest.raises(Interrupted, match="go on with: rlctl tune --resume"):
+        begin(tmp_path, RATES, trials=4)
+    assert len(played.calls) == interrupted_at
+    (folder,) = (tmp_path / "runs").glob("*/*_tune")
+    tuning = resume(folder, jobs=1)
+    assert played.calls[interrupted_at][:2] == ["train", "--resume"]
+    assert [each.number for each in tuning.trials] == [0, 1, 2, 3, 4]
+    assert {each.state for each in tuning.trials} <= {"done", "pruned"}
+    again = resume(folder, jobs=1)
+    assert len(played.calls) == 6
+    assert again == tuning
+
+
+def test_several_at_a_time(played, tmp_path):
+    tuning = begin(tmp_path, RATES, trials=8, jobs=4)
+    assert sorted(each.number for each in tuning.trials) == list(range(9))
+    assert len({json.dumps(each.values) for each in tuning.trials}) == 9
+
+
+def test_its_runs_are_runs(played, tmp_path):
+    tuning = begin(tmp_path, RATES, trials=2)
+    root = tmp_path / "runs"
+    listed = list_runs(root=root)
+    assert len(listed) == 3
+    assert {each.name.split("/")[1] for each in listed} == {tuning.path.name}
+    assert plan_removal([str(tuning.path)], root=root).paths == [tuning.path.resolve()]
+    with pytest.raises(UsageError, match="the trials of rlctl tune, not seeds of one recipe"):
+        read_group(tuning.path)
+    assert not (root / "latest").exists()
+    with pytest.raises(UsageError, match="see its table: rlctl tune --resume"):
+        find_run(str(tuning.path))
+    with pytest.raises(ArtifactError, match=f"but the trials of rlctl tune; name one in {tuning.path}"):
+        find_run(LINE, root)
+
+
+@pytest.mark.parametrize(
+    ("search", "error", "message"),
+    [
+        ("seed=0,1", UsageError, "--search seed: no hyperparameter"),
+        ("reward_weights.x=1,2", UsageError, "--search reward_weights.x: it changes what is trained for"),
+        ("algo_kwargs.gama=0.9,0.99", RecipeError, "Did you mean 'gamma'?"),
+        ("algo_kwargs.gamma=0.9:1.5", RecipeError, "gamma"),
+    ],
+)
+def test_what_cannot_be_searched(search, error, message, tmp_path):
+    with pytest.raises(error) as caught:
+        begin(tmp_path, search)
+    assert message in str(caught.value)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_damaged_tuning(tmp_path):
+    with pytest.raises(UsageError, match=r"not the folder of a tuning: it has no tune\.json"):
+        resume(tmp_path)
+    (tmp_path / "tune.json").write_text('{"task": 3}')
+    with pytest.raises(ArtifactError, match="damaged"):
+        resume(tmp_path)
+
+
+def test_without_optuna(monkeypatch, tmp_path):
+    monkeypatch.setitem(__import__("sys").modules, "optuna", None)
+    with pytest.raises(UsageError, match=r"rlctl tune needs optuna: pip install 'rlctl\[tune\]'"):
+        begin(tmp_path, RATES)
+
+
+def test_trainings_that_are_real(rlctl):
+    settings = ["-n", "128", "--n-envs", "2", "--set", "algo_kwargs.n_steps=16", "--set", "eval.episodes=1"]
+    search = ["--search", "algo_kwargs.gamma=0.5,0.99", "--trials", "1", "--jobs", "2"]
+    result = rlctl("tune", LINE, *settings, *search, "--json", "-")
+    assert result.returncode == 0, result.stderr
+    content = json.loads(result.stdout)
+    assert [(each["state"], each["values"]) for each in content["trials"]] == [
+        ("done", {}),
+        ("done", {"algo_kwargs.gamma": 0.5}),
+    ]
+    scores = [each["score"] for each in content["trials"]]
+    assert content["best"] == scores.index(max(scores))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "give a task to tune, or --resume FOLDER"),
+        (("reach", "--metric", "score"), "--metric score: give return or success"),
+        (("reach", "--search", "gamma"), "--search 'gamma': write KEY=LOW:HIGH"),
+    ],
+)
+def test_mistakes(rlctl, arguments, message):
+    result = rlctl("tune", *arguments)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert message in result.stderr
