@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import Episode, Moment, build_action, draw_actions
+from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_actions
 from rlctl.checking.finding import NotJudged
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import Leaf, flatten_action, flatten_numbers, name_element, pick
@@ -30,7 +30,7 @@ class OutOfTime(Exception):
 
 
 @dataclasses.dataclass(frozen=True)
-class Dimension:
+class ActionNumber:
     """One number of the action."""
 
     leaf: Leaf
@@ -57,11 +57,11 @@ class Dimension:
         return (low if np.isfinite(low) else min(-1.0, high)), (high if np.isfinite(high) else max(1.0, low))
 
 
-def find_dimensions(leaves: list[Leaf]) -> list[Dimension]:
+def find_dimensions(leaves: list[Leaf]) -> list[ActionNumber]:
     """Return the numbers of an action that can be varied."""
     flat = [(leaf, i) for leaf in leaves if leaf.supported for i in range(int(np.prod(leaf.shape)))]
-    found = [Dimension(leaf, index, column) for column, (leaf, index) in enumerate(flat)]
-    return [each for each in found if each.bounds[0] < each.bounds[1]]
+    dimensions = [ActionNumber(leaf, index, column) for column, (leaf, index) in enumerate(flat)]
+    return [dimension for dimension in dimensions if dimension.bounds[0] < dimension.bounds[1]]
 
 
 class Trials:
@@ -100,7 +100,9 @@ class Trials:
         frames = self._plain[seed, steps] = self.play(seed, self.actions(seed, steps))
         return frames
 
-    def with_value(self, seed: int, steps: int, dimension: Dimension, value: Any, at: int | None = None) -> list[Frame]:
+    def with_value(
+        self, seed: int, steps: int, dimension: ActionNumber, value: Any, at: int | None = None
+    ) -> list[Frame]:
         """Play an episode with one number of the action set to a value, in one step or in all."""
 
         def change(action: Any, leaf: Leaf) -> Any:
@@ -117,7 +119,7 @@ class Trials:
 
     def play(self, seed: int, chosen: Sequence[Any]) -> list[Frame]:
         """Play an episode with given actions, to its end at most; the first frame is that of reset."""
-        episode = Episode(self.instance, seed, given=chosen, max_steps=len(chosen), deadline=self.deadline)
+        episode = EpisodePlayer(self.instance, seed, given=chosen, max_steps=len(chosen), deadline=self.deadline)
         frames = [to_frame(moment) for moment in episode]
         if episode.ended == "time":
             raise OutOfTime
@@ -125,11 +127,11 @@ class Trials:
             raise NotJudged("step returns no observation, reward and flags (RL201)")
         return frames
 
-    def copies(self, dimension: Dimension, seed: int, steps: int, longest_delay: int) -> list[int]:
+    def copies(self, dimension: ActionNumber, seed: int, steps: int, longest_delay: int) -> list[int]:
         """Return the columns of a frame that only repeat this number of an earlier action."""
         rows = [frame[:REWARD] for frame in self.plain(seed, steps)[1:]]
-        given = [flatten_action(self.instance.action_leaves, each) for each in self.actions(seed, len(rows))]
-        values = np.array([each[dimension.column] for each in given])
+        given = [flatten_action(self.instance.action_leaves, action) for action in self.actions(seed, len(rows))]
+        values = np.array([action[dimension.column] for action in given])
         if not rows or len({row.shape for row in rows}) > 1:
             return []
         returned = np.stack(rows)
@@ -154,18 +156,21 @@ def find_differences(one: Sequence[Frame], two: Sequence[Frame]) -> dict[int, ND
 
     Columns are counted from the end: `REWARD`, -2 and -1 for the flags, the observation's elements before them.
     """
-    found = {}
+    differences = {}
     for step, (a, b) in enumerate(zip(one, two, strict=False)):
         if a.shape != b.shape:
-            found[step] = np.arange(REWARD, 0)
+            differences[step] = np.arange(REWARD, 0)
         elif (differ := (a != b) & ~(np.isnan(a) & np.isnan(b))).any():
-            found[step] = np.flatnonzero(differ) - len(a)
-    return found
+            differences[step] = np.flatnonzero(differ) - len(a)
+    return differences
 
 
 def observations_differ(one: Sequence[Frame], two: Sequence[Frame], besides: Sequence[int] = ()) -> bool:
     """Say whether observations or flags differ, with some columns left out."""
-    return any(not {REWARD, *besides}.issuperset(each.tolist()) for each in find_differences(one, two).values())
+    return any(
+        not {REWARD, *besides}.issuperset(find_difference.tolist())
+        for find_difference in find_differences(one, two).values()
+    )
 
 
 def find_other_rewards(one: Sequence[Frame], two: Sequence[Frame]) -> list[int]:

@@ -98,7 +98,9 @@ class _RecordedFunction(_Replacement):
 def _replace_functions(replace: Callable[[str, Any], Any]) -> Iterator[None]:
     """Replace each function of PyBullet, if it is loaded, inside the `with` block."""
     pybullet = sys.modules.get("pybullet")
-    functions = {name: each for name, each in vars(pybullet).items() if inspect.isbuiltin(each)} if pybullet else {}
+    functions = (
+        {name: function for name, function in vars(pybullet).items() if inspect.isbuiltin(function)} if pybullet else {}
+    )
     for name, function in functions.items():
         setattr(pybullet, name, replace(name, function))
     try:

@@ -48,7 +48,9 @@ def find_clients() -> list[int]:
     """Return the ids of the clients that are connected, whoever did it; empty where PyBullet is not loaded."""
     if "pybullet" not in sys.modules:
         return []
-    return [each for each in range(MOST_CLIENTS) if bullet().getConnectionInfo(physicsClientId=each)["isConnected"]]
+    return [
+        client for client in range(MOST_CLIENTS) if bullet().getConnectionInfo(physicsClientId=client)["isConnected"]
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Joint:
 
 
 @dataclasses.dataclass(frozen=True)
-class Body:
+class WorldBody:
     """A body of a world, as it was loaded."""
 
     id: int
@@ -87,7 +89,7 @@ class World:
     """The bodies of one client."""
 
     client: int
-    bodies: tuple[Body, ...]
+    bodies: tuple[WorldBody, ...]
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -109,14 +111,14 @@ def read_world(client: int) -> World:
     p = bullet()
     ids = [p.getBodyUniqueId(i, physicsClientId=client) for i in range(p.getNumBodies(physicsClientId=client))]
     bodies = []
-    for each in ids:
+    for id in ids:
         with contextlib.suppress(p.error):  # a soft body, which has neither links nor a mass
-            bodies.append(_body(client, each))
+            bodies.append(_body(client, id))
     bodies.sort(key=lambda body: (not body.joints, not body.is_free))
     return World(client, tuple(_number_names(bodies[:MOST_BODIES])))
 
 
-def _body(client: int, body: int) -> Body:
+def _body(client: int, body: int) -> WorldBody:
     p = bullet()
     base, name = (text.decode(errors="replace") for text in p.getBodyInfo(body, physicsClientId=client))
     infos = [
@@ -130,12 +132,12 @@ def _body(client: int, body: int) -> Body:
     links = [base, *(info[12].decode(errors="replace") for info in infos)]
     base_mass, *masses = (p.getDynamicsInfo(body, i, physicsClientId=client)[0] for i in range(-1, len(infos)))
     has_heavy_links = bool(joints) and any(mass > 0 for mass in masses)
-    return Body(
+    return WorldBody(
         body, name or base or "a body", tuple(links), tuple(joints[:MOST_JOINTS]), base_mass > 0, has_heavy_links
     )
 
 
-def _number_names(bodies: list[Body]) -> list[Body]:
+def _number_names(bodies: list[WorldBody]) -> list[WorldBody]:
     """Number bodies of one name; not by their ids, which are others at every reset of some environments."""
     counts: Counter[str] = Counter()
     numbered = []
@@ -153,7 +155,7 @@ def read_states(world: World) -> list[NDArray[np.float64]]:
     for body in world.bodies:
         position, _ = p.getBasePositionAndOrientation(body.id, physicsClientId=client)
         joints = p.getJointStates(body.id, [j.index for j in body.joints], physicsClientId=client) or ()
-        numbers = np.ravel([each[:2] for each in joints], "F")  # all positions, then all speeds
+        numbers = np.ravel([joint[:2] for joint in joints], "F")  # all positions, then all speeds
         parts = [position, *p.getBaseVelocity(body.id, physicsClientId=client), numbers]
         states.append(np.concatenate(parts))
     return states

@@ -10,9 +10,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from rlctl.checking import families
-from rlctl.checking.finding import RULES, Experiment, Finding, NotApplicable, NotJudged, Severity
+from rlctl.checking.experiments import Experiment
+from rlctl.checking.finding import RULES, NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.leaves import name_leaf
-from rlctl.checking.messages import Message, Mistake
+from rlctl.checking.messages import ChildMessage, Mistake
 from rlctl.checking.progress import Position
 from rlctl.checking.records import Records
 from rlctl.checking.supervisor import Supervisor
@@ -26,11 +27,11 @@ LOADING = ("RL0", "RL216")
 
 
 @dataclasses.dataclass
-class Verdict:
+class CheckVerdict:
     """What the rules say."""
 
-    findings: list[Finding] = dataclasses.field(default_factory=list)
-    waived: list[Finding] = dataclasses.field(default_factory=list)
+    findings: list[RuleFinding] = dataclasses.field(default_factory=list)
+    waived: list[RuleFinding] = dataclasses.field(default_factory=list)
     """What the environment's class says is meant."""
     judged: list[str] = dataclasses.field(default_factory=list)
     not_judged: dict[str, str] = dataclasses.field(default_factory=dict)
@@ -42,11 +43,11 @@ class Verdict:
 
 
 @dataclasses.dataclass(frozen=True)
-class Report:
+class CheckReport:
     """What was found, and what it was found by."""
 
     task: str
-    verdict: Verdict
+    verdict: CheckVerdict
     records: Records
     seconds: float
     """How long the check took."""
@@ -84,7 +85,7 @@ def check(
     only: Collection[str] | None = None,
     budget_s: float = families.PROCESS_S,
     show_progress: bool = True,
-) -> Report:
+) -> CheckReport:
     """Check an environment with some rules, given by id, or with what these can say from some experiments `only`.
 
     Raises `UsageError` for a task or a parameter that does not exist. Whatever the environment itself does, a crash
@@ -94,7 +95,7 @@ def check(
     records = Records(spec.task, normalizes_rewards=lambda: _normalizes_rewards(spec.task))
     mistakes: list[UsageError] = []
 
-    def receive(message: Message) -> None:
+    def receive(message: ChildMessage) -> None:
         if isinstance(message, Mistake):
             mistakes.append(UsageError(message.message))
         else:
@@ -102,7 +103,7 @@ def check(
 
     needed = {"build"} | {name for name in families.find_needs(rules) if only is None or name in only}
     experiments = {
-        name: [each.name for each in process.experiments if each.name in needed]
+        name: [experiment.name for experiment in process.experiments if experiment.name in needed]
         for name, process in families.PROCESSES.items()
     }
     supervisor = Supervisor(spec, budget_s, env_timeout_s, receive)
@@ -114,7 +115,7 @@ def check(
     if mistakes:
         raise mistakes[0]
     records.printed_lines, records.printed_first = supervisor.children[0].printed, supervisor.children[0].first_line
-    return Report(spec.task, judge(records, rules), records, time.monotonic() - started, budget_s, strict)
+    return CheckReport(spec.task, judge(records, rules), records, time.monotonic() - started, budget_s, strict)
 
 
 def _normalizes_rewards(task: str) -> bool:
@@ -138,9 +139,9 @@ def _status(task: str, wanted: bool) -> Iterator[Callable[[Position], None]]:
         yield lambda position: status.update(f"checking {task}: {position.phase}")
 
 
-def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> Verdict:
+def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> CheckVerdict:
     """Apply the rules; the findings come worst first. Raises `UsageError` for a waiver that cannot be used."""
-    verdict = Verdict(crashed={name: each.crash for name, each in records.finished.items() if each.crash})
+    verdict = CheckVerdict(crashed={name: end.crash for name, end in records.finished.items() if end.crash})
     for rule in rules:
         _apply(rule, records, verdict)
     if records.built is not None:
@@ -148,39 +149,39 @@ def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> Verdict:
         for leaf in records.built.leaves:
             if not leaf.supported:
                 verdict.not_judged[name_leaf(leaf)] = f"no rule can look into a {leaf.kind} space"
-    verdict.findings.sort(key=lambda each: (each.severity.rank, each.rule))
+    verdict.findings.sort(key=lambda finding: (finding.severity.rank, finding.rule))
     return verdict
 
 
-def _apply(rule: str, records: Records, verdict: Verdict) -> None:
+def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
     try:
-        found = _findings(rule, records)
+        findings = _findings(rule, records)
     except NotJudged as reason:
         verdict.not_judged[rule] = str(reason)
     except NotApplicable as reason:
         verdict.not_applicable[rule] = str(reason)
     except UsageError:  # the recipe that comes with the task
         raise
-    except Exception:  # a rule's bug must not hide what the other rules found, and must not look like a pass
+    except Exception:  # a rule's bug must not hide what the other rules findings, and must not look like a pass
         verdict.crashed[rule] = traceback.format_exc()
     else:
         verdict.judged.append(rule)
-        verdict.findings += found
+        verdict.findings += findings
 
 
-def _findings(rule: str, records: Records) -> list[Finding]:
+def _findings(rule: str, records: Records) -> list[RuleFinding]:
     """Return what the experiment that decides a rule and the rule's check have found."""
     check, experiment = families.CHECKS.get(rule), families.DECIDED_BY.get(rule)
-    found = [each for each in records.findings if each.rule == rule]
-    if found and records.built is None:
-        return found
+    findings = [finding for finding in records.findings if finding.rule == rule]
+    if findings and records.built is None:
+        return findings
     if records.built is None and not rule.startswith(LOADING):
         raise NotJudged("no instance could be built")
-    if check is not None and not found:
-        found += check.run(records)
-    if experiment is not None and not found:
+    if check is not None and not findings:
+        findings += check.run(records)
+    if experiment is not None and not findings:
         _require_complete(records, experiment, rule)
-    return found
+    return findings
 
 
 def _require_complete(records: Records, experiment: Experiment, rule: str) -> None:
@@ -194,7 +195,7 @@ def _require_complete(records: Records, experiment: Experiment, rule: str) -> No
         raise NotJudged(records.why_missing(experiment.name))
 
 
-def _waive(verdict: Verdict, waivers: Mapping[str, str]) -> None:
+def _waive(verdict: CheckVerdict, waivers: Mapping[str, str]) -> None:
     for rule, reason in waivers.items():
         if rule not in RULES:
             raise UsageError(
@@ -203,5 +204,5 @@ def _waive(verdict: Verdict, waivers: Mapping[str, str]) -> None:
             )
         if not reason.strip():
             raise UsageError(f"rlctl_ignore: {rule} is waived without a reason. Say why this is meant.")
-    verdict.waived = [each for each in verdict.findings if each.rule in waivers]
-    verdict.findings = [each for each in verdict.findings if each.rule not in waivers]
+    verdict.waived = [finding for finding in verdict.findings if finding.rule in waivers]
+    verdict.findings = [finding for finding in verdict.findings if finding.rule not in waivers]

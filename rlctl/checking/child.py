@@ -11,11 +11,12 @@ from typing import Any
 
 from rlctl.checking import families
 from rlctl.checking.clock import read_clock
+from rlctl.checking.experiments import Experiment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
-from rlctl.checking.finding import Experiment, Finding, NotApplicable, NotJudged
+from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.instance import Budget, Context
-from rlctl.checking.messages import End, Failure, Finished, Message, Mistake, Skipped, encode
-from rlctl.checking.progress import Progress
+from rlctl.checking.messages import CallFailure, ChildMessage, End, Finished, Mistake, Skipped, encode
+from rlctl.checking.progress import CallProgress
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 
@@ -24,7 +25,7 @@ def main(
     connection: Connection, process: str, spec: dict[str, Any], experiments: list[str], seconds: float, memory: int
 ) -> None:
     """Run some experiments of one process and send what they yield. `memory`: the descriptor of the progress."""
-    for message in run(process, EnvSpec(**spec), experiments, seconds, Progress(memory)):
+    for message in run(process, EnvSpec(**spec), experiments, seconds, CallProgress(memory)):
         connection.send_bytes(encode(message))
     connection.send_bytes(encode(End()))
 
@@ -34,19 +35,19 @@ def run(
     spec: EnvSpec,
     names: Collection[str] | None = None,
     seconds: float = families.PROCESS_S,
-    progress: Progress | None = None,
-) -> Iterator[Message]:
+    progress: CallProgress | None = None,
+) -> Iterator[ChildMessage]:
     """Yield the messages of one process; all its experiments by default, within so many seconds together."""
     context = Context(spec, progress)
     chosen = [each for each in families.PROCESSES[process].experiments if names is None or each.name in names]
     try:
         for message in _run_all(context, chosen, seconds):
-            yield dataclasses.replace(message, process=process) if isinstance(message, Failure) else message
+            yield dataclasses.replace(message, process=process) if isinstance(message, CallFailure) else message
     except UsageError as error:
         yield Mistake(str(error))
 
 
-def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> Iterator[Message]:
+def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> Iterator[ChildMessage]:
     """Run the experiments; each has its share of the time that those before it have left."""
     end = read_clock() + seconds
     shares = sum(each.share for each in chosen)
@@ -68,14 +69,14 @@ def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> 
     yield from context.close()
 
 
-def _run(experiment: Experiment, context: Context) -> Iterator[Message]:
+def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
     started = time.monotonic()
     context.progress.phase(experiment.name)
     is_complete, crash = False, ""
     found: set[str] = set()
     try:
         for message in experiment.run(context):
-            if isinstance(message, Finding):
+            if isinstance(message, RuleFinding):
                 found.add(message.rule)
             yield message
         is_complete = True

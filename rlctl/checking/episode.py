@@ -50,7 +50,7 @@ class Moment:
         return read_flag(self.terminated), read_flag(self.truncated)
 
 
-class Episode:
+class EpisodePlayer:
     """One episode. Iterating over it resets, and steps until it ends or must end; each call is a `Moment`.
 
     Where the environment raises, iterating raises `EnvironmentRaised`. `reset` and `step` may be called directly too.
@@ -170,9 +170,9 @@ def build_action(space: spaces.Space[Any], value_of: Callable[[Leaf], Any], path
     from gymnasium import spaces
 
     if isinstance(space, spaces.Dict):
-        return {key: build_action(each, value_of, (*path, key)) for key, each in space.spaces.items()}
+        return {key: build_action(part, value_of, (*path, key)) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        return tuple(build_action(each, value_of, (*path, i)) for i, each in enumerate(space.spaces))
+        return tuple(build_action(part, value_of, (*path, i)) for i, part in enumerate(space.spaces))
     (leaf,) = find_leaves(space, path)
     value = value_of(leaf)
     if value is None:

@@ -12,8 +12,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from rlctl.checking.messages import Failure
-from rlctl.checking.progress import Progress
+from rlctl.checking.messages import CallFailure
+from rlctl.checking.progress import CallProgress
 from rlctl.errors import RlctlError
 
 _HERE = Path(__file__).parent
@@ -35,11 +35,11 @@ class EnvironmentRaised(Exception):
         self.call = call
 
 
-def describe_failure(error: EnvironmentRaised, progress: Progress) -> Failure:
+def describe_failure(error: EnvironmentRaised, progress: CallProgress) -> CallFailure:
     """Describe what a call into the environment raised, and when."""
     where = progress.read()
     cause = error.__cause__ or error
-    return Failure(
+    return CallFailure(
         kind="raised",
         call=error.call,
         phase=where.phase,
@@ -63,18 +63,18 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}{place}"
 
 
-def lacks_display(failure: Failure) -> bool:
+def lacks_display(failure: CallFailure) -> bool:
     """Say whether a process ended because it has no display."""
     return failure.kind == "died" and NO_DISPLAY.search(failure.details or "") is not None
 
 
 def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
     """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
-    for each in iterate_causes(error):
-        if isinstance(each, FileNotFoundError):
-            return _describe(str(each.filename or each), [])
-        if type(each).__module__ == "pybullet" and "load" in str(each).lower():
-            name, data = _find_model(each.__traceback__), sys.modules.get("pybullet_data")
+    for cause in iterate_causes(error):
+        if isinstance(cause, FileNotFoundError):
+            return _describe(str(cause.filename or cause), [])
+        if type(cause).__module__ == "pybullet" and "load" in str(cause).lower():
+            name, data = _find_model(cause.__traceback__), sys.modules.get("pybullet_data")
             return None if name is None else _describe(name, [Path(data.getDataPath())] if data else [])
     return None
 

@@ -1,24 +1,16 @@
-"""What a rule says, what it finds, and how: by experiments in a child process, and checks of what these recorded.
-
-The texts of the rules are data, in rules.yaml beside this module.
-"""
+"""Rules and what they find. The texts of the rules are data, in `rules.yaml` next to this module."""
 
 from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
 from rlctl.errors import UsageError, did_you_mean
-
-if TYPE_CHECKING:
-    from rlctl.checking.instance import Context
-    from rlctl.checking.messages import Message
-    from rlctl.checking.records import Records
 
 
 class Severity(enum.StrEnum):
@@ -62,7 +54,7 @@ FAMILIES, RULES = _load()
 
 
 @dataclasses.dataclass(init=False)
-class Finding:
+class RuleFinding:
     """Something that is wrong, or may be, with one environment."""
 
     rule: str
@@ -88,55 +80,6 @@ class Finding:
     def name(self) -> str:
         """The rule's name."""
         return RULES[self.rule].name
-
-
-RECORDING = ("comparisons", "episodes", "instances")
-"""The experiments that record episodes for all rules: with random and other actions, alone and beside another."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Experiment:
-    """One thing to do with an environment in a child process."""
-
-    name: str
-    run: Callable[[Context], Iterator[Message]]
-    """Yields what it finds, each as soon as it is known, so that what comes before a crash is not lost."""
-    rules: tuple[str, ...]
-    """Those it decides: they are judged if it comes to its end. Empty for one that only records."""
-    share: float
-    """Its part of the time there is, relative to the other experiments of the same process."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Check:
-    """How the parent process judges a rule from what was recorded."""
-
-    rule: str
-    run: Callable[[Records], Iterable[Finding]]
-    needs: tuple[str, ...]
-    """The experiments that record what it reads."""
-
-
-def experiment(
-    name: str, *rules: str, share: float = 1.0
-) -> Callable[[Callable[[Context], Iterator[Message]]], Experiment]:
-    """Make an experiment of a function. It decides `rules`; see the package `families` for how."""
-
-    def decorate(run: Callable[[Context], Iterator[Message]]) -> Experiment:
-        assert all(rule in RULES for rule in rules)
-        return Experiment(name, run, rules, share)
-
-    return decorate
-
-
-def check(rule: str, *needs: str) -> Callable[[Callable[[Records], Iterable[Finding]]], Check]:
-    """Make the check of a rule of a function; by default it reads the recorded episodes."""
-
-    def decorate(run: Callable[[Records], Iterable[Finding]]) -> Check:
-        assert rule in RULES
-        return Check(rule, run, needs or RECORDING)
-
-    return decorate
 
 
 def list_names(names: Sequence[str], most: int) -> str:

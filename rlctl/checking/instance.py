@@ -12,8 +12,8 @@ from typing import Any, Literal
 from rlctl.checking.clock import read_clock
 from rlctl.checking.failures import EnvironmentRaised, describe, describe_failure
 from rlctl.checking.leaves import find_leaves
-from rlctl.checking.messages import Failure
-from rlctl.checking.progress import Progress
+from rlctl.checking.messages import CallFailure
+from rlctl.checking.progress import CallProgress
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
@@ -53,7 +53,7 @@ class Budget:
 class Instance:
     """One environment, and how it is called."""
 
-    def __init__(self, env: Any, progress: Progress) -> None:
+    def __init__(self, env: Any, progress: CallProgress) -> None:
         """Raises `TaskError` where its observation space cannot be read."""
         try:
             self.leaves = find_leaves(getattr(env, "observation_space", None))
@@ -106,9 +106,9 @@ class Instance:
 class Context:
     """One child process's view of the environment."""
 
-    def __init__(self, spec: EnvSpec, progress: Progress | None = None) -> None:
+    def __init__(self, spec: EnvSpec, progress: CallProgress | None = None) -> None:
         self.spec = spec
-        self.progress = progress or Progress()
+        self.progress = progress or CallProgress()
         self.budget = Budget(read_clock())
         """What the experiment that is running may use."""
         self._instance: Instance | None = None
@@ -148,7 +148,7 @@ class Context:
             with contextlib.suppress(EnvironmentRaised):
                 instance.close()
 
-    def close(self, instance: Instance | None = None) -> Iterator[Failure]:
+    def close(self, instance: Instance | None = None) -> Iterator[CallFailure]:
         """Close an instance, by default the one that this process keeps; yield what it raised."""
         if instance is None:
             self.progress.phase("close")
@@ -166,7 +166,7 @@ def _accepts(env: Any, name: str) -> bool:
         parameters = inspect.signature(env.reset).parameters.values()
     except ValueError:  # not written in Python
         return True
-    return any(each.name == name or each.kind is each.VAR_KEYWORD for each in parameters)
+    return any(parameter.name == name or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
 
 
 def find_author(env: Any) -> Any:

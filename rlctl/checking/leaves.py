@@ -98,7 +98,7 @@ def flatten_numbers(observation: Any) -> NDArray[Any]:
     """Return a copy of all numbers of an observation; those that are in no array of numbers are left out."""
     if isinstance(observation, dict):
         observation = tuple(observation.values())
-    if isinstance(observation, (tuple, list)) and any(isinstance(each, (np.ndarray, dict)) for each in observation):
+    if isinstance(observation, (tuple, list)) and any(isinstance(part, (np.ndarray, dict)) for part in observation):
         parts = [flatten_numbers(value) for value in observation]
         return np.concatenate(parts) if parts else np.zeros(0)
     try:
@@ -112,13 +112,13 @@ def find_numbers(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
     """Yield the numbers of an info by name; those in a dictionary of it as `reward_terms/distance`."""
     for key, value in info.items():
         inner = value.items() if isinstance(value, dict) else [("", value)]
-        for name, each in inner:
+        for name, number in inner:
             # Some libraries make an array without axes of a comparison.
-            if isinstance(each, NUMBERS) or (
-                isinstance(each, np.ndarray) and each.shape == () and each.dtype.kind in "biuf"
+            if isinstance(number, NUMBERS) or (
+                isinstance(number, np.ndarray) and number.shape == () and number.dtype.kind in "biuf"
             ):
                 with contextlib.suppress(OverflowError):  # a whole number of hundreds of digits
-                    yield f"{key}/{name}" if isinstance(value, dict) else str(key), float(each)
+                    yield f"{key}/{name}" if isinstance(value, dict) else str(key), float(number)
 
 
 def name_type(value: Any) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.finding import Finding
+from rlctl.checking.finding import RuleFinding
 from rlctl.checking.leaves import Leaf, name_element
 
 FIRST_SEED = 1000
@@ -98,7 +98,7 @@ class Form:
 
 
 @dataclasses.dataclass(frozen=True)
-class Trajectory:
+class RecordedEpisode:
     """One episode of T steps, or the part of it that was played."""
 
     role: str
@@ -134,7 +134,7 @@ class Trajectory:
 
 
 @dataclasses.dataclass(frozen=True)
-class Failure:
+class CallFailure:
     """A call into the environment that raised, never came back, or ended the process."""
 
     kind: str
@@ -218,15 +218,15 @@ class End:
     """The process has done all it was asked for."""
 
 
-Message = Built | Trajectory | Failure | Finding | Fact | Skipped | Finished | Mistake | End
+ChildMessage = Built | RecordedEpisode | CallFailure | RuleFinding | Fact | Skipped | Finished | Mistake | End
 
 
 def encode(message: Any) -> bytes:
     """Return a dataclass of this package as bytes; it may hold others, arrays, and what JSON can hold."""
     arrays: list[NDArray[Any]] = []
     plain = _to_plain(message, arrays)
-    header = json.dumps([plain, [[each.dtype.str, each.shape] for each in arrays]]).encode()
-    return b"\n".join([header, b"".join(each.tobytes() for each in arrays)])
+    header = json.dumps([plain, [[array.dtype.str, array.shape] for array in arrays]]).encode()
+    return b"\n".join([header, b"".join(array.tobytes() for array in arrays)])
 
 
 def decode(content: bytes) -> Any:
@@ -251,32 +251,32 @@ def _to_plain(value: Any, arrays: list[NDArray[Any]]) -> Any:
         fields = {field.name: _to_plain(getattr(value, field.name), arrays) for field in dataclasses.fields(value)}
         return {"class": f"{type(value).__module__}:{type(value).__name__}", "fields": fields}
     if isinstance(value, dict):  # its keys may be numbers
-        return {"dict": [[key, _to_plain(each, arrays)] for key, each in value.items()]}
+        return {"dict": [[key, _to_plain(item, arrays)] for key, item in value.items()]}
     if isinstance(value, tuple):
-        return {"tuple": [_to_plain(each, arrays) for each in value]}
+        return {"tuple": [_to_plain(item, arrays) for item in value]}
     if isinstance(value, list):
-        return [_to_plain(each, arrays) for each in value]
+        return [_to_plain(item, arrays) for item in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
 def _from_plain(value: Any, arrays: Sequence[NDArray[Any]]) -> Any:
     if isinstance(value, list):
-        return [_from_plain(each, arrays) for each in value]
+        return [_from_plain(item, arrays) for item in value]
     if not isinstance(value, dict):
         return value
     if "array" in value:
         return arrays[value["array"]]
     if "dict" in value:
-        return {key: _from_plain(each, arrays) for key, each in value["dict"]}
+        return {key: _from_plain(item, arrays) for key, item in value["dict"]}
     if "tuple" in value:
-        return tuple(_from_plain(each, arrays) for each in value["tuple"])
-    return _class(value["class"])(**{name: _from_plain(each, arrays) for name, each in value["fields"].items()})
+        return tuple(_from_plain(item, arrays) for item in value["tuple"])
+    return _class(value["class"])(**{name: _from_plain(item, arrays) for name, item in value["fields"].items()})
 
 
 def _class(name: str) -> type:
     """Return a dataclass of this package: what a child process names is not trusted further than that."""
     module, _, name = name.partition(":")
-    found = getattr(importlib.import_module(module), name, None) if module.startswith(f"{_PACKAGE}.") else None
-    if not (isinstance(found, type) and dataclasses.is_dataclass(found)):
+    cls = getattr(importlib.import_module(module), name, None) if module.startswith(f"{_PACKAGE}.") else None
+    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
         raise ValueError(f"{module}:{name} is not a dataclass of {_PACKAGE}")
-    return found
+    return cls

@@ -80,23 +80,25 @@ class Profile:
         profile.create_stats()
         self._stats: dict[Function, Any] = profile.stats
         """Per function the number of calls, twice, the time in itself and with all it calls [s], the same by caller."""
-        self._own = {each for each in self._stats if each[0] != "~" and is_own(each[0])}
-        modules = {getattr(each, "__dict__", {}).get("__file__"): name for name, each in list(sys.modules.items())}
-        self._names = {each: each[2] if each in self._own else _name_of(each, modules) for each in self._stats}
-        self._kinds = {each: _kind_of(name, each in self._own) for each, name in self._names.items()}
+        self._own = {function for function in self._stats if function[0] != "~" and is_own(function[0])}
+        modules = {getattr(module, "__dict__", {}).get("__file__"): name for name, module in list(sys.modules.items())}
+        self._names = {
+            function: function[2] if function in self._own else _name_of(function, modules) for function in self._stats
+        }
+        self._kinds = {function: _kind_of(name, function in self._own) for function, name in self._names.items()}
 
     def slowest(self) -> list[TimedCall]:
         """Return the functions by the time in themselves, the slowest first."""
-        return self._sum_up([(each, self._place(each), stats[2]) for each, stats in self._stats.items()])
+        return self._sum_up([(function, self._place(function), stats[2]) for function, stats in self._stats.items()])
 
     def suspicious(self) -> list[TimedCall]:
         """Return the functions of a suspicious kind that no other such calls, with the time in all they call."""
         return self._sum_up(
             [
-                (each, self._place(each if each in self._own else caller), spent[3])
-                for each, stats in self._stats.items()
+                (function, self._place(function if function in self._own else caller), spent[3])
+                for function, stats in self._stats.items()
                 for caller, spent in stats[4].items()
-                if self._kinds[each] and not self._kinds[caller]
+                if self._kinds[function] and not self._kinds[caller]
             ]
         )
 
@@ -105,19 +107,19 @@ class Profile:
         seen = set()
         while function is not None and function not in self._own:
             seen.add(function)
-            callers = {each: spent[3] for each, spent in self._stats[function][4].items() if each not in seen}
-            function = max(callers, key=lambda each: callers[each], default=None)
+            callers = {caller: spent[3] for caller, spent in self._stats[function][4].items() if caller not in seen}
+            function = max(callers, key=lambda caller: callers[caller], default=None)
         return "" if function is None else f"{Path(function[0]).name}:{function[1]}"
 
     def _sum_up(self, calls: Sequence[tuple[Function, str, float]]) -> list[TimedCall]:
         """Return one call per name, with the place where most of its time goes, the slowest first."""
         total = sum(stats[2] for stats in self._stats.values()) or 1.0
-        found: dict[str, TimedCall] = {}
-        for function, place, spent in sorted(calls, key=lambda each: -each[2]):
+        by_name: dict[str, TimedCall] = {}
+        for function, place, spent in sorted(calls, key=lambda call: -call[2]):
             name = self._names[function]
-            call = found.setdefault(name, TimedCall(name, place, 0.0, self._kinds[function]))
-            found[name] = dataclasses.replace(call, share=call.share + spent / total)
-        return sorted(found.values(), key=lambda each: -each.share)
+            call = by_name.setdefault(name, TimedCall(name, place, 0.0, self._kinds[function]))
+            by_name[name] = dataclasses.replace(call, share=call.share + spent / total)
+        return sorted(by_name.values(), key=lambda call: -call.share)
 
 
 def _name_of(function: Function, modules: dict[Any, str]) -> str:
@@ -134,7 +136,7 @@ def _name_of(function: Function, modules: dict[Any, str]) -> str:
     else:
         name = match["function"] or f"{match['of']}.{match['method']}"
     *parts, last = name.removeprefix("builtins.").removeprefix("io.").split(".")
-    return ".".join([*(each for each in parts if each and not each.startswith("_")), last])
+    return ".".join([*(part for part in parts if part and not part.startswith("_")), last])
 
 
 def find_own_code(env: Any) -> Callable[[str], bool]:
@@ -147,7 +149,7 @@ def find_own_code(env: Any) -> Callable[[str], bool]:
 
     @functools.cache
     def is_own(file: str) -> bool:
-        is_library = file.startswith(("<", *(f"{each}/" for each in libraries))) or "site-packages" in file
+        is_library = file.startswith(("<", *(f"{library}/" for library in libraries))) or "site-packages" in file
         return file.startswith(f"{folder}/") or not is_library
 
     return is_own

@@ -36,7 +36,7 @@ class Position:
     """Whether it is the first call of its kind in the process, which may compile or load something."""
 
 
-class Progress:
+class CallProgress:
     """Written by the child at every call, read by the parent. Without a descriptor nobody else reads it."""
 
     def __init__(self, descriptor: int | None = None) -> None:

@@ -7,22 +7,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import Episode, Moment
+from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.instance import Budget
 from rlctl.checking.leaves import Leaf, find_numbers, name_type, pick
-from rlctl.checking.messages import MOST_INFOS, Failure, Form, Series, Trajectory
+from rlctl.checking.messages import MOST_INFOS, CallFailure, Form, RecordedEpisode, Series
 
 
 class Recording:
     """An episode that is written down while it is played: `advance` while `running`, or `run`."""
 
-    def __init__(self, role: str, episode: Episode, budget: Budget) -> None:
+    def __init__(self, role: str, episode: EpisodePlayer, budget: Budget) -> None:
         """`role` is what it is recorded for; `budget` is charged with its memory."""
         self.role = role
         self.episode = episode
         self.budget = budget
-        self.failure: Failure | None = None
+        self.failure: CallFailure | None = None
         self._moments = iter(episode)
         self._ended = ""
         self._step = 0
@@ -34,7 +34,7 @@ class Recording:
         self._infos: dict[str, tuple[list[int], list[float]]] = {}
         self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
 
-    def run(self) -> list[Trajectory | Failure]:
+    def run(self) -> list[RecordedEpisode | CallFailure]:
         """Play the episode to its end; return what to send."""
         while self.running:
             self.advance()
@@ -67,7 +67,7 @@ class Recording:
         """Whether the episode was left before its end, for steps or time."""
         return self._ended in ("steps", "time")
 
-    def messages(self) -> list[Trajectory | Failure]:
+    def messages(self) -> list[RecordedEpisode | CallFailure]:
         """Return what to send: the trajectory, and the failure that ended it, if one did."""
         return [self.trajectory, *([self.failure] if self.failure else [])]
 
@@ -148,10 +148,10 @@ class Recording:
         self._previous[index] = value, copy
 
     @property
-    def trajectory(self) -> Trajectory:
+    def trajectory(self) -> RecordedEpisode:
         """What was written down."""
         names = ("what", "type", "leaf", "dtype", "shape")
-        return Trajectory(
+        return RecordedEpisode(
             role=self.role,
             episode=self.episode.number,
             seed=self.episode.seed,

@@ -6,8 +6,18 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from rlctl.checking.finding import Finding, NotJudged
-from rlctl.checking.messages import Built, Fact, Failure, Finished, Form, Message, Series, Skipped, Trajectory
+from rlctl.checking.finding import NotJudged, RuleFinding
+from rlctl.checking.messages import (
+    Built,
+    CallFailure,
+    ChildMessage,
+    Fact,
+    Finished,
+    Form,
+    RecordedEpisode,
+    Series,
+    Skipped,
+)
 
 OTHERS_MATTER = ("interleaved", "interleaved second", "after close")
 """Roles of episodes beside another instance: rules of their own judge them."""
@@ -19,9 +29,9 @@ class Records:
 
     task: str
     built: Built | None = None
-    trajectories: list[Trajectory] = dataclasses.field(default_factory=list)
-    failures: list[Failure] = dataclasses.field(default_factory=list)
-    findings: list[Finding] = dataclasses.field(default_factory=list)
+    trajectories: list[RecordedEpisode] = dataclasses.field(default_factory=list)
+    failures: list[CallFailure] = dataclasses.field(default_factory=list)
+    findings: list[RuleFinding] = dataclasses.field(default_factory=list)
     """Those of the experiments."""
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)
     """By the name of the experiment that found it out."""
@@ -37,16 +47,16 @@ class Records:
     """Lines that the environment of the first process wrote to stdout."""
     printed_first: str = ""
 
-    def add(self, message: Message) -> None:
+    def add(self, message: ChildMessage) -> None:
         """Take in one message of a child process."""
         match message:
             case Built():
                 self.built = message
-            case Trajectory():
+            case RecordedEpisode():
                 self.trajectories.append(message)
-            case Failure():
+            case CallFailure():
                 self.failures.append(message)
-            case Finding():
+            case RuleFinding():
                 self.findings.append(message)
             case Fact():
                 self.facts[message.experiment] = message.value
@@ -55,12 +65,12 @@ class Records:
             case Finished():
                 self.finished[message.experiment] = message
 
-    def role(self, role: str) -> list[Trajectory]:
+    def role(self, role: str) -> list[RecordedEpisode]:
         """Return what was recorded for one purpose."""
-        return [each for each in self.trajectories if each.role == role]
+        return [trajectory for trajectory in self.trajectories if trajectory.role == role]
 
     @property
-    def episodes(self) -> list[Trajectory]:
+    def episodes(self) -> list[RecordedEpisode]:
         """Return the whole episodes of the first process."""
         return self.role("episodes")
 
@@ -71,31 +81,33 @@ class Records:
         return self.built
 
     @property
-    def alone(self) -> list[Trajectory]:
+    def alone(self) -> list[RecordedEpisode]:
         """Return all episodes of instances that were alone in their process and used as a learner uses them."""
-        return [each for each in self.trajectories if each.role not in OTHERS_MATTER]
+        return [trajectory for trajectory in self.trajectories if trajectory.role not in OTHERS_MATTER]
 
-    def require_alone(self) -> list[Trajectory]:
+    def require_alone(self) -> list[RecordedEpisode]:
         """Return the same; raises `NotJudged` if there is none."""
-        found = self.alone
-        if not any(each.steps or each.observations for each in found):
+        episodes = self.alone
+        if not any(episode.steps or episode.observations for episode in episodes):
             raise NotJudged("no episode was recorded")
-        return found
+        return episodes
 
-    def forms(self, what: str) -> list[tuple[Trajectory, Form]]:
+    def forms(self, what: str) -> list[tuple[RecordedEpisode, Form]]:
         """Return every type that something had in the same episodes."""
-        return [(each, form) for each in self.require_alone() for form in each.forms if form.what == what]
+        return [(episode, form) for episode in self.require_alone() for form in episode.forms if form.what == what]
 
-    def series(self, leaf: int) -> list[tuple[Trajectory, Series]]:
+    def series(self, leaf: int) -> list[tuple[RecordedEpisode, Series]]:
         """Return the values of a leaf of the observation in the same episodes, where there are any."""
-        return [(each, each.observations[leaf]) for each in self.require_alone() if leaf in each.observations]
+        return [
+            (episode, episode.observations[leaf]) for episode in self.require_alone() if leaf in episode.observations
+        ]
 
-    def require_role(self, role: str) -> Trajectory:
+    def require_role(self, role: str) -> RecordedEpisode:
         """Return the episode of a comparison; raises `NotJudged` if there is none."""
-        found = self.role(role)
-        if not found:
+        episodes = self.role(role)
+        if not episodes:
             raise NotJudged(self.skipped.get(role, f"the comparison {role!r} could not be made"))
-        return found[0]
+        return episodes[0]
 
     def require_fact(self, experiment: str) -> Any:
         """Return what an experiment found out; raises `NotJudged` with the reason where it did not."""

@@ -13,8 +13,8 @@ from multiprocessing.connection import Connection, wait
 
 from rlctl.checking import families
 from rlctl.checking.clock import read_clock_of
-from rlctl.checking.messages import Built, End, Failure, Finished, Message, Mistake, decode
-from rlctl.checking.progress import Position, Progress
+from rlctl.checking.messages import Built, CallFailure, ChildMessage, End, Finished, Mistake, decode
+from rlctl.checking.progress import CallProgress, Position
 from rlctl.environments.spec import EnvSpec
 from rlctl.processes.child_process import ChildProcess, LineReader, anonymous_file
 
@@ -44,7 +44,7 @@ class Child:
         self.first_line = ""
         self.last_lines: deque[str] = deque(maxlen=_KEPT_LINES)
         self._memory = anonymous_file()
-        self._progress = Progress(self._memory)
+        self._progress = CallProgress(self._memory)
         self._readers = LineReader(self._count), LineReader(self._keep)
         arguments = {
             "process": name,
@@ -92,11 +92,13 @@ class Child:
     def _clock(self) -> float:
         return read_clock_of(self.process.process.pid)
 
-    def fail(self, kind: str, error: str) -> Failure:
+    def fail(self, kind: str, error: str) -> CallFailure:
         """Return the failure that ends it."""
         at, details = self.position, "\n".join(self.last_lines)
         call = at.call or "between calls"
-        return Failure(kind, call, at.phase, at.episode, at.seed, at.step, error, details or None, process=self.name)
+        return CallFailure(
+            kind, call, at.phase, at.episode, at.seed, at.step, error, details or None, process=self.name
+        )
 
     def describe_end(self) -> str:
         """Wait for its end, after its connection closed, and for the last it has printed; return how it ended."""
@@ -131,7 +133,7 @@ class Supervisor:
     """The child processes of one check."""
 
     def __init__(
-        self, spec: EnvSpec, budget_s: float, env_timeout_s: float, receive: Callable[[Message], None]
+        self, spec: EnvSpec, budget_s: float, env_timeout_s: float, receive: Callable[[ChildMessage], None]
     ) -> None:
         self._spec = spec
         self._budget_s = budget_s
@@ -192,7 +194,7 @@ class Supervisor:
         if why := child.hangs(self._env_timeout_s):
             self._end(child, child.fail("hung", why))
 
-    def _end(self, child: Child, failure: Failure | None = None, grace_s: float = 0.0) -> None:
+    def _end(self, child: Child, failure: CallFailure | None = None, grace_s: float = 0.0) -> None:
         if failure is not None:
             self._receive(failure)
             self._start_again(child)

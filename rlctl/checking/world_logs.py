@@ -14,10 +14,10 @@ from rlctl.checking.bullet_worlds import (
     ANGULAR,
     JOINTS,
     VELOCITY,
-    Body,
     Jump,
     Pair,
     World,
+    WorldBody,
     bullet,
     find_clients,
     find_jumps,
@@ -28,7 +28,7 @@ from rlctl.checking.bullet_worlds import (
     read_world,
     weight_matters,
 )
-from rlctl.checking.episode import Episode
+from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.finding import NotApplicable
 from rlctl.checking.instance import Instance
 from rlctl.checking.messages import FIRST_SEED
@@ -46,7 +46,7 @@ Place = dict[str, Any]
 
 
 @dataclasses.dataclass
-class Log:
+class WorldLog:
     """One world in one episode: an entry per look."""
 
     world: World
@@ -66,7 +66,7 @@ class Log:
             return False
         self.places.append(place)
         self.states.append(states)
-        self.deep.append({pair: each for pair, each in deep.items() if each[0] > each[1]})
+        self.deep.append({pair: depth for pair, depth in deep.items() if depth[0] > depth[1]})
         return True
 
     @property
@@ -75,10 +75,10 @@ class Log:
         return str(self.places[0]["actions"]) if self.places else ""
 
     @property
-    def bodies(self) -> list[tuple[Body, NDArray[np.float64]]]:
+    def bodies(self) -> list[tuple[WorldBody, NDArray[np.float64]]]:
         """The bodies, and the state of each at every look. Shape (looks, 9 + 2 * joints) each."""
         series = zip(*self.states, strict=True)
-        return [(body, np.array(each)) for body, each in zip(self.world.bodies, series, strict=False)]
+        return [(body, np.array(states)) for body, states in zip(self.world.bodies, series, strict=False)]
 
     @property
     def moves(self) -> bool:
@@ -101,7 +101,7 @@ class LoggedWorld:
     world: World
     gravity: list[float]
     """The strongest [m/s^2]."""
-    logs: list[Log] = dataclasses.field(default_factory=list)
+    logs: list[WorldLog] = dataclasses.field(default_factory=list)
     jumps: list[Jump] = dataclasses.field(default_factory=list)
     weight_matters: bool | None = None
     """Whether anything would move otherwise with gravity; tested only where there is none."""
@@ -122,20 +122,20 @@ class WorldLogger:
     @property
     def worlds(self) -> list[LoggedWorld]:
         """The worlds, without what never moves: a copy of the robot that kinematics are solved with."""
-        moving = [each for each in self._worlds.values() if any(log.moves for log in each.logs)]
+        moving = [world for world in self._worlds.values() if any(log.moves for log in world.logs)]
         return moving or list(self._worlds.values())
 
     def play(self, number: int, kind: str, steps: int, deadline: float) -> None:
-        """Log an episode; where it raises, what was logged before stays."""
+        """Log an episode. If the environment raises, the log keeps what came before."""
         seed = FIRST_SEED + number
-        logs: list[Log] = []
-        for moment in Episode(self.instance, seed, kind, number=number, max_steps=steps, deadline=deadline):
+        logs: list[WorldLog] = []
+        for moment in EpisodePlayer(self.instance, seed, kind, number=number, max_steps=steps, deadline=deadline):
             place = {"seed": seed, "episode": number, "actions": kind, "step": moment.step}
             logs = [log for log in (logs if moment.step else self._begin()) if log.look(place)]
             if not logs:
                 return
 
-    def _begin(self) -> list[Log]:
+    def _begin(self) -> list[WorldLog]:
         self.resets += 1
         logs = []
         for i, world in enumerate(self._read()):
@@ -144,16 +144,16 @@ class WorldLogger:
             logged.gravity = max(logged.gravity, gravity, key=np.linalg.norm)
             if world.key == logged.world.key:
                 logged.world = world
-            logs.append(Log(world))
+            logs.append(WorldLog(world))
             logged.logs.append(logs[-1])
         return logs
 
     def _read(self) -> list[World]:
         """Return the worlds of the clients that came with the instance, or of all where it shares older ones."""
         ids = find_clients()
-        own = [read_world(each) for each in ids if each not in self._older]
+        own = [read_world(id) for id in ids if id not in self._older]
         if not any(world.bodies for world in own):
-            own = [read_world(each) for each in ids]
+            own = [read_world(id) for id in ids]
         return [world for world in own if world.bodies][:MOST_WORLDS]
 
     def simulate_alone(self, number: int, deadline: float) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
-from rlctl.checking.check import Report, check
+from rlctl.checking.check import CheckReport, check
 from rlctl.checking.families import find_rules
 from rlctl.checking.finding import Severity
 from rlctl.environments import registry
@@ -159,9 +159,9 @@ def _restore(start: Start, checkpoints: Checkpoints, learner: Learner) -> str:
     return f"going on at step {start.step:,}, {exactness}"
 
 
-def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[Report]:
+def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[CheckReport]:
     """Check an environment in a child process, watched by a thread of this one."""
-    future: Future[Report] = Future()
+    future: Future[CheckReport] = Future()
 
     def run() -> None:
         try:
@@ -181,7 +181,7 @@ def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[Report]:
     return future
 
 
-def _refuse_errors(report: Report, display: Display) -> None:
+def _refuse_errors(report: CheckReport, display: Display) -> None:
     """Raise `AnswerIsNo` if the check found an error, and show its warnings."""
     if report.records.built is None:
         return  # the workers build it too, and report what is wrong

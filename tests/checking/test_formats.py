@@ -14,7 +14,7 @@ import sarif_pydantic
 from gymnasium import spaces
 
 from rlctl.checking import families
-from rlctl.checking.check import Report, Verdict, judge
+from rlctl.checking.check import CheckReport, CheckVerdict, judge
 from rlctl.checking.finding import FAMILIES, RULES, choose_rules, find_rule
 from rlctl.checking.formats import FORMATS, choose, github, plain, rules, sarif, structured
 from rlctl.checking.leaves import find_leaves
@@ -33,7 +33,7 @@ PROBE = [each.name for each in families.PROCESSES["probe"].experiments]
 
 def report_of(task, rules=tuple(RULES), experiments=None):
     records = records_of(task, *(experiments or {"build", *families.find_needs(rules)}))
-    return Report(task, judge(records, rules), records, 1.0, 20.0)
+    return CheckReport(task, judge(records, rules), records, 1.0, 20.0)
 
 
 def test_arrays_without_elements_have_no_row():
@@ -66,7 +66,7 @@ def waiving():
 
 @pytest.fixture(scope="module")
 def crashed():
-    return Report("any", Verdict(crashed={"RL999": "Traceback ..."}), Records("any"), 1.0, 20.0)
+    return CheckReport("any", CheckVerdict(crashed={"RL999": "Traceback ..."}), Records("any"), 1.0, 20.0)
 
 
 @pytest.fixture(params=["broken", "unbuilt", "waiving", "crashed"])

@@ -11,7 +11,8 @@ import pytest
 
 from rlctl.checking import families
 from rlctl.checking.check import check, judge
-from rlctl.checking.finding import Check, choose_rules
+from rlctl.checking.experiments import Check
+from rlctl.checking.finding import choose_rules
 from rlctl.checking.messages import Fact, Series, decode, encode
 from rlctl.checking.records import Records
 from rlctl.environments.spec import EnvSpec

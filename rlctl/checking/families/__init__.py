@@ -3,23 +3,23 @@
 **An experiment** does something with an environment in a child process and yields what it finds:
 
     @experiment("rendering", "RL215", share=0.5)
-    def render(context: Context) -> Iterator[Message]:
+    def render(context: Context) -> Iterator[ChildMessage]:
         with context.fresh("rgb_array") as instance:
             instance.reset(FIRST_SEED)
             if not isinstance(picture := instance.call("render", instance.env.render), np.ndarray):
-                yield Finding("RL215", "render returns no array", {"value": str(picture)})
+                yield RuleFinding("RL215", "render returns no array", {"value": str(picture)})
 
 It decides the rules that it names: they are judged when it comes to its end. `raise NotJudged(why)` or
 `NotApplicable(why)` says so of all its rules without a finding, `yield Skipped("RL404", why)` of one of them. It calls
-the environment through `Instance.call`, `Instance.reset` and `Episode` only, so that what the environment raises is an
-`EnvironmentRaised`, which need not be caught, and a hang or a crash can be placed. `context.budget` is what there is of
-time and memory.
+the environment through `Instance.call`, `Instance.reset` and `EpisodePlayer` only, so that what the environment raises
+is an `EnvironmentRaised`, which need not be caught, and a hang or a crash can be placed. `context.budget` is what there
+is of time and memory.
 
 **A check** judges one rule in the parent process, from recorded episodes, which many rules share:
 
     @check("RL502", "episodes")
-    def find_both_flags(records: Records) -> Iterator[Finding]:
-        for each in records.episodes: ...
+    def find_both_flags(records: Records) -> Iterator[RuleFinding]:
+        for episode in records.episodes: ...
 
 It names the experiments that it needs (by default those that record the common episodes, `RECORDING`) and raises
 `NotJudged` or `NotApplicable`. A rule may have both, and then has the findings of both. A recording experiment yields
@@ -35,6 +35,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Iterable
 
+from rlctl.checking.experiments import Check, Experiment
 from rlctl.checking.families import (
     actions,
     determinism,
@@ -52,7 +53,7 @@ from rlctl.checking.families import (
     speed,
     variants,
 )
-from rlctl.checking.finding import RULES, Check, Experiment
+from rlctl.checking.finding import RULES
 
 PROCESS_S = 18.0
 """How long the experiments of one process may take together [s]; importing and building comes on top."""
@@ -99,12 +100,12 @@ MODULES = (
     *(rewards, incentives, actions, physics, speed, variants),
 )
 
-CHECKS = {each.rule: each for module in MODULES for each in vars(module).values() if isinstance(each, Check)}
+CHECKS = {var.rule: var for module in MODULES for var in vars(module).values() if isinstance(var, Check)}
 """The check of a rule, for those that have one."""
 
-EXPERIMENTS = {each.name: each for process in PROCESSES.values() for each in process.experiments}
+EXPERIMENTS = {experiment.name: experiment for process in PROCESSES.values() for experiment in process.experiments}
 
-DECIDED_BY = {rule: each for each in EXPERIMENTS.values() for rule in each.rules}
+DECIDED_BY = {rule: experiment for experiment in EXPERIMENTS.values() for rule in experiment.rules}
 """The experiment that decides a rule, for those that one does."""
 
 

@@ -7,16 +7,17 @@ from typing import Literal
 
 from rlctl.checking.action_trials import (
     REPEATED_STEPS,
-    Dimension,
+    ActionNumber,
     OutOfTime,
     Trials,
     find_dimensions,
     find_other_rewards,
     observations_differ,
 )
-from rlctl.checking.finding import Finding, NotJudged, Severity, experiment, list_names
+from rlctl.checking.experiments import experiment
+from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, Message
+from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage
 
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))
@@ -31,7 +32,7 @@ itself in the observation."""
 
 
 @experiment("action effects", "RL701", share=4.0)
-def compare_actions(context: Context) -> Iterator[Message]:
+def compare_actions(context: Context) -> Iterator[ChildMessage]:
     """Play the same episode with each number of the action at other values."""
     with context.fresh() as instance:
         every = find_dimensions(instance.action_leaves)
@@ -52,7 +53,7 @@ def compare_actions(context: Context) -> Iterator[Message]:
     yield from _without_effect(effects, len(every), left_out)
 
 
-def _find_effect(trials: Trials, dimension: Dimension) -> Effect:
+def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
     copies = trials.copies(dimension, FIRST_SEED, REPEATED_STEPS, LONGEST_DELAY)
     effect: Effect = "none"
     for seed, steps in STAGES:
@@ -68,7 +69,7 @@ def _find_effect(trials: Trials, dimension: Dimension) -> Effect:
     return "lasting" if effect == "cost" and _lasts(trials, dimension) else effect
 
 
-def _lasts(trials: Trials, dimension: Dimension) -> bool:
+def _lasts(trials: Trials, dimension: ActionNumber) -> bool:
     """Say whether a single changed action changes rewards long after it: by a state that is not observed."""
     for seed, steps in STAGES[1:]:
         plain = trials.plain(seed, steps)
@@ -81,7 +82,7 @@ def _lasts(trials: Trials, dimension: Dimension) -> bool:
     return False
 
 
-def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) -> Iterator[Finding]:
+def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) -> Iterator[RuleFinding]:
     dead, costly, copied = (
         [name for name, effect in effects.items() if effect == kind] for kind in ("none", "cost", "copy")
     )
@@ -103,6 +104,6 @@ def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) ->
         yield _finding(copied, message, Severity.INFO)
 
 
-def _finding(names: list[str], message: str, severity: Severity) -> Finding:
+def _finding(names: list[str], message: str, severity: Severity) -> RuleFinding:
     evidence = {"value": names, "seed": FIRST_SEED, "seeds": [FIRST_SEED, SECOND_SEED], "steps": STAGES[-1][1]}
-    return Finding("RL701", message, evidence, severity)
+    return RuleFinding("RL701", message, evidence, severity)

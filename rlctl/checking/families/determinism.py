@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import Episode
-from rlctl.checking.finding import Finding, NotJudged, Severity, check, experiment
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
+from rlctl.checking.finding import NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, Built, Message, Skipped, Trajectory
+from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, Built, ChildMessage, RecordedEpisode, Skipped
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Records
 
@@ -34,7 +35,7 @@ make it large later. Relative to the larger value or to 1; it is also what Gymna
 
 
 @experiment("comparisons", share=6.0)
-def compare_repetitions(context: Context) -> Iterator[Message]:
+def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
     """Play the first episode again: at once, after an unfinished other one, and with another seed."""
     instance, budget = context.instance, context.budget
     longest_s = budget.seconds_left / 4
@@ -43,20 +44,22 @@ def compare_repetitions(context: Context) -> Iterator[Message]:
         instance.progress.phase(role)
         if role == "dirty":
             unfinished = min(DIRTY_STEPS, max(1, steps // 2))
-            other = Episode(instance, SECOND_SEED, "extreme", max_steps=unfinished, deadline=budget.end_within(1.0))
+            other = EpisodePlayer(
+                instance, SECOND_SEED, "extreme", max_steps=unfinished, deadline=budget.end_within(1.0)
+            )
             Recording(role, other, budget).run()
         if budget.seconds_left < 0:
             yield Skipped(role, "the first comparisons took all the time there is for them")
             continue
         seed = SECOND_SEED if role == "seeds" else FIRST_SEED
-        episode = Episode(instance, seed, number=number, action_seed=FIRST_SEED, max_steps=COMPARED_STEPS)
+        episode = EpisodePlayer(instance, seed, number=number, action_seed=FIRST_SEED, max_steps=COMPARED_STEPS)
         episode.deadline = budget.end_within(longest_s)
         recording = Recording(role, episode, budget)
         yield from recording.run()
         steps = min(steps, recording.steps)
 
 
-def compare(records: Records, first: str, second: str) -> tuple[Trajectory, Difference | None]:
+def compare(records: Records, first: str, second: str) -> tuple[RecordedEpisode, FirstDifference | None]:
     """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
     built = records.require_built()
     if not built.accepts_seed:
@@ -82,17 +85,23 @@ def require_independent(records: Records) -> None:
 
 
 def report(
-    rule: str, records: Records, trajectory: Trajectory, difference: Difference, what: str, *, is_mild: bool = False
-) -> Finding:
+    rule: str,
+    records: Records,
+    trajectory: RecordedEpisode,
+    difference: FirstDifference,
+    what: str,
+    *,
+    is_mild: bool = False,
+) -> RuleFinding:
     """Return the finding that two recordings differ; an info where the environment's registration says they may."""
     severity = Severity.WARNING if difference.is_small or is_mild else None
     if records.require_built().nondeterministic:
         severity = Severity.INFO
-    return Finding(rule, f"{what}: {difference.text()}", difference.evidence(trajectory), severity)
+    return RuleFinding(rule, f"{what}: {difference.text()}", difference.evidence(trajectory), severity)
 
 
 @check("RL301", "comparisons")
-def compare_starts(records: Records) -> Iterator[Finding]:
+def compare_starts(records: Records) -> Iterator[RuleFinding]:
     """Compare the resets of an episode and its repetition."""
     trajectory, difference = compare(records, "alone", "reused")
     if difference is not None and difference.step == 0:
@@ -100,7 +109,7 @@ def compare_starts(records: Records) -> Iterator[Finding]:
 
 
 @check("RL302", "comparisons")
-def compare_trajectories(records: Records) -> Iterator[Finding]:
+def compare_trajectories(records: Records) -> Iterator[RuleFinding]:
     """Compare the steps of an episode and its repetition."""
     trajectory, difference = compare(records, "alone", "reused")
     if difference is not None and difference.step > 0:
@@ -108,7 +117,7 @@ def compare_trajectories(records: Records) -> Iterator[Finding]:
 
 
 @check("RL303", "comparisons")
-def compare_after_other_episode(records: Records) -> Iterator[Finding]:
+def compare_after_other_episode(records: Records) -> Iterator[RuleFinding]:
     """Compare an episode with its repetition after an unfinished other one."""
     require_repeatable(records)
     trajectory, difference = compare(records, "alone", "dirty")
@@ -118,7 +127,7 @@ def compare_after_other_episode(records: Records) -> Iterator[Finding]:
 
 
 @check("RL304", "comparisons", "instances")
-def compare_instances(records: Records) -> Iterator[Finding]:
+def compare_instances(records: Records) -> Iterator[RuleFinding]:
     """Compare the first and a second instance of one process."""
     trajectory, difference = compare(records, "fresh process", "fresh instance")
     if difference is not None:
@@ -127,7 +136,7 @@ def compare_instances(records: Records) -> Iterator[Finding]:
 
 
 @check("RL305", "comparisons", "instances")
-def compare_processes(records: Records) -> Iterator[Finding]:
+def compare_processes(records: Records) -> Iterator[RuleFinding]:
     """Compare two processes."""
     trajectory, difference = compare(records, "alone", "fresh process")
     if difference is not None:
@@ -136,7 +145,7 @@ def compare_processes(records: Records) -> Iterator[Finding]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Difference:
+class FirstDifference:
     """Where two trajectories begin to differ."""
 
     step: int
@@ -161,7 +170,7 @@ class Difference:
         at = "at reset" if self.step == 0 else f"at step {self.step}"
         return f"first difference {at}: {self.element} is {self.first:.9g}, then {self.second:.9g}{size}"
 
-    def evidence(self, trajectory: Trajectory) -> dict[str, Any]:
+    def evidence(self, trajectory: RecordedEpisode) -> dict[str, Any]:
         """Return it with the trajectory's seed, as a finding's evidence."""
         return {
             "seed": trajectory.seed,
@@ -178,29 +187,29 @@ def _plain(value: float) -> float | str:
     return value if np.isfinite(value) else str(value)
 
 
-def find_difference(built: Built, one: Trajectory, two: Trajectory) -> Difference | None:
+def find_difference(built: Built, one: RecordedEpisode, two: RecordedEpisode) -> FirstDifference | None:
     """Compare two trajectories bit for bit as far as both go; NaN equals NaN."""
-    found: list[Difference] = []
+    differences: list[FirstDifference] = []
     for index in sorted(one.observations.keys() & two.observations.keys()):
         a, b = one.observations[index], two.observations[index]
-        found += _compare(a.values, b.values, a.steps, functools.partial(built.element, index))
+        differences += _compare(a.values, b.values, a.steps, functools.partial(built.element, index))
     after = np.arange(1, one.steps + 1)
-    found += _compare(one.rewards, two.rewards, after, lambda _: "reward")
-    found += _compare(one.terminated, two.terminated, after, lambda _: "terminated")
-    found += _compare(one.truncated, two.truncated, after, lambda _: "truncated")
+    differences += _compare(one.rewards, two.rewards, after, lambda _: "reward")
+    differences += _compare(one.terminated, two.terminated, after, lambda _: "terminated")
+    differences += _compare(one.truncated, two.truncated, after, lambda _: "truncated")
     if one.has_ended and two.has_ended and one.steps != two.steps:
-        found.append(Difference(min(one.steps, two.steps), "length", one.steps, two.steps, 1.0, 1.0))
-    if not found:
+        differences.append(FirstDifference(min(one.steps, two.steps), "length", one.steps, two.steps, 1.0, 1.0))
+    if not differences:
         return None
-    earliest = min(found, key=lambda each: (each.step, -each.size))
-    return dataclasses.replace(earliest, largest=max(each.largest for each in found))
+    earliest = min(differences, key=lambda difference: (difference.step, -difference.size))
+    return dataclasses.replace(earliest, largest=max(difference.largest for difference in differences))
 
 
 def _compare(
     a: NDArray[Any], b: NDArray[Any], steps: NDArray[np.int64], name_of: Callable[[int], str]
-) -> Iterator[Difference]:
+) -> Iterator[FirstDifference]:
     rows = min(len(a), len(b))
-    a, b = (each[:rows].reshape(rows, math.prod(each.shape[1:])).astype(np.float64) for each in (a, b))
+    a, b = (values[:rows].reshape(rows, math.prod(values.shape[1:])).astype(np.float64) for values in (a, b))
     unequal = (a != b) & ~(np.isnan(a) & np.isnan(b))
     if unequal.any():
         row = int(unequal.any(axis=1).argmax())
@@ -209,4 +218,4 @@ def _compare(
         relative = np.nan_to_num(relative, nan=np.inf, posinf=np.inf)
         flat = int(np.where(unequal[row], relative[row], -1.0).argmax())
         values, largest = (float(a[row, flat]), float(b[row, flat])), float(relative.max())
-        yield Difference(int(steps[row]), name_of(flat), *values, float(relative[row, flat]), largest)
+        yield FirstDifference(int(steps[row]), name_of(flat), *values, float(relative[row, flat]), largest)

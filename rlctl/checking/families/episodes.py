@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rlctl.checking.episode import Episode
-from rlctl.checking.finding import Finding, NotJudged, Severity, check, experiment
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
+from rlctl.checking.finding import NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import ENDS, FIRST_SEED, Message, Trajectory
+from rlctl.checking.messages import ENDS, FIRST_SEED, ChildMessage, RecordedEpisode
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Records
 
@@ -32,7 +33,7 @@ ENOUGH_STEPS = 1_000
 
 
 @experiment("episodes", share=6.0)
-def record_episodes(context: Context) -> Iterator[Message]:
+def record_episodes(context: Context) -> Iterator[ChildMessage]:
     """Play whole episodes with actions of every kind."""
     instance, budget = context.instance, context.budget
     cut = 0
@@ -41,15 +42,17 @@ def record_episodes(context: Context) -> Iterator[Message]:
             raise NotJudged(f"{number} of {len(EPISODES)} episodes were played: {budget.why_spent}")
         longest = LATER_ENDLESS_STEPS if number >= 3 and cut else ENDLESS_STEPS
         deadline = budget.end_within(budget.seconds_left / 2)
-        episode = Episode(instance, FIRST_SEED + number, kind, number=number, max_steps=longest, deadline=deadline)
+        episode = EpisodePlayer(
+            instance, FIRST_SEED + number, kind, number=number, max_steps=longest, deadline=deadline
+        )
         recording = Recording("episodes", episode, budget)
         yield from recording.run()
         cut += recording.was_cut
 
 
-def _require_episodes(records: Records) -> list[Trajectory]:
+def _require_episodes(records: Records) -> list[RecordedEpisode]:
     """Return the whole episodes that can be judged: those that did not raise."""
-    episodes = [each for each in records.episodes if each.ended != "raised"]
+    episodes = [episode for episode in records.episodes if episode.ended != "raised"]
     if not episodes:
         raise NotJudged(records.skipped.get("episodes", "no episode could be played"))
     return episodes
@@ -61,79 +64,79 @@ def _require_two_flags(records: Records) -> None:
 
 
 @check("RL501", "episodes", "search")
-def _find_time_limit_as_terminated(records: Records) -> Iterator[Finding]:
+def _find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_episodes(records)
     _require_two_flags(records)
-    if any(each.ended in ("truncated", "both") for each in episodes):
+    if any(episode.ended in ("truncated", "both") for episode in episodes):
         return
-    ended = [each for each in episodes if each.ended == "terminated"]
-    limit = max((each.steps for each in ended), default=0)
-    longer = [each for each in episodes if each.ended not in ENDS] + records.role("search")
-    if any(each.steps > limit for each in longer):
+    ended = [episode for episode in episodes if episode.ended == "terminated"]
+    limit = max((episode.steps for episode in ended), default=0)
+    longer = [episode for episode in episodes if episode.ended not in ENDS] + records.role("search")
+    if any(episode.steps > limit for episode in longer):
         return
-    if len(ended) < FEWEST_EPISODES or len({each.actions for each in ended}) < 2:
+    if len(ended) < FEWEST_EPISODES or len({episode.actions for episode in ended}) < 2:
         raise NotJudged(f"only {len(ended)} episodes ended")
-    ties = [each for each in ended if each.steps == limit]
+    ties = [episode for episode in ended if episode.steps == limit]
     of = {"episodes": len(ties), "of": len(episodes)}
     evidence = {"step": limit, **of, "value": "terminated", "expected": "truncated"}
-    has_obstacle = all(_ends_with_odd_reward(each) for each in ties)
+    has_obstacle = all(_ends_with_odd_reward(episode) for episode in ties)
     if limit >= SHORTEST_LIMIT and len(ties) == len(episodes):
         message = f"all {len(ties)} episodes, whatever the actions, end at step {limit} with terminated=True"
         if has_obstacle:
             message += ", and with a reward unlike any before: a time limit, or an obstacle that none of them passes"
-        yield Finding("RL501", message, evidence, Severity.INFO if has_obstacle else None)
-    elif limit >= SHORTEST_TIE and len(ties) >= FEWEST_TIES and len({each.actions for each in ties}) > 1:
+        yield RuleFinding("RL501", message, evidence, Severity.INFO if has_obstacle else None)
+    elif limit >= SHORTEST_TIE and len(ties) >= FEWEST_TIES and len({episode.actions for episode in ties}) > 1:
         message = f"{len(ties)} of {len(episodes)} episodes end at step {limit} with terminated=True, none later"
-        yield from () if has_obstacle else (Finding("RL501", message, evidence),)
+        yield from () if has_obstacle else (RuleFinding("RL501", message, evidence),)
 
 
-def _ends_with_odd_reward(episode: Trajectory) -> bool:
+def _ends_with_odd_reward(episode: RecordedEpisode) -> bool:
     """Say whether the last reward is outside of what all others are: an obstacle that was hit, not a clock."""
     before, last = episode.rewards[:-1], episode.rewards[-1]
     return bool(before.size and (last < before.min() or last > before.max()))
 
 
 @check("RL502", "episodes")
-def _find_both_flags(records: Records) -> Iterator[Finding]:
+def _find_both_flags(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_episodes(records)
-    both = [each for each in episodes if each.ended == "both"]
-    if len(both) >= 2 and not any(each.ended == "truncated" for each in episodes):
+    both = [episode for episode in episodes if episode.ended == "both"]
+    if len(both) >= 2 and not any(episode.ended == "truncated" for episode in episodes):
         message = f"{len(both)} episodes end with terminated=True and truncated=True, none with truncated alone"
-        yield Finding("RL502", message, both[0].at(both[0].steps, value=len(both), expected=0))
+        yield RuleFinding("RL502", message, both[0].at(both[0].steps, value=len(both), expected=0))
 
 
 @check("RL503", "episodes")
-def _find_endless(records: Records) -> Iterator[Finding]:
+def _find_endless(records: Records) -> Iterator[RuleFinding]:
     limit, episodes = records.require_built().max_steps, _require_episodes(records)
-    if any(each.ended == "truncated" for each in episodes):
+    if any(episode.ended == "truncated" for episode in episodes):
         return
     longest: dict[str, int] = {}
-    for each in episodes:
-        if not each.has_ended:
-            longest[each.actions] = max(longest.get(each.actions, 0), each.steps)
+    for episode in episodes:
+        if not episode.has_ended:
+            longest[episode.actions] = max(longest.get(episode.actions, 0), episode.steps)
     if not any(longest.values()):
         return
     if max(longest.values()) < (limit or ENOUGH_STEPS):
         raise NotJudged(f"no end within {max(longest.values())} steps, and there was no time for more")
     declared = f", past its own limit of {limit}" if limit else " and no time limit is known"
     steps = ", ".join(f"{count:,} with {kind} actions" for kind, count in longest.items())
-    yield Finding("RL503", f"no end within {steps}{declared}", {"steps": longest, "expected": limit})
+    yield RuleFinding("RL503", f"no end within {steps}{declared}", {"steps": longest, "expected": limit})
 
 
 @check("RL504", "episodes")
-def _find_end_at_once(records: Records) -> Iterator[Finding]:
+def _find_end_at_once(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_episodes(records)
-    if len(episodes) >= FEWEST_EPISODES and all(each.has_ended and each.steps == 1 for each in episodes):
+    if len(episodes) >= FEWEST_EPISODES and all(episode.has_ended and episode.steps == 1 for episode in episodes):
         message = f"all {len(episodes)} episodes end on step 1"
-        yield Finding("RL504", message, {"step": 1, "episodes": len(episodes)})
+        yield RuleFinding("RL504", message, {"step": 1, "episodes": len(episodes)})
 
 
 @check("RL506", "episodes", "search")
-def _find_no_time_limit(records: Records) -> Iterator[Finding]:
+def _find_no_time_limit(records: Records) -> Iterator[RuleFinding]:
     built, episodes = records.require_built(), _require_episodes(records)
-    if built.max_steps is not None or any(each.ended != "terminated" for each in episodes):
+    if built.max_steps is not None or any(episode.ended != "terminated" for episode in episodes):
         return  # those that did not end are RL503's
-    lengths = [each.steps for each in episodes]
+    lengths = [episode.steps for episode in episodes]
     is_continuous = any(leaf.kind == "Box" and leaf.dtype.startswith("float") for leaf in built.leaves)
     if len(set(lengths)) == 1 or (max(lengths) < SHORTEST_TIE and not is_continuous):
         return  # a bandit, or a game of a few moves
@@ -146,4 +149,4 @@ def _find_no_time_limit(records: Records) -> Iterator[Finding]:
     message = f"no time limit: {why}; all {len(episodes)} episodes ended with terminated=True, the longest after "
     evidence = {"episodes": len(episodes), "value": None, "expected": "max_episode_steps", "step": max(lengths)}
     severity = Severity.WARNING if is_continuous and built.truncation == "never" else Severity.INFO
-    yield Finding("RL506", f"{message}{max(lengths)} steps", evidence, severity)
+    yield RuleFinding("RL506", f"{message}{max(lengths)} steps", evidence, severity)

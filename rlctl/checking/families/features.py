@@ -9,8 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.experiments import check
 from rlctl.checking.families.rewards import WITH_SEARCH, require_rewarded
-from rlctl.checking.finding import Finding, NotApplicable, NotJudged, Severity, check, list_names
+from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.leaves import Leaf
 from rlctl.checking.records import Records
 
@@ -49,7 +50,7 @@ def _is_image(leaf: Leaf) -> bool:
 
 
 @check("RL110", *WITH_SEARCH)
-def _find_constant_elements(records: Records) -> Iterator[Finding]:
+def _find_constant_elements(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     names: list[str] = []
     total = 0
@@ -61,12 +62,12 @@ def _find_constant_elements(records: Records) -> Iterator[Finding]:
             constant = _constant(rows, leaf)
             total += size
             has_constant_leaf |= len(constant) == size
-            names += [f"{built.element(index, int(each))} ({float(rows[0, each]):.4g})" for each in constant]
+            names += [f"{built.element(index, int(column))} ({float(rows[0, column]):.4g})" for column in constant]
     if names:
-        yield Finding(
+        yield RuleFinding(
             "RL110",
             f"{len(names)} of {total} elements of the observation never changed: {list_names(names, MOST_NAMED)}",
-            {"value": len(names), "expected": 0, "elements": [each.partition(" (")[0] for each in names[:MOST_NAMED]]},
+            {"value": len(names), "expected": 0, "elements": [name.partition(" (")[0] for name in names[:MOST_NAMED]]},
             Severity.WARNING if has_constant_leaf else Severity.INFO,
         )
 
@@ -81,7 +82,7 @@ def _constant(rows: Numbers, leaf: Leaf) -> NDArray[np.intp]:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Step:
+class _StartStep:
     """One of the first steps of an episode."""
 
     seed: int
@@ -91,25 +92,25 @@ class _Step:
     """The ones before and after it, in units of what is near. Shape (2, elements)."""
     reward: float
 
-    def is_alike(self, other: _Step) -> bool:
+    def is_alike(self, other: _StartStep) -> bool:
         """Say whether the observations of both are the same, nearly."""
         return bool((np.abs(self.observations - other.observations) <= 1.0).all())
 
 
 @check("RL114", *WITH_SEARCH)
-def find_hidden_goal(records: Records) -> Iterator[Finding]:
+def find_hidden_goal(records: Records) -> Iterator[RuleFinding]:
     """Compare the rewards of steps with the zero action that look alike, of different episodes and of one."""
-    rewards = np.concatenate([each.rewards for each in require_rewarded(records)])
+    rewards = np.concatenate([episode.rewards for episode in require_rewarded(records)])
     pairs = [(one, two) for one, two in itertools.combinations(_first_steps(records), 2) if one.is_alike(two)]
     across = [pair for pair in pairs if pair[0].seed != pair[1].seed]
     within = [pair for pair in pairs if pair[0].seed == pair[1].seed]  # where chance in the reward would show
     seeds = {step.seed for pair in across for step in pair}
     if len(across) < FEWEST_PAIRS or len(within) < FEWEST_PAIRS or len(seeds) < FEWEST_ALIKE_SEEDS:
         return  # no two episodes came to the same state
-    different, same = (float(np.median([_apart(pair) for pair in each])) for each in (across, within))
+    different, same = (float(np.median([_apart(pair) for pair in group])) for group in (across, within))
     if different > LARGE_PART * float(rewards.std()) and different > TIMES * same:
         one, two = max(across, key=_apart)
-        yield Finding(
+        yield RuleFinding(
             "RL114",
             f"with {len(seeds)} seeds, steps that look alike have rewards {different:.3g} apart (median of "
             f"{len(across):,} pairs), within one episode {same:.2g}: {one.reward:.4g} and {two.reward:.4g}, say",
@@ -124,25 +125,25 @@ def find_hidden_goal(records: Records) -> Iterator[Finding]:
         )
 
 
-def _apart(pair: tuple[_Step, _Step]) -> float:
+def _apart(pair: tuple[_StartStep, _StartStep]) -> float:
     return abs(pair[0].reward - pair[1].reward)
 
 
-def _first_steps(records: Records) -> list[_Step]:
+def _first_steps(records: Records) -> list[_StartStep]:
     """Return the steps of all starts, but those that end an episode."""
     leaves = records.require_built().leaves
     if not leaves or any(not leaf.supported or len(leaf.shape) == 3 for leaf in leaves):
         raise NotApplicable("a part of the observation is an image or cannot be compared")
     near = np.concatenate([_near(_rows(records, index)) for index in range(len(leaves))])
     steps = []
-    for each in records.role("starts"):
-        series = [each.observations.get(index) for index in range(len(leaves))]
+    for episode in records.role("starts"):
+        series = [episode.observations.get(index) for index in range(len(leaves))]
         flat = [one.values.reshape(len(one.values), -1) for one in series if one is not None]
-        if [len(one) for one in flat] == [each.steps + 1] * len(leaves):
+        if [len(one) for one in flat] == [episode.steps + 1] * len(leaves):
             scaled = np.nan_to_num(np.concatenate(flat, axis=1) / near)
             steps += [
-                _Step(each.seed, number, scaled[number - 1 : number + 1], float(each.rewards[number - 1]))
-                for number in range(1, each.steps + 1 - (each.ended in ("terminated", "both")))
+                _StartStep(episode.seed, number, scaled[number - 1 : number + 1], float(episode.rewards[number - 1]))
+                for number in range(1, episode.steps + 1 - (episode.ended in ("terminated", "both")))
             ]
     return steps
 

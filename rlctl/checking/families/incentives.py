@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import Episode
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.families.rewards import (
     DISCOUNT,
     SUCCESS,
@@ -25,9 +26,9 @@ from rlctl.checking.families.rewards import (
     require_rewarded,
     summarize,
 )
-from rlctl.checking.finding import Finding, NotApplicable, NotJudged, Severity, check, experiment
+from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, Message, Skipped, Trajectory
+from rlctl.checking.messages import FIRST_SEED, ChildMessage, RecordedEpisode, Skipped
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Records
 
@@ -57,26 +58,31 @@ OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
 
 
 @check("RL604", *WITH_SEARCH)
-def _find_paid_ends(records: Records) -> Iterator[Finding]:
+def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
     episodes = require_rewarded(records)
-    if not any(each.terminated.any() for each in episodes):
+    if not any(episode.terminated.any() for episode in episodes):
         raise NotApplicable("nothing ended an episode early")
     longest = longest_episode(records, episodes)
-    inner = np.concatenate([each.rewards[: each.steps - each.has_ended] for each in episodes])
+    inner = np.concatenate([episode.rewards[: episode.steps - episode.has_ended] for episode in episodes])
     early = [
-        each for each in episodes if each.ended == "terminated" and each.steps < longest and not ends_in_success(each)
+        episode
+        for episode in episodes
+        if episode.ended == "terminated" and episode.steps < longest and not ends_in_success(episode)
     ]
     if not early or not inner.size or inner.max() > 0 or inner.mean() == 0:
         return
     mean = float(inner.mean())
-    gains = [float(each.rewards[-1]) - mean - DISCOUNT * discounted_steps(mean, longest - each.steps) for each in early]
+    gains = [
+        float(episode.rewards[-1]) - mean - DISCOUNT * discounted_steps(mean, longest - episode.steps)
+        for episode in early
+    ]
     gain = float(np.median(gains))
     severity = _severity_of_end(episodes, early, inner)
     if gain <= 0 or severity is None:
         return
     example = early[int(np.argmax(gains))]
     last = float(example.rewards[-1])
-    yield Finding(
+    yield RuleFinding(
         "RL604",
         f"{len(early)} of {len(episodes)} episodes ended early without success. The mean reward is {mean:.3g} and none "
         f"but the last is above 0, so ending at step {example.steps} with {last:.3g} saves "
@@ -88,36 +94,38 @@ def _find_paid_ends(records: Records) -> Iterator[Finding]:
 
 
 def _severity_of_end(
-    episodes: Sequence[Trajectory], early: Sequence[Trajectory], inner: NDArray[np.float64]
+    episodes: Sequence[RecordedEpisode], early: Sequence[RecordedEpisode], inner: NDArray[np.float64]
 ) -> Severity | None:
     if reports_success(episodes):
         return Severity.WARNING
-    as_good_as = float(np.median([np.mean(inner <= each.rewards[-1]) for each in early]))
+    as_good_as = float(np.median([np.mean(inner <= episode.rewards[-1]) for episode in early]))
     if as_good_as >= LIKE_A_GOAL:
         return None
     return Severity.INFO if as_good_as >= LIKE_ANY else Severity.WARNING
 
 
 @check("RL606", *WITH_SEARCH)
-def _find_paid_idleness(records: Records) -> Iterator[Finding]:
-    compared = [each for each in require_rewarded(records) if each.role in ("episodes", "search")]
-    idle = [each for each in compared if each.actions == "zero"]
-    others = [each for each in compared if each.actions != "zero"]
+def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
+    compared = [episode for episode in require_rewarded(records) if episode.role in ("episodes", "search")]
+    idle = [episode for episode in compared if episode.actions == "zero"]
+    others = [episode for episode in compared if episode.actions != "zero"]
     if not idle or len(others) < FEWEST_COMPARED:
         raise NotJudged(f"{len(idle)} episodes with zero actions and {len(others)} others were recorded")
-    steps = min(COMPARED_STEPS, *(each.steps for each in idle))
-    if any(each.terminated.any() or has_succeeded(each) for each in idle) or steps < SHORTEST_COMPARED:
+    steps = min(COMPARED_STEPS, *(episode.steps for episode in idle))
+    if any(episode.terminated.any() or has_succeeded(episode) for episode in idle) or steps < SHORTEST_COMPARED:
         return
-    nothing = [discounted_sum(each.rewards[:steps]) for each in idle]
-    something = [discounted_sum(each.rewards[:steps]) for each in others if each.steps >= steps or each.has_ended]
-    if not something or len({float(reward) for each in compared for reward in each.rewards[:steps]}) == 1:
+    nothing = [discounted_sum(episode.rewards[:steps]) for episode in idle]
+    something = [
+        discounted_sum(episode.rewards[:steps]) for episode in others if episode.steps >= steps or episode.has_ended
+    ]
+    if not something or len({float(reward) for episode in compared for reward in episode.rewards[:steps]}) == 1:
         return  # a reward that never changes is RL602's
     mean, best = float(np.mean(nothing)), max(something)
     if mean <= 0 or min(nothing) <= 0 or best > mean + NEARLY * abs(mean):
         return
     bonus, share = _bonus(idle)
     because = f"; {100 * share:.0f} % of it is the term {bonus!r}, which never changes" if bonus else ""
-    yield Finding(
+    yield RuleFinding(
         "RL606",
         f"doing nothing earns {mean:.4g} over {steps} steps (discounted by {DISCOUNT}), the best of "
         f"{len(something)} other episodes {best:.4g}{because}",
@@ -126,71 +134,71 @@ def _find_paid_idleness(records: Records) -> Iterator[Finding]:
     )
 
 
-def _bonus(idle: Sequence[Trajectory]) -> tuple[str | None, float]:
+def _bonus(idle: Sequence[RecordedEpisode]) -> tuple[str | None, float]:
     """Return the constant positive term that is most of the reward, if there is one, and its share."""
-    total = sum(float(np.nansum(np.abs(values))) for each in idle for values in find_terms(each).values())
-    if total <= 0 or not all(has_terms(each) for each in idle):
+    total = sum(float(np.nansum(np.abs(values))) for episode in idle for values in find_terms(episode).values())
+    if total <= 0 or not all(has_terms(episode) for episode in idle):
         return None, 0.0
-    steps = sum(each.steps for each in idle)
+    steps = sum(episode.steps for episode in idle)
     shares = {name: value * steps / total for name, value in find_constant_terms(idle).items() if value > 0}
     largest = max(shares, key=lambda name: shares[name], default=None)
     return (largest, shares[largest]) if largest is not None and shares[largest] >= MOST_OF else (None, 0.0)
 
 
 @experiment("starts", share=1.0)
-def record_starts(context: Context) -> Iterator[Message]:
+def record_starts(context: Context) -> Iterator[ChildMessage]:
     """Reset with many seeds, and take the same few steps with the zero action after each."""
     for number in range(STARTS):
         if context.budget.why_spent:
             yield Skipped("starts", f"only {number} of {STARTS} starts were made: {context.budget.why_spent}")
             return
-        episode = Episode(context.instance, FIRST + number, "zero", number=number, max_steps=START_STEPS)
+        episode = EpisodePlayer(context.instance, FIRST + number, "zero", number=number, max_steps=START_STEPS)
         yield from Recording("starts", episode, context.budget).run()
 
 
 @check("RL609", *WITH_SEARCH)
-def _find_unreported_success(records: Records) -> Iterator[Finding]:
+def _find_unreported_success(records: Records) -> Iterator[RuleFinding]:
     episodes = require_readable(records)
     if reports_success(episodes):
         return
-    if not any(each.has_ended for each in episodes):
+    if not any(episode.has_ended for episode in episodes):
         raise NotJudged("no episode ended, and success may be reported at the end only")
-    names = dict.fromkeys(name for each in episodes for name in each.infos if name.split("/")[-1] in OTHER_NAMES)
+    names = dict.fromkeys(name for episode in episodes for name in episode.infos if name.split("/")[-1] in OTHER_NAMES)
     instead = f"; {', '.join(map(repr, names))} in info is read by nobody" if names else ""
     message = f"is_success is not in info: rlctl eval cannot report a success rate{instead}"
-    yield Finding("RL609", message, {"value": list(names), "expected": SUCCESS})
+    yield RuleFinding("RL609", message, {"value": list(names), "expected": SUCCESS})
 
 
 @check("RL610", "starts")
-def _find_success_at_start(records: Records) -> Iterator[Finding]:
-    starts = [each for each in records.role("starts") if each.steps]
+def _find_success_at_start(records: Records) -> Iterator[RuleFinding]:
+    starts = [episode for episode in records.role("starts") if episode.steps]
     if len(starts) < FEWEST_STARTS:
         raise NotJudged("no step could be taken" if records.role("starts") else records.why_missing("starts"))
-    reported = [(each, each.infos[SUCCESS]) for each in starts if SUCCESS in each.infos]
+    reported = [(start, start.infos[SUCCESS]) for start in starts if SUCCESS in start.infos]
     if not reported:
         raise NotApplicable("is_success is not reported at the first step")
-    at_once = [each for each, success in reported if (success.values[success.steps <= 1] > 0).any()]
+    at_once = [episode for episode, success in reported if (success.values[success.steps <= 1] > 0).any()]
     share = len(at_once) / len(starts)
     if share > MANY_AT_START:
         message = f"{len(at_once)} of {len(starts)} episodes are a success after one step with the zero action"
-        yield Finding("RL610", message, at_once[0].at(1, value=share, expected=f"up to {MANY_AT_START}"))
+        yield RuleFinding("RL610", message, at_once[0].at(1, value=share, expected=f"up to {MANY_AT_START}"))
 
 
 @check("RL611", *WITH_SEARCH)
-def _find_no_success(records: Records) -> Iterator[Finding]:
+def _find_no_success(records: Records) -> Iterator[RuleFinding]:
     episodes = require_readable(records)
     if not reports_success(episodes):
         raise NotApplicable("is_success is not in info")
-    if any(has_succeeded(each) for each in episodes):
+    if any(has_succeeded(episode) for episode in episodes):
         return
-    steps = sum(each.steps for each in episodes)
+    steps = sum(episode.steps for episode in episodes)
     if len(episodes) < FEWEST_EPISODES or steps < FEWEST_STEPS or not records.role("search"):
         reason = f"only {len(episodes)} episodes with {steps} steps were recorded"
         raise NotJudged(records.skipped.get("search", reason))
-    best = max(episodes, key=lambda each: float(np.nan_to_num(each.rewards, nan=-np.inf).max()))
+    best = max(episodes, key=lambda episode: float(np.nan_to_num(episode.rewards, nan=-np.inf).max()))
     step = int(np.nan_to_num(best.rewards, nan=-np.inf).argmax())
     reward = float(best.rewards[step])
-    yield Finding(
+    yield RuleFinding(
         "RL611",
         f"is_success was not true once in {summarize(episodes)}; the best reward was {reward:.4g}, at step {step + 1}",
         best.at(step + 1, value=reward, episodes=len(episodes)),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.checking.experiments import RECORDING, check, experiment
 from rlctl.checking.failures import (
     NO_DISPLAY,
     EnvironmentRaised,
@@ -16,9 +17,9 @@ from rlctl.checking.failures import (
     iterate_causes,
     lacks_display,
 )
-from rlctl.checking.finding import RECORDING, Finding, NotApplicable, NotJudged, Severity, check, experiment
+from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, Failure, Form, Message, Trajectory
+from rlctl.checking.messages import FIRST_SEED, CallFailure, ChildMessage, Form, RecordedEpisode
 from rlctl.checking.records import Records
 from rlctl.errors import RecipeError
 
@@ -40,7 +41,7 @@ NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECAS
 
 
 @check("RL201")
-def _find_other_number_of_values(records: Records) -> Iterator[Finding]:
+def _find_other_number_of_values(records: Records) -> Iterator[RuleFinding]:
     for trajectory, form in _first_forms(records, "reset"):
         yield _of_form("RL201", f"reset returns {form.type}", trajectory, form, "tuple of 2")
     for trajectory, form in _first_forms(records, "step"):
@@ -48,20 +49,20 @@ def _find_other_number_of_values(records: Records) -> Iterator[Finding]:
 
 
 @check("RL202", "build")
-def _find_reset_without_seed(records: Records) -> Iterator[Finding]:
+def _find_reset_without_seed(records: Records) -> Iterator[RuleFinding]:
     if not records.require_built().accepts_seed:
-        yield Finding("RL202", "reset has no parameter `seed`")
+        yield RuleFinding("RL202", "reset has no parameter `seed`")
 
 
 @check("RL203", "build")
-def _find_reset_without_options(records: Records) -> Iterator[Finding]:
+def _find_reset_without_options(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     if built.accepts_seed and not built.accepts_options:  # without `seed`, RL202 says what reset has to look like
-        yield Finding("RL203", "reset has no parameter `options`")
+        yield RuleFinding("RL203", "reset has no parameter `options`")
 
 
 @check("RL204")
-def _find_wrong_types(records: Records) -> Iterator[Finding]:
+def _find_wrong_types(records: Records) -> Iterator[RuleFinding]:
     for what in ("terminated", "truncated"):
         for trajectory, form in _first_forms(records, what, "bool"):
             message = f"{what} is {_a(form.type)} at step {form.step}"
@@ -75,7 +76,7 @@ def _find_wrong_types(records: Records) -> Iterator[Finding]:
         yield _of_form("RL204", f"info is {_a(form.type)} at step {form.step}", trajectory, form, "dict")
 
 
-def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[Trajectory, Form]]:
+def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[RecordedEpisode, Form]]:
     """Yield the first place of each type of something, without those that are fine."""
     types = set(fine)
     for trajectory, form in records.forms(what):
@@ -85,16 +86,16 @@ def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[Traj
 
 
 def _of_form(
-    rule: str, message: str, trajectory: Trajectory, form: Form, expected: str, severity: Severity | None = None
-) -> Finding:
-    return Finding(rule, message, trajectory.at(form.step, type=form.type, expected=expected), severity)
+    rule: str, message: str, trajectory: RecordedEpisode, form: Form, expected: str, severity: Severity | None = None
+) -> RuleFinding:
+    return RuleFinding(rule, message, trajectory.at(form.step, type=form.type, expected=expected), severity)
 
 
 def _a(type_name: str) -> str:
     return type_name if type_name == "NoneType" else f"a {type_name}"
 
 
-def select_failures(records: Records, kind: str) -> Iterator[Failure]:
+def select_failures(records: Records, kind: str) -> Iterator[CallFailure]:
     """Yield the calls that raised, died or hung on an instance that was alone and used properly, each error once."""
     errors: set[tuple[str, str]] = set()
     for failure in records.failures:
@@ -106,37 +107,39 @@ def select_failures(records: Records, kind: str) -> Iterator[Failure]:
 
 
 @check("RL207")
-def _find_exceptions(records: Records) -> Iterator[Finding]:
-    raised = [each for each in select_failures(records, "raised") if each.file is None]  # the others are RL007's
+def _find_exceptions(records: Records) -> Iterator[RuleFinding]:
+    raised = [
+        failure for failure in select_failures(records, "raised") if failure.file is None
+    ]  # the others are RL007's
     for failure in raised[:MOST_FAILURES]:
-        yield Finding("RL207", failure.message, failure.place)
+        yield RuleFinding("RL207", failure.message, failure.place)
 
 
 @check("RL208")
-def _find_ends_of_process(records: Records) -> Iterator[Finding]:
+def _find_ends_of_process(records: Records) -> Iterator[RuleFinding]:
     for failure in select_failures(records, "died"):
         if not lacks_display(failure):  # RL216 says why
-            yield Finding("RL208", failure.message, failure.place)
+            yield RuleFinding("RL208", failure.message, failure.place)
 
 
 @check("RL209")
-def _find_hangs(records: Records) -> Iterator[Finding]:
+def _find_hangs(records: Records) -> Iterator[RuleFinding]:
     for failure in list(select_failures(records, "hung"))[:1]:
-        yield Finding("RL209", failure.message, failure.place)
+        yield RuleFinding("RL209", failure.message, failure.place)
 
 
 @check("RL211", *RECORDING)
-def _find_prints(records: Records) -> Iterator[Finding]:
+def _find_prints(records: Records) -> Iterator[RuleFinding]:
     lines = records.printed_lines
     if lines:
-        steps = max(1, sum(each.steps for each in records.trajectories))
+        steps = max(1, sum(trajectory.steps for trajectory in records.trajectories))
         message = f"{lines} lines on stdout in {steps} steps, the first: {records.printed_first[:80]!r}"
         severity = Severity.WARNING if steps >= FEWEST_STEPS and lines > max(20, MANY_LINES * steps) else None
-        yield Finding("RL211", message, {"value": lines, "expected": 0}, severity)
+        yield RuleFinding("RL211", message, {"value": lines, "expected": 0}, severity)
 
 
 @experiment(RENDERING, "RL215")
-def render(context: Context) -> Iterator[Message]:
+def render(context: Context) -> Iterator[ChildMessage]:
     """Try the mode rgb_array, which opens no window, on an instance of its own, where it is promised."""
     with context.fresh() as instance:
         metadata = getattr(instance.env, "metadata", None)
@@ -158,11 +161,11 @@ def render(context: Context) -> Iterator[Message]:
         if isinstance(cause, RecipeError):  # the constructor was not even called
             message = f"metadata promises the render mode rgb_array, but {cause}"
         severity = Severity.INFO if NO_GRAPHICS.search(describe(cause)) else None
-        yield Finding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity)
+        yield RuleFinding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity)
         return
     if wrong := _describe_wrong_picture(picture):
         message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"
-        yield Finding("RL215", message, {"value": wrong, "expected": PICTURE})
+        yield RuleFinding("RL215", message, {"value": wrong, "expected": PICTURE})
 
 
 def _lacks_library(error: BaseException) -> bool:
@@ -180,17 +183,17 @@ def _describe_wrong_picture(picture: Any) -> str:
 
 
 @check("RL215", RENDERING)
-def _find_end_in_rendering(records: Records) -> Iterator[Finding]:
+def _find_end_in_rendering(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
         if failure.phase == RENDERING and failure.kind in ("died", "hung"):
-            yield Finding("RL215", f"rendering without a window: {failure.message}", failure.place, Severity.ERROR)
+            yield RuleFinding("RL215", f"rendering without a window: {failure.message}", failure.place, Severity.ERROR)
 
 
 @check("RL216", *RECORDING)
-def _find_lost_display(records: Records) -> Iterator[Finding]:
+def _find_lost_display(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
         if lacks_display(failure):
             line = next(line for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)).strip()
-            yield Finding("RL216", f"{failure.message}, because there is no display: {line!r}", failure.place)
+            yield RuleFinding("RL216", f"{failure.message}, because there is no display: {line!r}", failure.place)
             return
     records.require_built()

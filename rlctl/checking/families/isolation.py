@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.checking.bullet_worlds import find_clients
-from rlctl.checking.episode import Episode
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.checking.families.interface import select_failures
-from rlctl.checking.finding import Finding, NotJudged, Severity, check, experiment
+from rlctl.checking.finding import NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context, Instance
-from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, Message, Skipped
+from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage, Skipped
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Records
 
@@ -49,7 +50,7 @@ _PROCESS = Path("/proc/self")
 
 
 @experiment("instances", "RL404", share=10.0)
-def compare_instances(context: Context) -> Iterator[Message]:
+def compare_instances(context: Context) -> Iterator[ChildMessage]:
     """Play on three instances: one alone, one after it, and two side by side of which one is closed."""
     progress, budget = context.progress, context.budget
     longest_s = budget.seconds_left / 5
@@ -57,7 +58,7 @@ def compare_instances(context: Context) -> Iterator[Message]:
     def begin(instance: Instance, role: str, seed: int) -> Recording:
         progress.phase(role)
         deadline = budget.end_within(longest_s)
-        episode = Episode(instance, seed, number=seed - FIRST_SEED, max_steps=COMPARED_STEPS, deadline=deadline)
+        episode = EpisodePlayer(instance, seed, number=seed - FIRST_SEED, max_steps=COMPARED_STEPS, deadline=deadline)
         return Recording(role, episode, budget)
 
     progress.phase("alone")
@@ -94,7 +95,7 @@ def compare_instances(context: Context) -> Iterator[Message]:
     yield from context.close(survivor)
 
 
-def _close_in_between(context: Context, recording: Recording, neighbour: Instance) -> Iterator[Message]:
+def _close_in_between(context: Context, recording: Recording, neighbour: Instance) -> Iterator[ChildMessage]:
     """Play an episode, after whose first step another instance is closed."""
     recording.advance()
     if recording.running:
@@ -114,22 +115,22 @@ def _require_same_alone(records: Records) -> None:
     require_independent(records)
 
 
-def _failure(records: Records, rule: str, phase: str, doing: str) -> Finding | None:
+def _failure(records: Records, rule: str, phase: str, doing: str) -> RuleFinding | None:
     """Return the first failure of a phase that does not happen to an instance alone."""
     alone = {(failure.call, failure.error) for failure in select_failures(records, "raised")}
     for failure in records.failures:
         is_here = failure.process == "instances" and failure.phase == phase and failure.call != "build"
         if is_here and (failure.call, failure.error) not in alone:
-            return Finding(rule, f"{doing}, {failure.message}", failure.place)
+            return RuleFinding(rule, f"{doing}, {failure.message}", failure.place)
     return None
 
 
 @check("RL401", "comparisons", "instances")
-def find_shared_world(records: Records) -> Iterator[Finding]:
+def find_shared_world(records: Records) -> Iterator[RuleFinding]:
     """Compare instances that were stepped in turns with such that were alone."""
     _require_same_alone(records)
-    if found := _failure(records, "RL401", "interleaved", IN_TURNS):
-        yield found
+    if finding := _failure(records, "RL401", "interleaved", IN_TURNS):
+        yield finding
         return
     for alone, beside in (("fresh process", "interleaved"), ("second alone", "interleaved second")):
         trajectory, difference = compare(records, alone, beside)
@@ -139,11 +140,11 @@ def find_shared_world(records: Records) -> Iterator[Finding]:
 
 
 @check("RL402", "comparisons", "instances")
-def find_effect_of_closing(records: Records) -> Iterator[Finding]:
+def find_effect_of_closing(records: Records) -> Iterator[RuleFinding]:
     """Compare an instance beside which another one was closed with one that was alone."""
     _require_same_alone(records)
-    if found := _failure(records, "RL402", "after close", AFTER_CLOSE):
-        yield found
+    if finding := _failure(records, "RL402", "after close", AFTER_CLOSE):
+        yield finding
         return
     if list(find_shared_world.run(records)):
         raise NotJudged("the instances already disturb each other while both are open (RL401)")
@@ -153,18 +154,18 @@ def find_effect_of_closing(records: Records) -> Iterator[Finding]:
 
 
 @check("RL403", "instances")
-def _find_single_instance(records: Records) -> Iterator[Finding]:
+def _find_single_instance(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
         if failure.call in ("load", "build") and failure.process != "probe":
             where = "in one process" if failure.phase in ("fresh instance", "interleaved") else "in a second process"
-            yield Finding("RL403", f"a second instance {where} cannot be built: {failure.error}", failure.place)
+            yield RuleFinding("RL403", f"a second instance {where} cannot be built: {failure.error}", failure.place)
             return
 
 
-def _shared_spaces(one: Any, other: Any) -> Iterator[Finding]:
+def _shared_spaces(one: Any, other: Any) -> Iterator[RuleFinding]:
     shared = []
     for name in ("action_space", "observation_space"):
-        first, again, others = (getattr(each, name, None) for each in (one, one, other))
+        first, again, others = (getattr(env, name, None) for env in (one, one, other))
         if first is not again:
             yield _of_spaces([name], f"{name} is a new object each time it is read, so that seeding it has no effect")
         elif first is others is not None:
@@ -173,10 +174,10 @@ def _shared_spaces(one: Any, other: Any) -> Iterator[Finding]:
         yield _of_spaces(shared, f"two instances have one object as {' and '.join(shared)}")
 
 
-def _of_spaces(names: list[str], message: str) -> Finding:
+def _of_spaces(names: list[str], message: str) -> RuleFinding:
     # Nobody samples observations.
     severity = Severity.WARNING if "action_space" in names else Severity.INFO
-    return Finding("RL404", message, {"value": names, "expected": []}, severity)
+    return RuleFinding("RL404", message, {"value": names, "expected": []}, severity)
 
 
 @dataclasses.dataclass
@@ -192,7 +193,7 @@ class Counts:
     def count(self) -> None:
         """Count what is there now."""
         clients, pybullet = find_clients(), sys.modules.get("pybullet")
-        bodies = [pybullet.getNumBodies(physicsClientId=each) for each in clients] if pybullet else []
+        bodies = [pybullet.getNumBodies(physicsClientId=client) for client in clients] if pybullet else []
         numbers = [len(clients), sum(bodies)]
         if _PROCESS.exists():
             numbers += [len(os.listdir(_PROCESS / "fd")), len(os.listdir(_PROCESS / "task"))]
@@ -213,14 +214,14 @@ class Counts:
 
 
 @experiment("leaks", "RL405", share=3.0)
-def count_after_resets(context: Context) -> Iterator[Message]:
+def count_after_resets(context: Context) -> Iterator[ChildMessage]:
     """Reset the process's instance many times, with one step each, and count what it holds."""
     counts = Counts()
     instance, budget = context.instance, context.budget
     gc.freeze()  # what there is already need not be looked through again and again
     try:
         while counts.resets < MOST_RESETS and budget.seconds_left > 0:
-            for _ in Episode(instance, FIRST_SEED + counts.resets, number=counts.resets, max_steps=1):
+            for _ in EpisodePlayer(instance, FIRST_SEED + counts.resets, number=counts.resets, max_steps=1):
                 pass
             counts.count()
             if counts.resets % MEASURED_RESETS == 0:
@@ -232,7 +233,7 @@ def count_after_resets(context: Context) -> Iterator[Message]:
     yield from find_growth(counts)
 
 
-def find_growth(counts: Counts) -> Iterator[Finding]:
+def find_growth(counts: Counts) -> Iterator[RuleFinding]:
     """Yield what grows with every reset; raises `NotJudged` where there were too few of them."""
     resets = counts.resets
     if resets < FEWEST_RESETS:
@@ -242,7 +243,7 @@ def find_growth(counts: Counts) -> Iterator[Finding]:
             first, after = series[SETTLING_RESETS], resets - SETTLING_RESETS - 1
             message = f"{what} grow with every reset: from {first} to {series[-1]} in {after} resets"
             evidence = {"element": what, "value": series[-1], "expected": first, "resets": after}
-            yield Finding("RL405", message, {**evidence, "per_reset": growth / after}, LEAKS[what])
+            yield RuleFinding("RL405", message, {**evidence, "per_reset": growth / after}, LEAKS[what])
             return  # a client brings its own bodies, files, threads and memory
     if len(counts.memory) >= FEWEST_MEASUREMENTS:
         start, middle, end = (counts.memory[i] for i in (0, (len(counts.memory) - 1) // 2, -1))
@@ -253,7 +254,7 @@ def find_growth(counts: Counts) -> Iterator[Finding]:
                 f"{(end - middle) / 2**20:.1f} MiB in the second half"
             )
             evidence = {"element": "memory", "value": end, "expected": start, "resets": resets}
-            yield Finding("RL405", message, {**evidence, "per_reset": (end - start) / resets})
+            yield RuleFinding("RL405", message, {**evidence, "per_reset": (end - start) / resets})
 
 
 def _growth(series: list[int]) -> int:

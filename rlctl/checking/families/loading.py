@@ -13,10 +13,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rlctl.checking.bullet_worlds import find_clients
+from rlctl.checking.experiments import RECORDING, check, experiment
 from rlctl.checking.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
-from rlctl.checking.finding import RECORDING, Finding, check, experiment
+from rlctl.checking.finding import RuleFinding
 from rlctl.checking.instance import Context, Instance, find_author, find_longest_episode, is_task
-from rlctl.checking.messages import Built, Message
+from rlctl.checking.messages import Built, ChildMessage
 from rlctl.checking.records import Records
 from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
@@ -27,7 +28,7 @@ WAIVERS = "rlctl_ignore"
 
 
 @experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL013", "RL216", share=0.0)
-def build(context: Context) -> Iterator[Message]:
+def build(context: Context) -> Iterator[ChildMessage]:
     """Build the first instance, which the process keeps. Raises `UsageError` for a name that does not exist."""
     try:
         instance = context.instance
@@ -43,32 +44,34 @@ def build(context: Context) -> Iterator[Message]:
     if is_task(instance.env):
         yield from _find_misspelled(type(find_author(instance.env)))
     if _count_windows():
-        yield Finding("RL216", "PyBullet was connected with a window (p.GUI)", {"value": "GUI", "expected": "DIRECT"})
+        yield RuleFinding(
+            "RL216", "PyBullet was connected with a window (p.GUI)", {"value": "GUI", "expected": "DIRECT"}
+        )
 
 
-def _explain(context: Context, error: RlctlError) -> Finding:
+def _explain(context: Context, error: RlctlError) -> RuleFinding:
     """Return the finding for an exception of the import or the constructor."""
     cause = error.__cause__
     details = {"traceback": error.details} if error.details else {}
     if isinstance(error, NoSuchClassError):
-        return Finding("RL005", str(error), details)
+        return RuleFinding("RL005", str(error), details)
     if isinstance(error, OldGymError) or _imports_old_gym(cause):
-        return Finding("RL008", str(error), details)
+        return RuleFinding("RL008", str(error), details)
     if (file := find_missing_file(cause)) is not None:
         return _not_found("the constructor", file, error.details)
     if context.progress.read().call == "load":
-        return Finding("RL001", str(error), details)
+        return RuleFinding("RL001", str(error), details)
     if isinstance(cause, TypeError) and (missing := _missing_arguments(str(cause))):
         settings = " ".join(f"--set task.{name}=..." for name in missing)
         fix = f"Give them ({settings}), or give them default values."
-        return Finding("RL006", str(error), details, fix=fix)
+        return RuleFinding("RL006", str(error), details, fix=fix)
     if isinstance(error, TaskError) and error.details is None and not _is_task(context.spec.task):
-        return Finding("RL003", str(error))  # the registry's; what a constructor raises comes with its traceback
-    return Finding("RL002", str(error), details)
+        return RuleFinding("RL003", str(error))  # the registry's; what a constructor raises comes with its traceback
+    return RuleFinding("RL002", str(error), details)
 
 
 def _imports_old_gym(error: BaseException | None) -> bool:
-    missing = [str(each.name) for each in iterate_causes(error) if isinstance(each, ModuleNotFoundError)]
+    missing = [str(cause.name) for cause in iterate_causes(error) if isinstance(cause, ModuleNotFoundError)]
     return any(name.partition(".")[0] == "gym" for name in missing)
 
 
@@ -77,22 +80,22 @@ def _is_task(name: str) -> bool:
 
 
 def _missing_arguments(message: str) -> list[str]:
-    found = re.search(r"missing \d+ required .*?arguments?: (.*)", message)
-    return re.findall(r"'(\w+)'", found.group(1)) if found else []
+    match = re.search(r"missing \d+ required .*?arguments?: (.*)", message)
+    return re.findall(r"'(\w+)'", match.group(1)) if match else []
 
 
-def _base_class(instance: Instance) -> Iterator[Finding]:
+def _base_class(instance: Instance) -> Iterator[RuleFinding]:
     bases = type(getattr(instance.env, "unwrapped", instance.env)).__mro__
     if any(base.__module__.partition(".")[0] == "gym" for base in bases):
-        yield Finding("RL008", "the class inherits from gym.Env, not from gymnasium.Env")
+        yield RuleFinding("RL008", "the class inherits from gym.Env, not from gymnasium.Env")
     elif not instance.is_env:
-        yield Finding("RL003", "the class does not inherit from gymnasium.Env")
+        yield RuleFinding("RL003", "the class does not inherit from gymnasium.Env")
     for name, leaves in (("observation", instance.leaves), ("action", instance.action_leaves)):
         if "NoneType" in {leaf.kind for leaf in leaves}:
-            yield Finding("RL003", f"there is no {name}_space")
+            yield RuleFinding("RL003", f"there is no {name}_space")
 
 
-def _find_misspelled(author: type) -> Iterator[Finding]:
+def _find_misspelled(author: type) -> Iterator[RuleFinding]:
     """Find names that a task's class defines and nothing uses, close to one that means something to rlctl."""
     from rlctl.task import Task  # PyBullet comes with it
 
@@ -106,7 +109,7 @@ def _find_misspelled(author: type) -> Iterator[Finding]:
             close = difflib.get_close_matches(name, meant - vars(cls).keys(), n=1, cutoff=0.7)
             if close and words[name] == 1:
                 evidence = {"value": name, "expected": close[0]}
-                yield Finding(
+                yield RuleFinding(
                     "RL013", f"{cls.__name__}.{name} is used by nothing. Did you mean {close[0]!r}?", evidence
                 )
 
@@ -115,21 +118,21 @@ def _count_windows() -> int:
     pybullet = sys.modules.get("pybullet")
     if pybullet is None:
         return 0
-    methods = [pybullet.getConnectionInfo(physicsClientId=each)["connectionMethod"] for each in find_clients()]
+    methods = [pybullet.getConnectionInfo(physicsClientId=client)["connectionMethod"] for client in find_clients()]
     return methods.count(pybullet.GUI)
 
 
 @check("RL004", "build")
-def _find_end_while_loading(records: Records) -> Iterator[Finding]:
+def _find_end_while_loading(records: Records) -> Iterator[RuleFinding]:
     if records.built is None:
         for failure in records.failures:
             if failure.process == "probe" and failure.call in ("load", "build") and not lacks_display(failure):
                 evidence = {"last_output": failure.details} if failure.details else {}
-                yield Finding("RL004", failure.message, evidence)
+                yield RuleFinding("RL004", failure.message, evidence)
 
 
 @check("RL007", "build", *RECORDING)
-def _find_missing_files(records: Records) -> Iterator[Finding]:
+def _find_missing_files(records: Records) -> Iterator[RuleFinding]:
     files = set()
     for failure in records.failures if records.built is not None else ():
         if failure.file is not None and failure.file["file"] not in files:
@@ -137,10 +140,10 @@ def _find_missing_files(records: Records) -> Iterator[Finding]:
             yield _not_found(failure.call, failure.file, failure.details)
 
 
-def _not_found(call: str, file: Mapping[str, Any], details: str | None) -> Finding:
+def _not_found(call: str, file: Mapping[str, Any], details: str | None) -> RuleFinding:
     where = f", looked for in {' and '.join(file['searched'])}" if file["searched"] else ""
     evidence = {**file, "traceback": details} if details else dict(file)
-    return Finding("RL007", f"{call} does not find {file['file']!r}{where}", evidence)
+    return RuleFinding("RL007", f"{call} does not find {file['file']!r}{where}", evidence)
 
 
 def describe_built(instance: Instance) -> Built:
@@ -192,7 +195,7 @@ def _read_truncation(env: Any) -> str:
     except (AttributeError, OSError, TypeError, SyntaxError):
         return "unknown"
     returned = [node.value for node in nodes if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple)]
-    flags = [ast.unparse(each.elts[3]) for each in returned if len(each.elts) == 5]
+    flags = [ast.unparse(values.elts[3]) for values in returned if len(values.elts) == 5]
     assigned: dict[str, set[str]] = {}
     for node in nodes:
         if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign) and node.value is not None:

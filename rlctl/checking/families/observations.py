@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.finding import RECORDING, Finding, Severity, check
+from rlctl.checking.experiments import RECORDING, check
+from rlctl.checking.finding import RuleFinding, Severity
 from rlctl.checking.leaves import Leaf, name_leaf
-from rlctl.checking.messages import Form, Series, Trajectory
+from rlctl.checking.messages import Form, RecordedEpisode, Series
 from rlctl.checking.records import Records
 
 ROUNDING = 1e-6
@@ -22,7 +23,7 @@ SMALLEST_SIDE = 36
 """An image with a shorter side does not fit through the default network's filters [pixels]."""
 
 
-def _forms(records: Records) -> Iterator[tuple[Leaf, list[tuple[Trajectory, Form]]]]:
+def _forms(records: Records) -> Iterator[tuple[Leaf, list[tuple[RecordedEpisode, Form]]]]:
     """Yield what each leaf that can be judged looked like, in all episodes."""
     forms = records.forms("observation")
     for index, leaf in enumerate(records.require_built().leaves):
@@ -35,7 +36,7 @@ def _when(step: int) -> str:
 
 
 @check("RL101")
-def find_wrong_shape(records: Records) -> Iterator[Finding]:
+def find_wrong_shape(records: Records) -> Iterator[RuleFinding]:
     """Find observations of another shape, or with other keys."""
     for leaf, forms in _forms(records):
         for trajectory, form in forms:
@@ -43,11 +44,11 @@ def find_wrong_shape(records: Records) -> Iterator[Finding]:
                 shape = None if form.shape is None else list(form.shape)
                 message = f"{name_leaf(leaf)} {_when(form.step)} {what}"
                 evidence = trajectory.at(form.step, type=form.type, shape=shape, expected=list(leaf.shape))
-                yield Finding("RL101", message, evidence)
+                yield RuleFinding("RL101", message, evidence)
                 break
     for trajectory, form in records.forms("keys")[:1]:
         message = f"observation has the keys {form.type}; the space has other ones"
-        yield Finding("RL101", message, trajectory.at(form.step))
+        yield RuleFinding("RL101", message, trajectory.at(form.step))
 
 
 def _wrong_shape(leaf: Leaf, form: Form) -> str:
@@ -60,7 +61,7 @@ def _wrong_shape(leaf: Leaf, form: Form) -> str:
 
 
 @check("RL102")
-def _find_wrong_dtype(records: Records) -> Iterator[Finding]:
+def _find_wrong_dtype(records: Records) -> Iterator[RuleFinding]:
     wrong = [
         (leaf, trajectory, form)
         for leaf, forms in _forms(records)
@@ -73,7 +74,7 @@ def _find_wrong_dtype(records: Records) -> Iterator[Finding]:
         message = f"{name_leaf(leaf)} {_when(form.step)} is {form.dtype}; the space is {leaf.dtype}{more}"
         is_number = np.dtype(form.dtype).kind in "biuf"
         evidence = trajectory.at(form.step, dtype=form.dtype, expected=leaf.dtype)
-        yield Finding("RL102", message, evidence, Severity.WARNING if is_number else Severity.ERROR)
+        yield RuleFinding("RL102", message, evidence, Severity.WARNING if is_number else Severity.ERROR)
 
 
 def _has_wrong_dtype(leaf: Leaf, form: Form) -> bool:
@@ -86,23 +87,23 @@ def _has_wrong_dtype(leaf: Leaf, form: Form) -> bool:
 
 
 @check("RL103")
-def find_out_of_range(records: Records) -> Iterator[Finding]:
+def find_out_of_range(records: Records) -> Iterator[RuleFinding]:
     """Find the observation that is farthest outside its bounds, per leaf."""
     built = records.require_built()
     for index, leaf in enumerate(built.leaves):
-        recorded = [(*each, _excess(leaf, each[1].values)) for each in records.series(index) if leaf.supported]
+        recorded = [(*pair, _excess(leaf, pair[1].values)) for pair in records.series(index) if leaf.supported]
         if not any(excess.any() for *_, excess in recorded):
             continue
-        trajectory, series, excess = max(recorded, key=lambda each: float(each[2].max(initial=0.0)))
+        trajectory, series, excess = max(recorded, key=lambda record: float(record[2].max(initial=0.0)))
         row, flat = divmod(int(excess.argmax()), excess.shape[1])
         step, value = int(series.steps[row]), float(series.values[row].flat[flat])
         low, high = (float(np.ravel(np.asarray(bound))[flat]) for bound in (leaf.low, leaf.high))
         bound = low if value < low else high
         is_rounding = np.dtype(leaf.dtype).kind == "f" and abs(value - bound) <= ROUNDING * max(abs(bound), 1e-3)
-        outside = np.concatenate([each.any(axis=1) for *_, each in recorded])
+        outside = np.concatenate([excess.any(axis=1) for *_, excess in recorded])
         count, total = int(outside.sum()), len(outside)
         element = built.element(index, flat)
-        yield Finding(
+        yield RuleFinding(
             "RL103",
             f"{element} is {value:.9g} {_when(step)}; the space allows [{low:.9g}, {high:.9g}]"
             f"{' (float rounding)' if is_rounding else ''}; {count} of {total} observations are outside",
@@ -119,11 +120,11 @@ def find_out_of_range(records: Records) -> Iterator[Finding]:
 
 
 def _severity_of_outside(
-    recorded: list[tuple[Trajectory, Series, NDArray[np.float64]]], outside: NDArray[np.bool_]
+    recorded: list[tuple[RecordedEpisode, Series, NDArray[np.float64]]], outside: NDArray[np.bool_]
 ) -> Severity:
     """Return how bad it is that some observations are outside. Shape of `outside`: all that were recorded."""
     is_first = np.concatenate([series.steps == 0 for _, series, _ in recorded])
-    is_last = np.concatenate([(series.steps == each.steps) & each.has_ended for each, series, _ in recorded])
+    is_last = np.concatenate([(series.steps == episode.steps) & episode.has_ended for episode, series, _ in recorded])
     share = float((outside & ~is_last).mean())
     if share >= LARGE_SHARE or (outside & is_first).any():
         return Severity.ERROR
@@ -140,7 +141,7 @@ def _excess(leaf: Leaf, values: NDArray[Any]) -> NDArray[np.float64]:
 
 
 @check("RL104")
-def find_not_finite(records: Records) -> Iterator[Finding]:
+def find_not_finite(records: Records) -> Iterator[RuleFinding]:
     """Find the first NaN or infinity, per leaf."""
     built = records.require_built()
     for index, _ in enumerate(built.leaves):
@@ -151,26 +152,26 @@ def find_not_finite(records: Records) -> Iterator[Finding]:
             row, flat = np.argwhere(~np.isfinite(values))[0].tolist()
             step, element, value = int(series.steps[row]), built.element(index, flat), str(values[row, flat])
             evidence = trajectory.at(step, element=element, value=value, expected="finite")
-            yield Finding("RL104", f"{element} is {value} {_when(step)}", evidence)
+            yield RuleFinding("RL104", f"{element} is {value} {_when(step)}", evidence)
             break
 
 
 @check("RL105")
-def _find_shared_memory(records: Records) -> Iterator[Finding]:
+def _find_shared_memory(records: Records) -> Iterator[RuleFinding]:
     for trajectory, form in records.forms("memory")[:1]:
         name = name_leaf(records.require_built().leaves[form.leaf or 0])
         message = f"step {form.step} wrote into the memory of the {name} returned before it"
-        yield Finding("RL105", message, trajectory.at(form.step, steps=form.count))
+        yield RuleFinding("RL105", message, trajectory.at(form.step, steps=form.count))
 
 
 @check("RL106", "build")
-def _find_unusual_actions(records: Records) -> Iterator[Finding]:
+def _find_unusual_actions(records: Records) -> Iterator[RuleFinding]:
     for leaf in records.require_built().action_leaves:
         if leaf.kind == "Box":
             yield from _unusual_actions(leaf)
 
 
-def _unusual_actions(leaf: Leaf) -> Iterator[Finding]:
+def _unusual_actions(leaf: Leaf) -> Iterator[RuleFinding]:
     low, high = np.ravel(np.asarray(leaf.low, np.float64)), np.ravel(np.asarray(leaf.high, np.float64))
     is_open = ~np.isfinite(low) | ~np.isfinite(high)
     is_thrust = (low == 0) & (high <= 1)  # or a pedal: by nature to one side
@@ -184,24 +185,24 @@ def _unusual_actions(leaf: Leaf) -> Iterator[Finding]:
             name = f"action[{i}]"
             message = f"{int(wrong.sum())} of {wrong.size} actions {what}: {name} is in [{low[i]:g}, {high[i]:g}]"
             evidence = {"element": name, "value": [float(low[i]), float(high[i])], "expected": [-1.0, 1.0]}
-            yield Finding("RL106", message, evidence, severity)
+            yield RuleFinding("RL106", message, evidence, severity)
             return
     if leaf.dtype != "float32":
         evidence = {"value": leaf.dtype, "expected": "float32"}
-        yield Finding("RL106", f"actions are {leaf.dtype}", evidence, Severity.INFO)
+        yield RuleFinding("RL106", f"actions are {leaf.dtype}", evidence, Severity.INFO)
 
 
 @check("RL108", "build", *RECORDING)
-def _find_unusual_images(records: Records) -> Iterator[Finding]:
+def _find_unusual_images(records: Records) -> Iterator[RuleFinding]:
     for index, leaf in enumerate(records.require_built().leaves):
         name, shape = name_leaf(leaf), list(leaf.shape)
         if leaf.kind == "Box" and (problem := _image_problem(leaf)):
-            yield Finding("RL108", f"{name} {problem}", {"element": name, "value": shape, "dtype": leaf.dtype})
+            yield RuleFinding("RL108", f"{name} {problem}", {"element": name, "value": shape, "dtype": leaf.dtype})
         elif leaf.kind == "Box" and _is_in_image_format(leaf) and (brightest := _brightest(records, index)) in (0, 1):
             message = (
                 f"{name} is uint8 up to 255, and no pixel of any episode is brighter than {brightest}: scaled twice?"
             )
-            yield Finding("RL108", message, {"element": name, "value": brightest, "expected": 255})
+            yield RuleFinding("RL108", message, {"element": name, "value": brightest, "expected": 255})
 
 
 def _is_in_image_format(leaf: Leaf) -> bool:
@@ -222,18 +223,18 @@ def _image_problem(leaf: Leaf) -> str:
 
 
 def _brightest(records: Records, index: int) -> int | None:
-    return max((int(each.values.max()) for _, each in records.series(index) if each.values.size), default=None)
+    return max((int(series.values.max()) for _, series in records.series(index) if series.values.size), default=None)
 
 
 @check("RL109", "build")
-def _find_unsupported_spaces(records: Records) -> Iterator[Finding]:
+def _find_unsupported_spaces(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     for what, leaves, depth in (("observation", built.leaves, 1), ("action", built.action_leaves, 0)):
         for leaf in leaves:
             if kind := _unsupported_kind(leaf, depth):
                 name, part = name_leaf(leaf, what), "part " if leaf.supported and leaf.path else ""
                 message = f"{name} is {part}of a {kind}; SB3 has no network for it"
-                yield Finding("RL109", message, {"element": name, "value": kind})
+                yield RuleFinding("RL109", message, {"element": name, "value": kind})
                 break
 
 

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.bullet_calls import BulletCall, record_calls
-from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Body, Joint, Jump, Pair, find_clients
+from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump, Pair, WorldBody, find_clients
+from rlctl.checking.experiments import experiment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
-from rlctl.checking.finding import Finding, NotApplicable, NotJudged, experiment, list_names
+from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, list_names
 from rlctl.checking.instance import Context, is_task
-from rlctl.checking.messages import FIRST_SEED, Message, Skipped
-from rlctl.checking.world_logs import Log, LoggedWorld, Place, WorldLogger
+from rlctl.checking.messages import FIRST_SEED, ChildMessage, Skipped
+from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
 
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))
 """The actions of each episode, and how many of its steps are logged."""
@@ -42,8 +43,8 @@ MOST_CALLS = 20
 
 
 @experiment("worlds", *(f"RL80{i}" for i in (1, 3, 4, 5, 7, 8, 9)), share=4.0)
-def watch_worlds(context: Context) -> Iterator[Message]:
-    """Log the worlds of an instance through a few episodes; let them fall alone, which changes them, after that."""
+def watch_worlds(context: Context) -> Iterator[ChildMessage]:
+    """Log the worlds of an instance through a few episodes, then let them fall alone, which changes them."""
     if "pybullet" not in sys.modules:
         with context.fresh():
             pass  # what it imports is imported now
@@ -74,15 +75,15 @@ def watch_worlds(context: Context) -> Iterator[Message]:
         yield from _judge(world)
 
 
-def _left_out_clients(calls: Sequence[BulletCall]) -> Iterator[Finding]:
+def _left_out_clients(calls: Sequence[BulletCall]) -> Iterator[RuleFinding]:
     if calls:
         count = f"{len(calls)} calls" if len(calls) > 1 else "a call"
-        shown = list_names([f"{each.place} {each.name}" for each in calls], MOST_NAMES)
-        evidence = {"file": calls[0].file, "line": calls[0].line, "places": [each.place for each in calls[:MOST_CALLS]]}
-        yield Finding("RL808", f"{count} of PyBullet without physicsClientId: {shown}", evidence)
+        shown = list_names([f"{call.place} {call.name}" for call in calls], MOST_NAMES)
+        evidence = {"file": calls[0].file, "line": calls[0].line, "places": [call.place for call in calls[:MOST_CALLS]]}
+        yield RuleFinding("RL808", f"{count} of PyBullet without physicsClientId: {shown}", evidence)
 
 
-def _model_faults(env: Any) -> Iterator[Message]:
+def _model_faults(env: Any) -> Iterator[ChildMessage]:
     if not is_task(env):
         yield Skipped("RL809", "model files are known of tasks of rlctl only", applies=False)
         return
@@ -90,10 +91,10 @@ def _model_faults(env: Any) -> Iterator[Message]:
 
     for body in env.unwrapped.sim.bodies.values():
         for fault in find_inertia_faults(body):
-            yield Finding("RL809", fault.rstrip("."))
+            yield RuleFinding("RL809", fault.rstrip("."))
 
 
-def _judge(world: LoggedWorld) -> Iterator[Message]:
+def _judge(world: LoggedWorld) -> Iterator[ChildMessage]:
     yield from _gravity(world)
     explosions = list(_explosion(world))
     yield from explosions
@@ -110,17 +111,17 @@ def _when(place: Place) -> str:
     return f"at step {place['step']}" if place["step"] else "at reset"
 
 
-def _gravity(world: LoggedWorld) -> Iterator[Finding]:
+def _gravity(world: LoggedWorld) -> Iterator[RuleFinding]:
     heavy = [body.name for body in world.world.bodies if body.is_free or body.has_heavy_links]
     if heavy and not any(world.gravity) and world.weight_matters is not False:
         evidence = {"value": world.gravity, "expected": [0.0, 0.0, -9.81], "bodies": heavy}
-        yield Finding("RL801", f"gravity is (0, 0, 0), and {list_names(heavy, MOST_NAMES)} can move", evidence)
+        yield RuleFinding("RL801", f"gravity is (0, 0, 0), and {list_names(heavy, MOST_NAMES)} can move", evidence)
 
 
-def _penetration(world: LoggedWorld) -> Iterator[Finding]:
+def _penetration(world: LoggedWorld) -> Iterator[RuleFinding]:
     """Yield what is deep inside something else for several steps in a row with ordinary actions, the deepest only."""
     thrown = _thrown(world)
-    worst: dict[Pair, tuple[float, Log, list[int]]] = {}
+    worst: dict[Pair, tuple[float, WorldLog, list[int]]] = {}
     for log in world.logs:
         for pair in {pair for deep in log.deep for pair in deep} if log.actions != "extreme" else ():
             row = _longest_row([pair in deep for deep in log.deep])
@@ -130,12 +131,12 @@ def _penetration(world: LoggedWorld) -> Iterator[Finding]:
             is_thrown = log.places[row[0]]["step"] <= 1 and any(body in name for body in thrown for name in names)
             if len(row) >= LASTING_STEPS and not is_thrown and depth > worst.get(pair, (0.0,))[0]:
                 worst[pair] = depth, log, row
-    for pair, (depth, log, row) in sorted(worst.items(), key=lambda each: -each[1][0])[:1]:
+    for pair, (depth, log, row) in sorted(worst.items(), key=lambda item: -item[1][0])[:1]:
         at = max(row, key=lambda i: log.deep[i][pair][0])
         limit, place = log.deep[at][pair][1], log.places[at]
         names = [log.world.link_name(link) for link in pair]
         more = f"; so are {len(worst) - 1} other pairs of links" if len(worst) > 1 else ""
-        yield Finding(
+        yield RuleFinding(
             "RL803",
             f"{names[0]} is {100 * depth:.1f} cm inside {names[1]} {_when(place)}, and deeper than "
             f"{100 * limit:.1f} cm for {len(row)} steps in a row{more}",
@@ -148,9 +149,9 @@ def _longest_row(is_deep: Sequence[bool]) -> list[int]:
     return max((list(row) for deep, row in groups if deep), key=len, default=[])
 
 
-def _joint_limits(world: LoggedWorld) -> Iterator[Finding]:
+def _joint_limits(world: LoggedWorld) -> Iterator[RuleFinding]:
     """Yield the joint that is farthest outside its limits."""
-    found: list[tuple[float, str, Joint, int, Place, float]] = []
+    joints: list[tuple[float, str, Joint, int, Place, float]] = []
     for log in world.logs:
         for body, states in log.bodies:
             for j, joint in enumerate(body.joints):
@@ -159,13 +160,13 @@ def _joint_limits(world: LoggedWorld) -> Iterator[Finding]:
                 steps, row = int((outside > 0).sum()), int(outside.argmax())
                 if steps >= LASTING_STEPS:
                     name, place = f"{joint.name} of {body.name}", log.places[row]
-                    found.append((float(outside[row]), name, joint, steps, place, float(positions[row])))
-    found.sort(key=lambda each: -each[0])
-    names = list(dict.fromkeys(each[1] for each in found))
-    for _, name, joint, steps, place, value in found[:1]:
+                    joints.append((float(outside[row]), name, joint, steps, place, float(positions[row])))
+    joints.sort(key=lambda record: -record[0])
+    names = list(dict.fromkeys(record[1] for record in joints))
+    for _, name, joint, steps, place, value in joints[:1]:
         unit = "rad" if joint.is_angle else "m"
         more = f"; outside of theirs are {list_names(names[1:], MOST_NAMES)}" if names[1:] else ""
-        yield Finding(
+        yield RuleFinding(
             "RL804",
             f"{name} is at {value:.3g} {unit} {_when(place)}; its limits are [{joint.low:.3g}, {joint.high:.3g}] "
             f"{unit}; it is outside by much in {steps} steps{more}",
@@ -183,17 +184,17 @@ def _outside(joint: Joint, values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isfinite(outside) & (outside > allowed), outside / width, 0.0)
 
 
-def _explosion(world: LoggedWorld) -> Iterator[Finding]:
+def _explosion(world: LoggedWorld) -> Iterator[RuleFinding]:
     """Yield the worst of what is faster than any robot, or is not a number."""
-    found = [each for log in world.logs for body, states in log.bodies for each in _fast(log, body, states)]
-    found.sort(key=lambda each: -each[0])
-    parts = {part for _, part, *_ in found}
-    for _, _, message, evidence in found[:1]:
+    fastest = [record for log in world.logs for body, states in log.bodies for record in _fast(log, body, states)]
+    fastest.sort(key=lambda record: -record[0])
+    parts = {part for _, part, *_ in fastest}
+    for _, _, message, evidence in fastest[:1]:
         more = f", and {len(parts) - 1} more" if len(parts) > 1 else ""  # its consequences
-        yield Finding("RL805", message + more, evidence)
+        yield RuleFinding("RL805", message + more, evidence)
 
 
-def _fast(log: Log, body: Body, states: NDArray[np.float64]) -> Iterator[tuple[float, str, str, Place]]:
+def _fast(log: WorldLog, body: WorldBody, states: NDArray[np.float64]) -> Iterator[tuple[float, str, str, Place]]:
     """Yield what of a body is too fast for several looks: speed, what it is, message, evidence."""
     for row, column in np.argwhere(~np.isfinite(states))[:1].tolist():
         value, place = str(states[row, column]), log.places[row]
@@ -219,9 +220,9 @@ def _thrown(world: LoggedWorld) -> dict[str, Jump]:
     return {jump.body: jump for jump in reversed(world.jumps) if jump.speed > jump.explained + FASTEST_JUMP}
 
 
-def _unrest(world: LoggedWorld) -> Iterator[Finding]:
+def _unrest(world: LoggedWorld) -> Iterator[RuleFinding]:
     for jump in _thrown(world).values():
-        yield Finding(
+        yield RuleFinding(
             "RL807",
             f"{jump.body} moves at {jump.speed:.2f} m/s {jump.after_s:.2g} s after reset, with nothing done to it; "
             f"falling explains {jump.explained:.2f} m/s",

@@ -8,11 +8,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import Episode
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.failures import EnvironmentRaised, describe
-from rlctl.checking.finding import Finding, NotApplicable, NotJudged, Severity, check, experiment
+from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, Message, Trajectory
+from rlctl.checking.messages import FIRST_SEED, ChildMessage, RecordedEpisode
 from rlctl.checking.records import Records
 
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")
@@ -37,39 +38,39 @@ TOLERANCE = 1e-4
 GOALS = ("achieved_goal", "desired_goal")
 
 
-def require_readable(records: Records) -> list[Trajectory]:
+def require_readable(records: Records) -> list[RecordedEpisode]:
     """Return the episodes of a step at least, if flags and infos can be read; raises `NotJudged` otherwise."""
     records.require_built()
     if records.forms("step"):
         raise NotJudged("step does not return five values (RL201)")
     if any(form.type != "dict" for _, form in records.forms("info")):
         raise NotJudged("info is not a dict (RL204)")
-    episodes = [each for each in records.require_alone() if each.steps]
+    episodes = [episode for episode in records.require_alone() if episode.steps]
     _require_enough(episodes)
     return episodes
 
 
-def require_rewarded(records: Records) -> list[Trajectory]:
+def require_rewarded(records: Records) -> list[RecordedEpisode]:
     """Return the same, if every reward is a finite number."""
     episodes = require_readable(records)
-    if not all(each.reward_is_number.all() for each in episodes):
+    if not all(episode.reward_is_number.all() for episode in episodes):
         raise NotJudged("the reward is not a number (RL204)")
-    if not all(np.isfinite(each.rewards).all() for each in episodes):
+    if not all(np.isfinite(episode.rewards).all() for episode in episodes):
         raise NotJudged("the reward is not finite (RL601)")
     return episodes
 
 
-def _require_enough(episodes: list[Trajectory]) -> None:
-    if sum(each.steps for each in episodes) < ENOUGH_STEPS:
+def _require_enough(episodes: list[RecordedEpisode]) -> None:
+    if sum(episode.steps for episode in episodes) < ENOUGH_STEPS:
         raise NotJudged(f"fewer than {ENOUGH_STEPS} steps were recorded")
 
 
-def has_terms(episode: Trajectory) -> bool:
+def has_terms(episode: RecordedEpisode) -> bool:
     """Say whether there are reward terms in info."""
     return any(name.startswith(TERMS) for name in episode.infos)
 
 
-def find_terms(episode: Trajectory) -> dict[str, NDArray[np.float64]]:
+def find_terms(episode: RecordedEpisode) -> dict[str, NDArray[np.float64]]:
     """Return the reward terms of an episode by name; NaN where one is not in info. Shape (T,) each."""
     terms = {}
     for name, series in episode.infos.items():
@@ -81,7 +82,7 @@ def find_terms(episode: Trajectory) -> dict[str, NDArray[np.float64]]:
     return terms
 
 
-def find_constant_terms(episodes: Sequence[Trajectory]) -> dict[str, float]:
+def find_constant_terms(episodes: Sequence[RecordedEpisode]) -> dict[str, float]:
     """Return the terms that have one value at all steps of all episodes."""
     by_name: dict[str, list[NDArray[np.float64]]] = {}
     for episode in episodes:
@@ -94,17 +95,17 @@ def find_constant_terms(episodes: Sequence[Trajectory]) -> dict[str, float]:
     }
 
 
-def reports_success(episodes: Sequence[Trajectory]) -> bool:
+def reports_success(episodes: Sequence[RecordedEpisode]) -> bool:
     """Say whether `is_success` is in info, at least sometimes."""
-    return any(SUCCESS in each.infos for each in episodes)
+    return any(SUCCESS in episode.infos for episode in episodes)
 
 
-def has_succeeded(episode: Trajectory) -> bool:
+def has_succeeded(episode: RecordedEpisode) -> bool:
     """Say whether `is_success` was true at any step."""
     return SUCCESS in episode.infos and bool((episode.infos[SUCCESS].values > 0).any())
 
 
-def ends_in_success(episode: Trajectory) -> bool:
+def ends_in_success(episode: RecordedEpisode) -> bool:
     """Say whether `is_success` was true at the last step."""
     series = episode.infos.get(SUCCESS)
     return series is not None and int(series.steps[-1]) == episode.steps and bool(series.values[-1] > 0)
@@ -120,55 +121,55 @@ def discounted_steps(reward: float, steps: int) -> float:
     return float(reward * (1 - DISCOUNT**steps) / (1 - DISCOUNT))
 
 
-def longest_episode(records: Records, episodes: Sequence[Trajectory]) -> int:
+def longest_episode(records: Records, episodes: Sequence[RecordedEpisode]) -> int:
     """Return how long an episode may last: the declared limit, or the longest that was recorded [steps]."""
-    return records.require_built().max_steps or max(each.steps for each in episodes)
+    return records.require_built().max_steps or max(episode.steps for episode in episodes)
 
 
-def summarize(episodes: Sequence[Trajectory]) -> str:
+def summarize(episodes: Sequence[RecordedEpisode]) -> str:
     """Return how much was recorded: `80 episodes with random, zero and searched actions (6,100 steps)`."""
-    kinds = list(dict.fromkeys(each.actions for each in episodes))
+    kinds = list(dict.fromkeys(episode.actions for episode in episodes))
     kinds_text = " and ".join([", ".join(kinds[:-1]), kinds[-1]]) if len(kinds) > 1 else kinds[0]
-    return f"{len(episodes)} episodes with {kinds_text} actions ({sum(each.steps for each in episodes):,} steps)"
+    return f"{len(episodes)} episodes with {kinds_text} actions ({sum(episode.steps for episode in episodes):,} steps)"
 
 
 @check("RL601")
-def find_not_finite(records: Records) -> Iterator[Finding]:
+def find_not_finite(records: Records) -> Iterator[RuleFinding]:
     """Find the first reward that is NaN or infinite."""
     for episode in records.require_alone():
         wrong = np.flatnonzero(~np.isfinite(episode.rewards) & episode.reward_is_number)
         if wrong.size:
             step, value = int(wrong[0]) + 1, str(episode.rewards[wrong[0]])
             evidence = episode.at(step, value=value, expected="finite")
-            yield Finding("RL601", f"the reward is {value} at step {step}", evidence)
+            yield RuleFinding("RL601", f"the reward is {value} at step {step}", evidence)
             return
 
 
 @check("RL602", *WITH_SEARCH)
-def _find_constant_reward(records: Records) -> Iterator[Finding]:
+def _find_constant_reward(records: Records) -> Iterator[RuleFinding]:
     episodes = require_rewarded(records)
     constant = float(episodes[0].rewards[0])
-    if any((each.rewards != constant).any() or each.terminated.any() for each in episodes):
+    if any((episode.rewards != constant).any() or episode.terminated.any() for episode in episodes):
         return
-    at_success = any(has_succeeded(each) for each in episodes)
+    at_success = any(has_succeeded(episode) for episode in episodes)
     also = ", also where is_success is true" if at_success else ""
-    yield Finding(
+    yield RuleFinding(
         "RL602",
         f"the reward is {constant:g} at every step of {summarize(episodes)}{also}, and nothing ends an episode early",
-        {"value": constant, "episodes": len(episodes), "steps": sum(each.steps for each in episodes)},
+        {"value": constant, "episodes": len(episodes), "steps": sum(episode.steps for episode in episodes)},
         Severity.WARNING if constant > 0 or at_success else Severity.INFO,
     )
 
 
 @check("RL603")
-def _find_badly_scaled(records: Records) -> Iterator[Finding]:
+def _find_badly_scaled(records: Records) -> Iterator[RuleFinding]:
     require_rewarded(records)
-    episodes = [each for each in records.episodes if each.steps]
+    episodes = [episode for episode in records.episodes if episode.steps]
     if not episodes:
         return
-    inner = np.concatenate([each.rewards[: each.steps - each.has_ended] for each in episodes])
+    inner = np.concatenate([episode.rewards[: episode.steps - episode.has_ended] for episode in episodes])
     size = float(np.sqrt(np.mean(inner**2))) if inner.size else 0.0
-    largest = max(episodes, key=lambda each: float(np.abs(each.rewards).max()))
+    largest = max(episodes, key=lambda episode: float(np.abs(episode.rewards).max()))
     step = int(np.abs(largest.rewards).argmax())
     value = float(largest.rewards[step])
     if size > LARGE:
@@ -178,48 +179,48 @@ def _find_badly_scaled(records: Records) -> Iterator[Finding]:
     else:
         return
     evidence = largest.at(step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
-    yield Finding("RL603", message, evidence, Severity.INFO if records.normalizes_rewards() else Severity.WARNING)
+    yield RuleFinding("RL603", message, evidence, Severity.INFO if records.normalizes_rewards() else Severity.WARNING)
 
 
 @check("RL612", *WITH_SEARCH)
-def _find_constant_penalty(records: Records) -> Iterator[Finding]:
-    episodes = [each for each in require_rewarded(records) if has_terms(each)]
+def _find_constant_penalty(records: Records) -> Iterator[RuleFinding]:
+    episodes = [episode for episode in require_rewarded(records) if has_terms(episode)]
     if not episodes:
         raise NotApplicable("no reward_terms in info")
     _require_enough(episodes)
     for name, value in find_constant_terms(episodes).items():
         if value < 0 and not MEANT_CONSTANT.search(name):
             message = f"reward term {name!r} is {value:.6g} at every step of {summarize(episodes)}"
-            yield Finding("RL612", message, {"term": name, "value": value, "episodes": len(episodes)})
+            yield RuleFinding("RL612", message, {"term": name, "value": value, "episodes": len(episodes)})
 
 
 @experiment("hindsight", "RL614", share=0.3)
-def recompute_rewards(context: Context) -> Iterator[Message]:
+def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
     """Ask for the rewards of steps that have just been rewarded, all at once, as hindsight replay does."""
     instance = context.instance
     compute = getattr(getattr(instance.env, "unwrapped", instance.env), "compute_reward", None)
     leaves = {leaf.path for leaf in instance.leaves}
     if not callable(compute) or not leaves >= {(name,) for name in GOALS}:
         raise NotApplicable("no compute_reward, or no goals in the observation that are arrays")
-    episode = Episode(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
-    taken = [each for each in episode if each.step and each.is_readable]
+    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
+    taken = [moment for moment in episode if moment.step and moment.is_readable]
     if not taken:
         raise NotJudged("no step could be taken")
     try:
-        goals = [np.stack([np.asarray(each.observation[name]) for each in taken]) for name in GOALS]
-        given = np.array([float(each.reward) for each in taken])
-        infos = np.array([each.info for each in taken])
+        goals = [np.stack([np.asarray(moment.observation[name]) for moment in taken]) for name in GOALS]
+        given = np.array([float(moment.reward) for moment in taken])
+        infos = np.array([moment.info for moment in taken])
     except (LookupError, TypeError, ValueError):
         raise NotJudged("goals are missing or change their shape (RL101), or types are wrong (RL204)") from None
     try:
         computed = instance.call("compute_reward", lambda: np.asarray(compute(*goals, infos), np.float64))
     except EnvironmentRaised as error:
         raised = describe(error.__cause__ or error)
-        yield Finding("RL614", f"compute_reward, of many goals at once, raises {raised}", {"steps": len(taken)})
+        yield RuleFinding("RL614", f"compute_reward, of many goals at once, raises {raised}", {"steps": len(taken)})
         return
     if computed.shape != given.shape:
         shapes = f"of {len(taken)} goals at once it returns shape {computed.shape}, not {given.shape}"
-        yield Finding("RL614", f"compute_reward: {shapes}", {"steps": len(taken)})
+        yield RuleFinding("RL614", f"compute_reward: {shapes}", {"steps": len(taken)})
         return
     off = np.abs(computed - given)
     # Written so that NaN is another reward; where the environment itself gives one, RL601 says so.
@@ -228,4 +229,4 @@ def recompute_rewards(context: Context) -> Iterator[Message]:
         step = int(np.where(is_other, off, 0.0).argmax())
         message = f"the reward of step {step + 1} is {given[step]:.6g}, and compute_reward says {computed[step]:.6g}"
         evidence = {"step": step + 1, "value": float(computed[step]), "expected": float(given[step])}
-        yield Finding("RL614", message, evidence)
+        yield RuleFinding("RL614", message, evidence)

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import Episode, action_at, zero_action
+from rlctl.checking.episode import EpisodePlayer, action_at, zero_action
+from rlctl.checking.experiments import experiment
 from rlctl.checking.families.rewards import (
     DISCOUNT,
     discounted_steps,
@@ -25,9 +26,9 @@ from rlctl.checking.families.rewards import (
     has_succeeded,
     reports_success,
 )
-from rlctl.checking.finding import Finding, NotJudged, experiment
+from rlctl.checking.finding import NotJudged, RuleFinding
 from rlctl.checking.instance import Context, find_longest_episode
-from rlctl.checking.messages import FIRST_SEED, Message, Skipped, Trajectory
+from rlctl.checking.messages import FIRST_SEED, ChildMessage, RecordedEpisode, Skipped
 from rlctl.checking.recording import Recording
 
 MOST_STEPS = 6_000
@@ -65,7 +66,7 @@ class _Attempt:
     """One episode of the search."""
 
     sequence: list[Any]
-    played: Trajectory
+    played: RecordedEpisode
 
     @property
     def score(self) -> float:
@@ -75,7 +76,7 @@ class _Attempt:
 
 
 @experiment("search", "RL605", share=3.0)
-def search(context: Context) -> Iterator[Message]:
+def search(context: Context) -> Iterator[ChildMessage]:
     """Look for action sequences with a high return, and stop one that finished shortly before its end."""
     leaves = context.instance.action_leaves
     unknown = [leaf.kind for leaf in leaves if not leaf.supported]
@@ -100,12 +101,12 @@ class _Search:
         self._length = LONGEST
         self._size = sum(int(np.prod(leaf.shape)) for leaf in self.instance.action_leaves)
 
-    def cross_entropy_search(self) -> Iterator[Message]:
+    def cross_entropy_search(self) -> Iterator[ChildMessage]:
         """Play generations of held actions, each around the best of the one before."""
         shape = (SEGMENTS, self._size)
         mean, width = np.full(shape, 0.5), np.full(shape, WIDTH)
         best, best_score = mean, -np.inf
-        while self._goes_on(CEM_FRACTION) and not any(has_succeeded(each.played) for each in self.attempts):
+        while self._goes_on(CEM_FRACTION) and not any(has_succeeded(attempt.played) for attempt in self.attempts):
             generation: list[tuple[float, NDArray[np.float64]]] = []
             for number in range(GENERATION):
                 centre, spread = (best, WIDTH * width) if number == 0 else (mean, width)
@@ -114,30 +115,30 @@ class _Search:
                 generation.append((self.attempts[-1].score, parameters))
                 if not self._goes_on(CEM_FRACTION):
                     break
-            generation.sort(key=lambda each: -each[0])
+            generation.sort(key=lambda scored: -scored[0])
             if generation[0][0] > best_score:
                 best_score, best = generation[0]
             elite = np.stack([parameters for _, parameters in generation[:ELITE]])
             mean, width = elite.mean(axis=0), np.maximum(elite.std(axis=0), LEAST_WIDTH)
 
-    def perturb_best(self) -> Iterator[Message]:
+    def perturb_best(self) -> Iterator[ChildMessage]:
         """Follow the best sequence and hold another action from some step on."""
         for _ in range(CONTINUED):
             if not self._goes_on():
                 return
-            best = max(self.attempts, key=lambda each: each.score)
+            best = max(self.attempts, key=lambda attempt: attempt.score)
             at = int(best.played.steps * np.sqrt(self._rng.random()))  # rather late than early
             action = action_at(self._space, self._rng.random(self._size))
             yield from self.play([*best.sequence[:at], *[action] * (self._length - at)])
 
-    def stop_early(self) -> Iterator[Message]:
+    def stop_early(self) -> Iterator[ChildMessage]:
         """Follow a sequence that finished, do nothing from shortly before its end on, and compare what both earn."""
-        is_reported = reports_success([each.played for each in self.attempts])
-        finished = [each for each in self.attempts if _finishes(each.played, is_reported)]
+        is_reported = reports_success([attempt.played for attempt in self.attempts])
+        finished = [attempt for attempt in self.attempts if _finishes(attempt.played, is_reported)]
         if not finished:
             yield Skipped("RL605", "the search for high returns ended no episode at a goal", applies=False)
             return
-        best = max(finished, key=lambda each: each.played.rewards[-1])
+        best = max(finished, key=lambda attempt: attempt.played.rewards[-1])
         one, nothing = best.played, zero_action(self._space)
         stops: list[Stop] = []
         for before in STOPS:
@@ -148,18 +149,18 @@ class _Search:
                 is_same = np.array_equal(one.rewards[:at], two.rewards[:at]) and two.ended != "raised"
                 if is_same and two.steps > one.steps and not _finishes(two, is_reported):
                     limit = find_longest_episode(self.instance.env)
-                    longest = limit or max(each.played.steps for each in self.attempts)
+                    longest = limit or max(attempt.played.steps for attempt in self.attempts)
                     stops.append(compare_returns(one, two, at, longest))
         if not is_reported:
-            stops = [each for each in stops if each.finishing > 0]  # an end that costs more than it pays is no goal
+            stops = [stop for stop in stops if stop.finishing > 0]  # an end that costs more than it pays is no goal
         yield from _judge_stops(one, stops)
 
-    def play(self, sequence: list[Any], kind: str = "searched") -> Iterator[Message]:
+    def play(self, sequence: list[Any], kind: str = "searched") -> Iterator[ChildMessage]:
         """Play one sequence of actions."""
         given = (copy.deepcopy(action) for action in sequence)
         deadline = self.budget.end_within(max(0.0, self.budget.seconds_left / 4))
         number, steps = len(self.attempts), len(sequence)
-        episode = Episode(
+        episode = EpisodePlayer(
             self.instance, FIRST_SEED, kind, number=number, max_steps=steps, deadline=deadline, given=given
         )
         recording = Recording("search", episode, self.budget)
@@ -170,19 +171,19 @@ class _Search:
             self._length = min(self._length, played.steps)
 
     def _hold(self, parameters: NDArray[np.float64]) -> list[Any]:
-        actions = [action_at(self._space, each) for each in parameters]
+        actions = [action_at(self._space, parameter) for parameter in parameters]
         # Where episodes end soon the actions have to change soon.
-        longest = max(each.played.steps for each in self.attempts)
+        longest = max(attempt.played.steps for attempt in self.attempts)
         segment = max(2, min(self._length, round(STRETCH * longest)) // SEGMENTS)
         return [actions[min(SEGMENTS - 1, step // segment)] for step in range(self._length)]
 
     def _goes_on(self, part: float = 1.0) -> bool:
-        steps = sum(each.played.steps for each in self.attempts)
+        steps = sum(attempt.played.steps for attempt in self.attempts)
         is_left = steps < part * MOST_STEPS and len(self.attempts) < part * MOST_EPISODES
         return is_left and not self.budget.why_spent
 
 
-def _finishes(episode: Trajectory, success_is_reported: bool) -> bool:
+def _finishes(episode: RecordedEpisode, success_is_reported: bool) -> bool:
     """Whether an episode ended at the goal: as it reports, or else with a reward far above what it began with."""
     if episode.ended not in ("terminated", "both"):
         return False
@@ -207,7 +208,7 @@ class Stop:
     """Its mean reward from that step on."""
 
 
-def compare_returns(one: Trajectory, two: Trajectory, at: int, longest: int) -> Stop:
+def compare_returns(one: RecordedEpisode, two: RecordedEpisode, at: int, longest: int) -> Stop:
     """Compare an episode that finished with one that is the same for `at` steps. `longest`: the time limit [steps]."""
     rest = two.rewards[at:]
     to_come = 0 if two.has_ended else longest - two.steps
@@ -215,13 +216,13 @@ def compare_returns(one: Trajectory, two: Trajectory, at: int, longest: int) -> 
     return Stop(at + 1, discounted_sum(one.rewards[at:]), stopping, float(rest.mean()))
 
 
-def _judge_stops(finished: Trajectory, stops: Sequence[Stop]) -> Iterator[Message]:
+def _judge_stops(finished: RecordedEpisode, stops: Sequence[Stop]) -> Iterator[ChildMessage]:
     if not stops:
         yield Skipped("RL605", "no episode that stops just before the goal could be played")
         return
-    best = max(stops, key=lambda each: each.stopping - each.finishing)
+    best = max(stops, key=lambda stop: stop.stopping - stop.finishing)
     if best.per_step > 0 and best.stopping > best.finishing + CLEARLY * abs(best.finishing):
-        yield Finding(
+        yield RuleFinding(
             "RL605",
             f"finishing at step {finished.steps} earns {best.finishing:.4g} from step {best.step} on; stopping there "
             f"instead earns {best.per_step:.3g} per step, {best.stopping:.4g} in all (discounted by {DISCOUNT})",

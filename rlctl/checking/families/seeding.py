@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import Episode
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.families.determinism import compare
-from rlctl.checking.finding import Finding, NotJudged, check, experiment
+from rlctl.checking.finding import NotJudged, RuleFinding
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import flatten_numbers
-from rlctl.checking.messages import FIRST_SEED, Message
+from rlctl.checking.messages import FIRST_SEED, ChildMessage
 from rlctl.checking.records import Records
 
 WATCHED_STEPS = 30
@@ -26,62 +27,68 @@ FEWEST_SEEDS = 4
 
 
 @check("RL306", "comparisons", "episodes")
-def _compare_seeds(records: Records) -> Iterator[Finding]:
+def _compare_seeds(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     trajectory, difference = compare(records, "alone", "seeds")
     if difference is not None:
         return
-    starts = [each for each in records.require_alone() if 0 in each.observations and len(each.observations[0].steps)]
-    seeds = len({each.seed for each in starts})
+    starts = [
+        episode
+        for episode in records.require_alone()
+        if 0 in episode.observations and len(episode.observations[0].steps)
+    ]
+    seeds = len({start.seed for start in starts})
     if seeds < FEWEST_SEEDS:
         raise NotJudged(f"fewer than {FEWEST_SEEDS} seeds were tried")
     for index, _ in enumerate(built.leaves):
-        values = [each.observations[index].values[0] for each in starts if index in each.observations]
+        values = [start.observations[index].values[0] for start in starts if index in start.observations]
         if any(not np.array_equal(values[0], other) for other in values[1:]):
             return
     message = f"{seeds} seeds give one start, and with the same actions one trajectory of {trajectory.steps} steps"
-    yield Finding("RL306", message, {"seeds": seeds, "value": 1, "expected": seeds})
+    yield RuleFinding("RL306", message, {"seeds": seeds, "value": 1, "expected": seeds})
 
 
 @experiment("unseeded", "RL308", share=0.5)
-def compare_unseeded(context: Context) -> Iterator[Message]:
+def compare_unseeded(context: Context) -> Iterator[ChildMessage]:
     """Play in two new instances after the same resets: first all with a seed, then the last ones without."""
     with context.fresh() as first, context.fresh() as second:
         if not first.accepts_seed:
             raise NotJudged("reset takes no seed (RL202)")
         deadline = context.budget.deadline
-        if _differing(*(_play(each, deadline, seed=FIRST_SEED) for each in (first, second))):
+        if _differing(*(_play(instance, deadline, seed=FIRST_SEED) for instance in (first, second))):
             raise NotJudged("equal seeds and actions give unequal episodes (RL3)")
-        values = _differing(*(_play(each, deadline) for each in (first, second)))
+        values = _differing(*(_play(instance, deadline) for instance in (first, second)))
     if values:
         message = f"reset with one seed, and then without: {values[0]:.6g} in an observation, in another instance "
         evidence = {"seed": FIRST_SEED, "value": values[1], "expected": values[0]}
-        yield Finding("RL308", f"{message}{values[1]:.6g}", evidence)
+        yield RuleFinding("RL308", f"{message}{values[1]:.6g}", evidence)
 
 
 def _play(instance: Instance, deadline: float, **seed: int) -> NDArray[np.float64]:
     """Reset with a seed and then a few times as given; return the numbers of these and of some more observations."""
-    episode = Episode(instance, FIRST_SEED, max_steps=UNSEEDED_STEPS, deadline=deadline)
+    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=UNSEEDED_STEPS, deadline=deadline)
     episode.reset()
     starts = [instance.call("reset", instance.env.reset, **seed) for _ in range(UNSEEDED_RESETS)]
-    observations = [each[0] if isinstance(each, tuple) else each for each in starts]
+    observations = [start[0] if isinstance(start, tuple) else start for start in starts]
     while not episode.ended:
         observations.append(episode.step().observation)
-    return np.nan_to_num(np.concatenate([flatten_numbers(each) for each in observations]).astype(np.float64))
+    return np.nan_to_num(
+        np.concatenate([flatten_numbers(observation) for observation in observations]).astype(np.float64)
+    )
 
 
 def _differing(one: NDArray[np.float64], two: NDArray[np.float64]) -> list[float]:
     """Return the first two numbers that differ, as far as both go; nothing where none do."""
     rows = min(len(one), len(two))
     unequal = np.flatnonzero(one[:rows] != two[:rows])
-    return [float(each[unequal[0]]) for each in (one, two)] if unequal.size else []
+    return [float(numbers[unequal[0]]) for numbers in (one, two)] if unequal.size else []
 
 
 @experiment("global random", "RL309", share=0.5)
-def compare_generators(context: Context) -> Iterator[Message]:
+def compare_generators(context: Context) -> Iterator[ChildMessage]:
     """Play the beginning of an episode, and say which generators of the whole process it moves, and where first."""
     moved: set[str] = set()
-    episode = Episode(context.instance, FIRST_SEED, max_steps=WATCHED_STEPS, deadline=context.budget.deadline)
+    episode = EpisodePlayer(context.instance, FIRST_SEED, max_steps=WATCHED_STEPS, deadline=context.budget.deadline)
     before = _read_generators()
     for moment in episode:
         after = _read_generators()
@@ -90,7 +97,7 @@ def compare_generators(context: Context) -> Iterator[Message]:
                 moved.add(generator)
                 call, at = ("step", f" at step {moment.step}") if moment.step else ("reset", "")
                 evidence = {"generator": generator, "call": call, "step": moment.step}
-                yield Finding("RL309", f"{call} moves the global generator {generator}{at}", evidence)
+                yield RuleFinding("RL309", f"{call} moves the global generator {generator}{at}", evidence)
         before = _read_generators()
 
 

@@ -9,10 +9,11 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from rlctl.checking.bullet_calls import visible_to_profilers
 from rlctl.checking.clock import read_clock
-from rlctl.checking.episode import Episode
-from rlctl.checking.finding import Finding, NotJudged, check, experiment, list_names
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
+from rlctl.checking.finding import NotJudged, RuleFinding, list_names
 from rlctl.checking.instance import Context, Instance, Timer, rebuilds_world
-from rlctl.checking.messages import Fact, Message
+from rlctl.checking.messages import ChildMessage, Fact
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_code
 from rlctl.checking.records import Records
 from rlctl.output import format_duration
@@ -71,7 +72,7 @@ class Speed:
 
 
 @experiment("speed", share=1.5)
-def measure_speed(context: Context) -> Iterator[Message]:
+def measure_speed(context: Context) -> Iterator[ChildMessage]:
     """Play random episodes: first with nothing but a clock, then under a profiler."""
     instance, seconds = context.instance, min(LONGEST_S, context.budget.seconds_left)
     steps, resets = Stopwatch(), Stopwatch()
@@ -80,13 +81,13 @@ def measure_speed(context: Context) -> Iterator[Message]:
     _play(instance, stopwatches, TIMED_STEPS, deadline)
     _play(instance, stopwatches, TIMED_RESETS, deadline, only_reset=True)
     profilers = {"step": cProfile.Profile(), "reset": cProfile.Profile()}
-    timers = {call: each.runcall for call, each in profilers.items()}
+    timers = {call: profiler.runcall for call, profiler in profilers.items()}
     with visible_to_profilers():
         for only_reset in (False, True):
             deadline = read_clock() + min(seconds / 4, PROFILED_S)
             _play(instance, timers, MOST_STEPS, deadline, only_reset=only_reset)
     is_own = find_own_code(instance.env)
-    in_step, in_reset = (Profile(each, is_own) for each in profilers.values())
+    in_step, in_reset = (Profile(profiler, is_own) for profiler in profilers.values())
     yield Fact(
         "speed",
         Speed(
@@ -111,7 +112,9 @@ def _play(
     try:
         while calls > 0 and read_clock() < deadline:
             steps = 0 if only_reset else calls
-            episode = Episode(instance, FIRST_SPEED_SEED + number, number=number, max_steps=steps, deadline=deadline)
+            episode = EpisodePlayer(
+                instance, FIRST_SPEED_SEED + number, number=number, max_steps=steps, deadline=deadline
+            )
             for _ in episode:
                 pass
             number += 1
@@ -130,7 +133,7 @@ def typical(seconds: Sequence[float], batch: int) -> float | None:
 
 
 @check("RL901", "speed")
-def _find_slow_step(records: Records) -> Iterator[Finding]:
+def _find_slow_step(records: Records) -> Iterator[RuleFinding]:
     speed = _require_speed(records)
     if speed.step_s is None:
         raise NotJudged("no step could be timed")
@@ -140,7 +143,7 @@ def _find_slow_step(records: Records) -> Iterator[Finding]:
         return
     per_s, hours = 1 / speed.step_s, MILLION * speed.step_s / 3600
     calls = _list(speed.slowest_in_step)
-    yield Finding(
+    yield RuleFinding(
         "RL901",
         f"{per_s:,.3g} steps/s: a million steps take {hours:,.3g} hours per process on this machine; slowest: {calls}",
         {"value": per_s, "expected": SLOW_STEPS_PER_S, "step_ms": 1e3 * speed.step_s, "steps": speed.steps},
@@ -148,20 +151,20 @@ def _find_slow_step(records: Records) -> Iterator[Finding]:
 
 
 @check("RL903", "speed")
-def _find_drawing_and_waiting(records: Records) -> Iterator[Finding]:
+def _find_drawing_and_waiting(records: Records) -> Iterator[RuleFinding]:
     speed = _require_speed(records)
     for call, seconds in (("step", speed.step_s), ("reset", speed.reset_s)):
-        for each in _idle(records, speed, call):
-            lost = _time(each.share * seconds) if seconds else "?"
-            yield Finding(
+        for episode in _idle(records, speed, call):
+            lost = _time(episode.share * seconds) if seconds else "?"
+            yield RuleFinding(
                 "RL903",
-                f"{call} calls {each.name}{_at(each)}: {lost} per {call}, {each.share:.0%} of its time",
-                {"call": call, "value": each.name, "place": each.place, "share": each.share},
+                f"{call} calls {episode.name}{_at(episode)}: {lost} per {call}, {episode.share:.0%} of its time",
+                {"call": call, "value": episode.name, "place": episode.place, "share": episode.share},
             )
 
 
 @check("RL904", "speed", "episodes")
-def _find_loading(records: Records) -> Iterator[Finding]:
+def _find_loading(records: Records) -> Iterator[RuleFinding]:
     speed, step_s, reset_s, steps = _require_times(records)
     for call, call_s, part, whole_s in (
         ("reset", reset_s, "an episode", reset_s + steps * step_s),
@@ -170,14 +173,14 @@ def _find_loading(records: Records) -> Iterator[Finding]:
         calls = _loading(speed, call)
         seconds = call_s * _share(calls)
         share = seconds / whole_s if whole_s else 0.0
-        connects = any(each.kind == "connecting" for each in calls)
+        connects = any(call.kind == "connecting" for call in calls)
         if calls and (connects or call == "step" or share >= LITTLE_LOADING):
-            named = sorted(calls, key=lambda each: (each.kind != "connecting", -each.share))
-            names = list_names([f"{each.name}{_at(each)}" for each in named], NAMED_CALLS)
-            yield Finding(
+            named = sorted(calls, key=lambda call: (call.kind != "connecting", -call.share))
+            names = list_names([f"{timed.name}{_at(timed)}" for timed in named], NAMED_CALLS)
+            yield RuleFinding(
                 "RL904",
                 f"{call} calls {names}: {_time(seconds)} per {call}, {share:.0%} of {part}",
-                {"call": call, "value": [each.name for each in named], "ms": 1e3 * seconds, "share": share},
+                {"call": call, "value": [timed.name for timed in named], "ms": 1e3 * seconds, "share": share},
             )
 
 
@@ -198,10 +201,10 @@ def format_speed(records: Records) -> str:
 
 def episode_steps(records: Records) -> float | None:
     """Return the mean length of an episode with random actions, or of any, cut ones only if there are no others."""
-    episodes = [each for each in records.episodes if each.steps]
-    whole = [each for each in episodes if each.has_ended] or episodes
-    random = [each for each in whole if each.actions == "random"] or whole
-    return statistics.fmean(each.steps for each in random) if random else None
+    episodes = [episode for episode in records.episodes if episode.steps]
+    whole = [episode for episode in episodes if episode.has_ended] or episodes
+    random = [episode for episode in whole if episode.actions == "random"] or whole
+    return statistics.fmean(episode.steps for episode in random) if random else None
 
 
 def _require_speed(records: Records) -> Speed:
@@ -219,7 +222,7 @@ def _require_times(records: Records) -> tuple[Speed, float, float, float]:
 
 def _suspicious(speed: Speed, call: str, kinds: Sequence[str]) -> list[TimedCall]:
     calls = speed.suspicious_in_step if call == "step" else speed.suspicious_in_reset
-    return [each for each in calls if each.kind in kinds]
+    return [call for call in calls if call.kind in kinds]
 
 
 def _idle(records: Records, speed: Speed, call: str) -> list[TimedCall]:
@@ -227,7 +230,7 @@ def _idle(records: Records, speed: Speed, call: str) -> list[TimedCall]:
     shapes = [leaf.shape for leaf in records.require_built().leaves]
     has_image = any(sum(size >= SMALLEST_IMAGE for size in shape) >= 2 for shape in shapes)
     kinds = ("sleeping",) if has_image else ("sleeping", "rendering")
-    return [each for each in _suspicious(speed, call, kinds) if each.share >= LEAST_DRAWING]
+    return [timed for timed in _suspicious(speed, call, kinds) if timed.share >= LEAST_DRAWING]
 
 
 def _loading(speed: Speed, call: str) -> list[TimedCall]:
@@ -238,16 +241,16 @@ def _loading(speed: Speed, call: str) -> list[TimedCall]:
     share = _share(calls)
     seconds = share * ((speed.step_s if call == "step" else speed.reset_s) or 0.0)
     is_much = seconds > SLOW_LOADING_S or (call == "step" and share > MOST_LOADING)
-    return calls if is_much or any(each.kind == "connecting" for each in calls) else []
+    return calls if is_much or any(call.kind == "connecting" for call in calls) else []
 
 
 def _share(calls: Sequence[TimedCall]) -> float:
-    return min(1.0, sum(each.share for each in calls))
+    return min(1.0, sum(call.share for call in calls))
 
 
 def _list(calls: Sequence[TimedCall]) -> str:
     return ", ".join(
-        f"{each.name} {each.share:.0%}{_at(each)}" for each in calls[:NAMED_CALLS] if each.share >= LEAST_SHARE
+        f"{call.name} {call.share:.0%}{_at(call)}" for call in calls[:NAMED_CALLS] if call.share >= LEAST_SHARE
     )
 
 

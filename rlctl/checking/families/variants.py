@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import Episode
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import experiment
 from rlctl.checking.failures import EnvironmentRaised, describe
-from rlctl.checking.finding import Finding, NotApplicable, NotJudged, experiment
+from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import flatten_numbers
-from rlctl.checking.messages import FIRST_SEED, Message, Skipped
+from rlctl.checking.messages import FIRST_SEED, ChildMessage, Skipped
 from rlctl.environments import info, registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
@@ -27,7 +28,7 @@ STEPS = 60
 
 
 @experiment("variants", "RL011", "RL012", share=2.0)
-def play_variants(context: Context) -> Iterator[Message]:
+def play_variants(context: Context) -> Iterator[ChildMessage]:
     """Play the task with all of its events and with none, and each of its stages, and compare equal seeds."""
     task: Any = getattr(getattr(context.instance.env, "unwrapped", None), "task", None)
     if not registry.is_task(type(task)):
@@ -57,19 +58,19 @@ def _find_stages(name: str, task: Any) -> Sequence[Any]:
     return stages if isinstance(stages, list | tuple) else ()  # another type is refused with the recipe
 
 
-def _play_events(context: Context, repeats: bool) -> Iterator[Finding]:
+def _play_events(context: Context, repeats: bool) -> Iterator[RuleFinding]:
     for randomize in {True, False} - {context.spec.randomize}:
         where = f"with randomize={str(randomize).lower()}"
         try:
             same = _play(context, dataclasses.replace(context.spec, randomize=randomize))
         except EnvironmentRaised as error:
-            yield Finding("RL011", f"{where}: {_explain(error)}")
+            yield RuleFinding("RL011", f"{where}: {_explain(error)}")
             continue
         if repeats and not same:
-            yield Finding("RL011", f"{where}: equal seeds and actions give unequal episodes")
+            yield RuleFinding("RL011", f"{where}: equal seeds and actions give unequal episodes")
 
 
-def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[Finding]:
+def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[RuleFinding]:
     from rlctl.recipe.recipe import validate
 
     spec, first = context.spec, None
@@ -77,24 +78,24 @@ def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[Finding]:
     try:
         specs = validate(settings, "stages").env_specs(spec.task)
     except RecipeError as error:
-        yield Finding("RL012", str(error))
+        yield RuleFinding("RL012", str(error))
         return
-    for number, each in enumerate(specs, start=1):
+    for number, stage in enumerate(specs, start=1):
         try:
-            info = _describe(context, each)
+            info = _describe(context, stage)
         except EnvironmentRaised as error:
-            yield Finding("RL012", f"stage {number} of {len(specs)}: {_explain(error)}")
+            yield RuleFinding("RL012", f"stage {number} of {len(specs)}: {_explain(error)}")
             continue
         first = first or info
         if difference := info.find_difference(first, "stage 1's"):
-            yield Finding("RL012", f"stage {number} of {len(specs)}: {difference}")
+            yield RuleFinding("RL012", f"stage {number} of {len(specs)}: {difference}")
 
 
 def _play(context: Context, spec: EnvSpec) -> bool:
     """Say whether two episodes of one seed are equal in the environment of `spec`."""
     with Context(spec, context.progress).fresh() as instance:
         episodes = [_record(context, instance) for _ in range(2)]
-    shortest = min(len(each) for each in episodes)  # where time was up
+    shortest = min(len(episode) for episode in episodes)  # where time was up
     return bool(np.array_equal(episodes[0][:shortest], episodes[1][:shortest]))
 
 
@@ -107,7 +108,7 @@ def _describe(context: Context, spec: EnvSpec) -> EnvInfo:
 
 
 def _record(context: Context, instance: Instance) -> NDArray[np.float64]:
-    episode = Episode(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
+    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
     return np.concatenate([flatten_numbers(moment.observation) for moment in episode])
 
 

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rlctl import output
-from rlctl.checking.check import Report
+from rlctl.checking.check import CheckReport
 from rlctl.checking.formats import github, plain, sarif, structured
 from rlctl.errors import UsageError
 from rlctl.storage import files
 
-FORMATS: dict[str, Callable[[Report], str]] = {
+FORMATS: dict[str, Callable[[CheckReport], str]] = {
     "text": plain.text,
     "json": structured.text,
     "sarif": sarif.text,
@@ -29,7 +29,7 @@ def choose(form: str | None, target: str | None, json: str | None) -> tuple[str,
     return form or "text", target
 
 
-def show(report: Report, form: str, target: str | None) -> None:
+def show(report: CheckReport, form: str, target: str | None) -> None:
     """Print a report, or write it to a file (`-`: stdout) and say so on stderr."""
     for name, trace in report.verdict.crashed.items():
         print(f"{name} crashed, a bug in rlctl:\n{trace}", file=sys.stderr)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from rlctl.checking.check import Report
-from rlctl.checking.finding import Finding, Severity
+from rlctl.checking.check import CheckReport
+from rlctl.checking.finding import RuleFinding, Severity
 from rlctl.checking.formats.plain import summary
 
 COMMANDS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "notice"}
 
 
-def text(report: Report) -> str:
+def text(report: CheckReport) -> str:
     """Return a line per finding, and one that says what was found."""
     place = _place(report)
     lines = [_annotation(finding, place) for finding in report.verdict.findings]
@@ -20,13 +20,13 @@ def text(report: Report) -> str:
     return "\n".join([*lines, summary(report)]) + "\n"
 
 
-def _annotation(finding: Finding, place: str) -> str:
+def _annotation(finding: RuleFinding, place: str) -> str:
     title = _property(f"{finding.rule} {finding.name}")
     message = _data(f"{finding.message}\nfix: {finding.fix}")
     return f"::{COMMANDS[finding.severity]} {place}title={title}::{message}"
 
 
-def _place(report: Report) -> str:
+def _place(report: CheckReport) -> str:
     """Return file and line as properties; empty for a file outside the repository, which cannot be annotated."""
     if report.place is None:
         return ""

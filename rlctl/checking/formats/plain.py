@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from rlctl import output
-from rlctl.checking.check import Report
+from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import format_speed
-from rlctl.checking.finding import FAMILIES, RULES, Finding, Severity
+from rlctl.checking.finding import FAMILIES, RULES, RuleFinding, Severity
 from rlctl.checking.formats.structured import Row, action_rows, observation_rows
 
 if TYPE_CHECKING:
@@ -29,12 +29,12 @@ SHOWN_ROWS = 16
 """How many parts of the observation are shown."""
 
 
-def show(report: Report) -> None:
+def show(report: CheckReport) -> None:
     """Print a report to stdout."""
     _print(output.out(), report)
 
 
-def text(report: Report) -> str:
+def text(report: CheckReport) -> str:
     """Return a report as plain text, a line for each thing."""
     from rich.console import Console
 
@@ -44,25 +44,25 @@ def text(report: Report) -> str:
     return stream.getvalue()
 
 
-def summary(report: Report) -> str:
+def summary(report: CheckReport) -> str:
     """Say in a line what was found."""
     verdict = report.verdict
     counts = Counter(finding.severity for finding in verdict.findings)
-    found = ", ".join(output.format_count(counts[s], s) for s in Severity if counts[s])
+    counted = ", ".join(output.format_count(counts[s], s) for s in Severity if counts[s])
     waived = f", {len(verdict.waived)} waived" if verdict.waived else ""
     rules = f"{output.format_count(len(verdict.judged), 'rule')} judged"
-    return f"{report.task}: {found or 'no findings'}{waived}; {rules} in {report.seconds:.1f} s"
+    return f"{report.task}: {counted or 'no findings'}{waived}; {rules} in {report.seconds:.1f} s"
 
 
-def _print(out: Console, report: Report) -> None:
-    for _, findings in itertools.groupby(report.verdict.findings, key=lambda each: (each.severity, each.rule)):
+def _print(out: Console, report: CheckReport) -> None:
+    for _, findings in itertools.groupby(report.verdict.findings, key=lambda finding: (finding.severity, finding.rule)):
         _print_rule(out, list(findings))
     out.print(summary(report), style="bold" if out.is_terminal else None)
     for line in _facts(report):
         out.print(line)
 
 
-def _print_rule(out: Console, findings: list[Finding]) -> None:
+def _print_rule(out: Console, findings: list[RuleFinding]) -> None:
     from rich.padding import Padding
     from rich.text import Text
 
@@ -82,7 +82,7 @@ def _print_rule(out: Console, findings: list[Finding]) -> None:
     out.print()
 
 
-def _add(body: Text, finding: Finding) -> None:
+def _add(body: Text, finding: RuleFinding) -> None:
     body.append(f"{finding.message}\n")
     for line in str(finding.evidence.get("last_output", "")).splitlines()[-SHOWN_LINES:]:
         body.append(f"  {line}\n", "dim")
@@ -90,7 +90,7 @@ def _add(body: Text, finding: Finding) -> None:
         body.append(f"{numbers}\n", "dim")
 
 
-def _numbers(finding: Finding) -> str:
+def _numbers(finding: RuleFinding) -> str:
     shown = {key: value for key, value in finding.evidence.items() if key not in LONG and value is not None}
     return ", ".join(f"{key.replace('_', ' ')} {_short(value)}" for key, value in shown.items())
 
@@ -100,15 +100,15 @@ def _short(value: Any) -> str:
         return f"{value:.6g}"
     if isinstance(value, list):
         more = f" and {len(value) - SHOWN_ITEMS} more" if len(value) > SHOWN_ITEMS else ""
-        return f"[{', '.join(_short(each) for each in value[:SHOWN_ITEMS])}{more}]"
+        return f"[{', '.join(_short(item) for item in value[:SHOWN_ITEMS])}{more}]"
     if isinstance(value, dict):
-        return ", ".join(f"{key} {_short(each)}" for key, each in value.items())
+        return ", ".join(f"{key} {_short(item)}" for key, item in value.items())
     return str(value)
 
 
-def _facts(report: Report) -> Iterator[str]:
+def _facts(report: CheckReport) -> Iterator[str]:
     verdict, built = report.verdict, report.records.built
-    for rule, findings in itertools.groupby(verdict.waived, key=lambda each: each.rule):
+    for rule, findings in itertools.groupby(verdict.waived, key=lambda finding: finding.rule):
         reason = built.waivers[rule] if built else ""
         yield f"waived {rule} ({'; '.join(finding.message for finding in findings)}): {reason}"
     if built is not None:

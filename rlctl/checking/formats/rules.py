@@ -23,7 +23,9 @@ def show_list() -> None:
             if rule.id.startswith(family):
                 severity = Text(f"{rule.severity:<8}", STYLES[rule.severity])
                 out.print(Text(f"  {rule.id}  ").append_text(severity).append(rule.name))
-    counts = ", ".join(f"{sum(rule.severity is each for rule in RULES.values())} {each}s" for each in Severity)
+    counts = ", ".join(
+        f"{sum(rule.severity is severity for rule in RULES.values())} {severity}s" for severity in Severity
+    )
     out.print(f"{len(RULES)} rules: {counts}. rlctl check-env --explain {next(iter(RULES))} says more.")
 
 

@@ -9,8 +9,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rlctl.checking.check import Report
-from rlctl.checking.finding import FAMILIES, RULES, Finding, Rule, Severity
+from rlctl.checking.check import CheckReport
+from rlctl.checking.finding import FAMILIES, RULES, Rule, RuleFinding, Severity
 from rlctl.checking.formats.structured import plain
 from rlctl.version import __version__
 
@@ -18,17 +18,17 @@ LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 
 
-def text(report: Report) -> str:
+def text(report: CheckReport) -> str:
     """Return a report as SARIF."""
     verdict = report.verdict
     known = {finding.rule for finding in (*verdict.findings, *verdict.waived)}
     rules = [rule for rule in RULES.values() if rule.id in known]
     numbers = {rule.id: number for number, rule in enumerate(rules)}
     waivers = report.records.built.waivers if report.records.built else {}
-    results = [_result(report, each, numbers) for each in verdict.findings]
-    for each in verdict.waived:
-        suppression = {"kind": "inSource", "justification": waivers[each.rule]}
-        results.append({**_result(report, each, numbers), "suppressions": [suppression]})
+    results = [_result(report, finding, numbers) for finding in verdict.findings]
+    for finding in verdict.waived:
+        suppression = {"kind": "inSource", "justification": waivers[finding.rule]}
+        results.append({**_result(report, finding, numbers), "suppressions": [suppression]})
     run = {
         "tool": {"driver": {"name": "rlctl", "version": __version__, "rules": [_rule(rule) for rule in rules]}},
         "invocations": [_invocation(report)],
@@ -50,7 +50,7 @@ def _rule(rule: Rule) -> dict[str, Any]:
     }
 
 
-def _result(report: Report, finding: Finding, numbers: dict[str, int]) -> dict[str, Any]:
+def _result(report: CheckReport, finding: RuleFinding, numbers: dict[str, int]) -> dict[str, Any]:
     result: dict[str, Any] = {
         "ruleId": finding.rule,
         "ruleIndex": numbers[finding.rule],
@@ -75,7 +75,7 @@ def _artifact(file: Path) -> dict[str, str]:
     return {"uri": file.as_uri()}
 
 
-def _invocation(report: Report) -> dict[str, Any]:
+def _invocation(report: CheckReport) -> dict[str, Any]:
     verdict = report.verdict
     notes = [("error", f"{name} crashed:\n{trace}") for name, trace in verdict.crashed.items()]
     notes += [("note", f"{name} not judged: {reason}") for name, reason in verdict.not_judged.items()]

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.check import Report
+from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import Speed
-from rlctl.checking.finding import Finding
+from rlctl.checking.finding import RuleFinding
 from rlctl.checking.leaves import Leaf, name_leaf
 from rlctl.checking.messages import Built
 from rlctl.checking.records import Records
@@ -24,12 +24,12 @@ ELEMENTS_SHOWN = 8
 """So many numbers without names get a row each; more of them share one."""
 
 
-def text(report: Report) -> str:
+def text(report: CheckReport) -> str:
     """Return a report as JSON text."""
     return json.dumps(content(report), indent=2, allow_nan=False) + "\n"
 
 
-def content(report: Report) -> dict[str, Any]:
+def content(report: CheckReport) -> dict[str, Any]:
     """Return a report as plain data."""
     verdict, records = report.verdict, report.records
     return {
@@ -38,10 +38,10 @@ def content(report: Report) -> dict[str, Any]:
         "task": report.task,
         "exit_code": report.exit_code,
         "strict": report.strict,
-        "findings": [finding_json(each) for each in verdict.findings],
+        "findings": [finding_json(finding) for finding in verdict.findings],
         "waived": [
-            {**finding_json(each), "reason": records.built.waivers[each.rule] if records.built else ""}
-            for each in verdict.waived
+            {**finding_json(finding), "reason": records.built.waivers[finding.rule] if records.built else ""}
+            for finding in verdict.waived
         ],
         "judged": verdict.judged,
         "not_judged": [{"what": rule, "reason": why} for rule, why in verdict.not_judged.items()],
@@ -50,14 +50,14 @@ def content(report: Report) -> dict[str, Any]:
         "environment": _environment(report),
         "speed": _speed(report),
         "episodes": len(records.episodes),
-        "steps": sum(each.steps for each in records.trajectories),
+        "steps": sum(trajectory.steps for trajectory in records.trajectories),
         "seconds": report.seconds,
         "budget_seconds": report.budget_s,
-        "experiments": {name: each.seconds for name, each in records.finished.items()},
+        "experiments": {name: end.seconds for name, end in records.finished.items()},
     }
 
 
-def finding_json(finding: Finding) -> dict[str, Any]:
+def finding_json(finding: RuleFinding) -> dict[str, Any]:
     """Return a finding as plain data."""
     return {
         "rule": finding.rule,
@@ -74,13 +74,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if isinstance(value, dict):
-        return {str(key): plain(each) for key, each in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(each) for each in value]
+        return [plain(item) for item in value]
     return value
 
 
-def _environment(report: Report) -> dict[str, Any] | None:
+def _environment(report: CheckReport) -> dict[str, Any] | None:
     built = report.records.built
     if built is None:
         return None
@@ -97,7 +97,7 @@ def _environment(report: Report) -> dict[str, Any] | None:
     }
 
 
-def _speed(report: Report) -> Any:
+def _speed(report: CheckReport) -> Any:
     """What one process does; null where no step could be timed."""
     speed: Speed | None = report.records.facts.get("speed")
     if speed is None or speed.step_s is None:
@@ -123,8 +123,8 @@ def observation_rows(records: Records) -> list[Row]:
     built, rows = records.built, []
     for index, leaf in enumerate(built.leaves if built else ()):
         if built is not None and leaf.supported and 0 not in leaf.shape:
-            values = [each.observations[index].values for each in records.alone if index in each.observations]
-            flat = [each.reshape(len(each), -1).astype(np.float64) for each in values if each.size]
+            values = [episode.observations[index].values for episode in records.alone if index in episode.observations]
+            flat = [value.reshape(len(value), -1).astype(np.float64) for value in values if value.size]
             rows += [_row(name, leaf, part, flat) for name, part in _parts(built, leaf).items()]
     return rows
 
@@ -146,6 +146,6 @@ def _parts(built: Built, leaf: Leaf) -> dict[str, slice]:
 def _row(name: str, leaf: Leaf, part: slice, values: list[NDArray[np.float64]]) -> Row:
     low, high = (np.ravel(np.asarray(bound, np.float64))[part] for bound in (leaf.low, leaf.high))
     with np.errstate(invalid="ignore"):
-        smallest, largest = ([float(function(each[:, part])) for each in values] for function in (np.min, np.max))
+        smallest, largest = ([float(function(value[:, part])) for value in values] for function in (np.min, np.max))
     observed = (float(np.min(smallest)), float(np.max(largest))) if values else None
     return Row(name, low.size, float(low.min()), float(high.max()), observed)
