@@ -14,7 +14,7 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.baseline import Baseline, choose_task, load_baseline
-from rlctl.evaluation.statistics import (
+from rlctl.evaluation.episode_statistics import (
     Spread,
     mean_action_change,
     mean_metrics,

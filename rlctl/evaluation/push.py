@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.evaluation.statistics import summarize
+from rlctl.evaluation.episode_statistics import summarize
 from rlctl.policy.shipped import Interval
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.robustness import PushLevel, PushTest

@@ -9,8 +9,8 @@ from pydantic_core import to_jsonable_python
 
 from rlctl import output
 from rlctl.environments.info import describe_randomization
+from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.evaluate import Evaluation
-from rlctl.evaluation.statistics import Spread
 from rlctl.policy.policy import collect_versions
 
 

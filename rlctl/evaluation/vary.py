@@ -16,9 +16,9 @@ from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation import axes as axes_of
+from rlctl.evaluation.episode_statistics import summarize
 from rlctl.evaluation.evaluate import NO_GATES, EvalRequest, Gates, LoadedPolicy, find_player, start_workers
 from rlctl.evaluation.push import measure_push
-from rlctl.evaluation.statistics import summarize
 from rlctl.policy.acting import Exploration
 from rlctl.policy.policy import collect_versions
 from rlctl.rollout.collect import play_episodes

@@ -21,7 +21,7 @@ from rlctl.recipe.recipe import find_difference, find_mixed
 from rlctl.run.directory import RunDirectory, is_group
 from rlctl.run.group import find_group, read_group
 from rlctl.run.lookup import find_run
-from rlctl.runs.statistics import (
+from rlctl.runs.significance import (
     Difference,
     Verdict,
     return_difference,

@@ -8,10 +8,10 @@ from typing import Any
 from rich.text import Text
 
 from rlctl import output
-from rlctl.evaluation.statistics import Spread
+from rlctl.evaluation.episode_statistics import Spread
 from rlctl.recipe.stages import format_value
 from rlctl.runs.comparison import Candidate, Comparison, EvaluatedRun, Quantity, Side
-from rlctl.runs.statistics import ALPHA, Difference, SeedDifference, Verdict, interquartile_mean_interval
+from rlctl.runs.significance import ALPHA, Difference, SeedDifference, Verdict, interquartile_mean_interval
 
 
 def show(result: Comparison, json: str | None) -> None:

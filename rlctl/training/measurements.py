@@ -21,7 +21,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from rlctl.environments.dict_spaces import join, split, split_names
 from rlctl.environments.info import EnvInfo
-from rlctl.evaluation.statistics import mean_metrics, mean_return, mean_terms, success_rate
+from rlctl.evaluation.episode_statistics import mean_metrics, mean_return, mean_terms, success_rate
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.training.vec_env import WorkerVecEnv
 

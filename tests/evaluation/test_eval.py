@@ -7,11 +7,11 @@ import pytest
 
 from rlctl.environments.spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
+from rlctl.evaluation.episode_statistics import Spread, mean_terms, success_interval, success_rate
 from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.evaluation.group import GroupScore, SeedScore
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.score import measure_score
-from rlctl.evaluation.statistics import Spread, mean_terms, success_interval, success_rate
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.runs.summary import read_table
 from rlctl.training.request import TrainRequest, run_training

@@ -10,7 +10,7 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, choose_spec, load_player
 from rlctl.runs.comparison import Candidate, Comparison, Side, compare, find_runs_of
 from rlctl.runs.comparison_report import as_json, format_needed
-from rlctl.runs.statistics import Verdict
+from rlctl.runs.significance import Verdict
 from rlctl.training.request import TrainRequest, run_training
 from tests.training.conftest import ENVS, TINY
 

@@ -5,7 +5,7 @@ import statistics
 import numpy as np
 import pytest
 
-from rlctl.runs.statistics import (
+from rlctl.runs.significance import (
     Verdict,
     interquartile_mean_interval,
     return_difference,
