@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import statistics
 from collections.abc import Sequence
 
 import numpy as np
@@ -51,14 +50,26 @@ def success_rate(results: Sequence[EpisodeResult]) -> float | None:
 
 
 def success_interval(results: Sequence[EpisodeResult]) -> tuple[float, float] | None:
-    """Return the 95 % Wilson score interval of the success rate (E. B. Wilson, 1927)."""
+    """Return the 95 % interval of the success rate by Clopper and Pearson (1934), which covers it at least as often."""
     known = [result.success for result in results if result.success is not None]
     if not known:
         return None
-    rate, count, z = sum(known) / len(known), len(known), statistics.NormalDist().inv_cdf(0.975)
-    centre = (rate + z**2 / (2 * count)) / (1 + z**2 / count)
-    half = z * math.sqrt(rate * (1 - rate) / count + (z / (2 * count)) ** 2) / (1 + z**2 / count)
-    return (centre - half if rate > 0 else 0.0), (centre + half if rate < 1 else 1.0)
+    return _lower_bound(sum(known), len(known)), 1.0 - _lower_bound(len(known) - sum(known), len(known))
+
+
+def _lower_bound(count: int, episodes: int) -> float:
+    """Return the rate at which `count` or more of the episodes have a probability of 2.5 %."""
+    if count == 0:
+        return 0.0
+    numbers = np.arange(1, episodes + 1)
+    log_choices = np.cumsum(np.log((episodes + 1 - numbers) / numbers))[count - 1 :]
+    numbers = numbers[count - 1 :]
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        rate = (low + high) / 2
+        logs = log_choices + numbers * math.log(rate) + (episodes - numbers) * math.log1p(-rate)
+        low, high = (rate, high) if np.exp(logs).sum() < 0.025 else (low, rate)
+    return low
 
 
 def mean_return(results: Sequence[EpisodeResult]) -> float:

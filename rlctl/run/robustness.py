@@ -23,7 +23,7 @@ class Outcome(_Content):
     success_rate: float | None
     """In [0, 1]; None where the task reports no success."""
     success_interval: Interval | None
-    """95 % Wilson score interval of the success rate."""
+    """95 % interval of the success rate; see `success_interval`."""
     mean_return: float
     return_interval: Interval
     """95 % interval of the mean, by Student's t; the value itself, twice, for a single episode."""

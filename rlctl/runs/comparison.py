@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import glob
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,8 @@ from rlctl.recipe.recipe import find_difference, find_mixed
 from rlctl.run.directory import RunDirectory, is_group
 from rlctl.run.group import find_group, read_group
 from rlctl.run.lookup import find_run
-from rlctl.runs.significance import (
-    Difference,
-    Verdict,
-    return_difference,
-    seed_difference,
-    success_difference,
-)
+from rlctl.runs.significance import Difference, Quantity, Verdict, compare_episodes, compare_seeds
 from rlctl.runs.summary import read_table, summarize
-
-Quantity = Literal["success", "return"]
 
 THRESHOLD = 0.9
 """Success rate whose first evaluation is looked for, where no other is asked for."""
@@ -76,15 +68,15 @@ class Candidate:
     """A side beside the baseline: by how much it differs, and in what."""
 
     side: Side
-    differences: dict[Quantity, Difference]
+    differences: Mapping[Quantity, Difference]
     """`success`, where the task reports it, then `return`."""
     recipe_changes: dict[str, tuple[Any, Any]]
     """Per dotted key, the value here and the baseline's."""
 
     @property
     def verdict(self) -> Verdict:
-        """Success decides; where it cannot tell, the return does."""
-        verdicts = (each.verdict for each in self.differences.values())
+        """Success decides; where it cannot tell, the return does. The p-values allow for both."""
+        verdicts = (difference.verdict for difference in self.differences.values())
         return next((verdict for verdict in verdicts if verdict is not Verdict.CANNOT_TELL), Verdict.CANNOT_TELL)
 
 
@@ -151,7 +143,11 @@ def compare(texts: Sequence[str], request: EvalRequest, threshold: float | None 
         task=task,
         baseline=baseline,
         candidates=[
-            Candidate(side, _differences(baseline, side, of_recipes), find_difference(recipe[0], recipes[0][0]))
+            Candidate(
+                side,
+                _differences(baseline, side, of_recipes, len(others)),
+                find_difference(recipe[0], recipes[0][0]),
+            )
             for side, recipe in zip(others, recipes[1:], strict=True)
         ],
         episodes=request.episodes,
@@ -223,14 +219,10 @@ def _default_threshold(threshold: float | None, has_success: bool) -> float | No
     return THRESHOLD if threshold is None and has_success else threshold
 
 
-def _differences(baseline: Side, side: Side, of_recipes: bool) -> dict[Quantity, Difference]:
+def _differences(baseline: Side, side: Side, of_recipes: bool, comparisons: int) -> Mapping[Quantity, Difference]:
     quantities: list[Quantity] = ["success", "return"] if baseline.has_success and side.has_success else ["return"]
     if of_recipes:
-        return {each: seed_difference(baseline.scores(each), side.scores(each)) for each in quantities}
-    differences = {}
-    for each in quantities:
-        one, two = baseline.runs[0].values(each), side.runs[0].values(each)
-        known = np.isfinite(one) & np.isfinite(two)
-        differ = success_difference if each == "success" else return_difference
-        differences[each] = differ(one[known], two[known])
-    return differences
+        one, two = ({quantity: each.scores(quantity) for quantity in quantities} for each in (baseline, side))
+        return compare_seeds(one, two, comparisons)
+    one, two = ({quantity: each.runs[0].values(quantity) for quantity in quantities} for each in (baseline, side))
+    return compare_episodes(one, two, comparisons)

@@ -10,8 +10,16 @@ from rich.text import Text
 from rlctl import output
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.recipe.stages import format_value
-from rlctl.runs.comparison import Candidate, Comparison, EvaluatedRun, Quantity, Side
-from rlctl.runs.significance import ALPHA, Difference, SeedDifference, Verdict, interquartile_mean_interval
+from rlctl.runs.comparison import Candidate, Comparison, EvaluatedRun, Side
+from rlctl.runs.significance import (
+    ALPHA,
+    Difference,
+    Quantity,
+    SeedDifference,
+    Verdict,
+    find_least_seeds,
+    interquartile_mean_interval,
+)
 
 
 def show(result: Comparison, json: str | None) -> None:
@@ -28,6 +36,7 @@ def show(result: Comparison, json: str | None) -> None:
         output.print_table(("policy", "success", "return"), rows, left=("policy",))
     if result.world_differences:
         out.print(f"all played with the first's {', '.join(result.world_differences)}")
+    out.print(describe_tests(result))
     for candidate in result.candidates:
         _show_candidate(result, candidate)
 
@@ -78,7 +87,7 @@ def _show_candidate(result: Comparison, candidate: Candidate) -> None:
     for quantity, difference in candidate.differences.items():
         out.print(f"  {quantity}: {format_difference(difference, as_percent=quantity == 'success')}")
     if candidate.verdict is Verdict.CANNOT_TELL:
-        out.print(f"  {format_needed(candidate, result.of_recipes)}")
+        out.print(f"  {format_needed(candidate, len(result.candidates))}")
     for key, (value, before) in candidate.recipe_changes.items():
         out.print(f"  recipe: {key}: {format_value(key, before)} -> {format_value(key, value)}")
     if not candidate.recipe_changes:
@@ -101,20 +110,36 @@ def format_difference(difference: Difference, *, as_percent: bool) -> str:
     return text
 
 
-def format_needed(candidate: Candidate, of_recipes: bool) -> str:
-    """Say how much data would decide."""
-    unit, parts = "seeds for each recipe" if of_recipes else "episodes", []
-    first = next(iter(candidate.differences.values()))
-    if isinstance(first, SeedDifference) and first.smallest_p >= ALPHA:
-        parts.append(
-            f"so few seeds cannot decide: the smallest p-value that they can reach is {first.smallest_p:.2g}; "
-            "4 seeds for each recipe reach 0.029, 5 reach 0.008"
-        )
-    needed = [(each.needed, quantity) for quantity, each in candidate.differences.items() if each.needed is not None]
+def format_needed(candidate: Candidate, comparisons: int) -> str:
+    """Return how much data would decide, where a baseline is compared with so many candidates."""
+    first, *_ = candidate.differences.values()
+    unit, parts = "episodes", []
+    if isinstance(first, SeedDifference):
+        unit = "seeds for each recipe"
+        if first.smallest_p >= ALPHA:
+            seeds, smallest = find_least_seeds(comparisons)
+            parts.append(
+                f"so few seeds cannot decide: the smallest p-value that they can reach is {first.smallest_p:.2g}; "
+                f"{seeds} seeds for each recipe reach {smallest:.2g}"
+            )
+    needed = [
+        (difference.needed, quantity)
+        for quantity, difference in candidate.differences.items()
+        if difference.needed is not None
+    ]
     if needed:
         count, quantity = min(needed)
         parts.append(f"if the difference in {quantity} is as it seems, about {count:,} {unit} would decide")
     return "; ".join(parts) or "no difference at all: more of the same would not decide"
+
+
+def describe_tests(result: Comparison) -> str:
+    """Return what is tested, and how often equals are called different."""
+    quantities = " and ".join(result.candidates[0].differences)
+    count = len(result.candidates)
+    of = "" if count == 1 else f" of {count} candidates"
+    together = "" if count == 1 and " and " not in quantities else ", p-values adjusted for all tests together"
+    return f"tested: {quantities}{of}{together}; where all are equal, {ALPHA:.0%} of comparisons report a difference"
 
 
 def as_json(result: Comparison) -> dict[str, Any]:
@@ -125,6 +150,7 @@ def as_json(result: Comparison) -> dict[str, Any]:
         "task": result.task,
         "episodes": result.episodes,
         "threshold": result.threshold,
+        "tested": describe_tests(result),
         "baseline": _side_as_json(result.baseline, result),
         "candidates": [
             {

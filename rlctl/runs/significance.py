@@ -2,18 +2,26 @@
 
 Two policies are compared on the same episodes, so the unit is the episode and the test is paired. Two recipes are
 compared by training each several times, so the unit is the training seed.
+
+Success and return are tested together, and each candidate against the baseline. The p-values are adjusted for that:
+where all are equal, at most `ALPHA` of the comparisons report any difference.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import enum
+import itertools
 import math
 import statistics
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+Quantity = Literal["success", "return"]
+Array = NDArray[np.float64]
 
 ALPHA = 0.05
 """Below this p-value a difference is called one; intervals are of 1 - ALPHA."""
@@ -40,7 +48,7 @@ class Difference:
     """Lower end of the 95 % interval; equal to `mean` where there is nothing to resample."""
     high: float
     p: float
-    """Two-sided p-value; 1 where all pairs are equal."""
+    """Two-sided p-value, adjusted for all that is tested; 1 where all pairs are equal."""
     needed: int | None
     """About how many episodes, or seeds per recipe, would decide, if the difference is as it seems; None if it is 0."""
 
@@ -61,7 +69,100 @@ class SeedDifference(Difference):
     """The smallest p-value that so many seeds can reach at all."""
 
 
-def success_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64]) -> Difference:
+_Kind = TypeVar("_Kind", bound=Difference)
+
+
+def compare_episodes(
+    baseline: Mapping[Quantity, Array], candidate: Mapping[Quantity, Array], comparisons: int = 1
+) -> dict[Quantity, Difference]:
+    """Compare two policies by success and return on the same episodes, each of shape (episodes,), NaN where unknown.
+
+    `comparisons` is how many candidates are compared with this baseline.
+    """
+    differences, changes = {}, []
+    for quantity in baseline:
+        one, two = baseline[quantity], candidate[quantity]
+        known = np.isfinite(one) & np.isfinite(two)
+        measure = success_difference if quantity == "success" else return_difference
+        differences[quantity] = measure(one[known], two[known])
+        changes.append(np.where(known, two - one, 0.0))
+    return _adjust(differences, flip_signs(np.array(changes)), comparisons)
+
+
+def compare_seeds(
+    baseline: Mapping[Quantity, Array], candidate: Mapping[Quantity, Array], comparisons: int = 1
+) -> dict[Quantity, SeedDifference]:
+    """Compare two recipes by the scores of their training seeds, each of shape (seeds,); see `compare_episodes`."""
+    differences = {quantity: seed_difference(baseline[quantity], candidate[quantity]) for quantity in baseline}
+    p_values = exchange_seeds(np.array(list(baseline.values())), np.array(list(candidate.values())))
+    return {
+        quantity: dataclasses.replace(difference, smallest_p=min(1.0, comparisons * difference.smallest_p))
+        for quantity, difference in _adjust(differences, p_values, comparisons).items()
+    }
+
+
+def _adjust(differences: Mapping[Quantity, _Kind], p_values: Array, comparisons: int) -> dict[Quantity, _Kind]:
+    """Return the differences with p-values for all quantities together, and by Bonferroni for several candidates."""
+    return {
+        quantity: dataclasses.replace(difference, p=min(1.0, comparisons * max(difference.p, float(p))))
+        for (quantity, difference), p in zip(differences.items(), p_values, strict=True)
+    }
+
+
+def flip_signs(differences: Array) -> Array:
+    """Return the p-values, shape (quantities,), of paired differences, shape (quantities, episodes), tested together.
+
+    Under the null hypothesis an episode's differences may as well have the other sign, all at once. Step-down maximum
+    of Westfall and Young (1993), which takes into account that success and return go together.
+    """
+    moving = differences[:, differences.any(axis=0)]
+    episodes = moving.shape[1]
+    scale = np.sqrt((moving**2).sum(axis=1, keepdims=True))
+    scaled = np.divide(moving, scale, out=np.zeros_like(moving), where=scale > 0)
+    if exact := 2**episodes <= _RESAMPLES:
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=episodes))).reshape(-1, episodes)
+    else:
+        signs = 2.0 * _rng().integers(2, size=(_RESAMPLES, episodes), dtype=np.int8) - 1.0
+    return _step_down(np.abs(scaled.sum(axis=1)), np.abs(signs @ scaled.T), exact)
+
+
+def exchange_seeds(baseline: Array, candidate: Array) -> Array:
+    """Return the p-values, shape (quantities,), of scores, shapes (quantities, seeds), of two recipes tested together.
+
+    Under the null hypothesis a seed may as well be the other recipe's; else as `flip_signs`.
+    """
+    scores = np.concatenate([candidate, baseline], axis=1)
+    count, every = candidate.shape[1], scores.shape[1]
+    scores = scores - scores.mean(axis=1, keepdims=True)
+    scale = scores.std(axis=1, keepdims=True)
+    scaled = np.divide(scores, scale, out=np.zeros_like(scores), where=scale > 1e-12)
+    if exact := math.comb(every, count) <= _RESAMPLES:
+        chosen = np.array(list(itertools.combinations(range(every), count)))
+    else:
+        chosen = _rng().permuted(np.tile(np.arange(every), (_RESAMPLES, 1)), axis=1)[:, :count]
+    # Of centred scores the sum over one recipe's seeds is proportional to the difference of means.
+    return _step_down(np.abs(scaled[:, :count].sum(axis=1)), np.abs(scaled[:, chosen].sum(axis=2)).T, exact)
+
+
+def _step_down(observed: Array, resampled: Array, exact: bool) -> Array:
+    """Return p-values, shape (quantities,), of statistics, of which `resampled` is the null, shape (n, quantities)."""
+    order = np.argsort(-observed)
+    largest = np.maximum.accumulate(resampled[:, order[::-1]], axis=1)[:, ::-1]
+    extreme = (largest >= observed[order] - 1e-9).sum(axis=0)
+    p_values = np.empty(len(order))
+    p_values[order] = np.maximum.accumulate(extreme / len(resampled) if exact else (extreme + 1) / (len(resampled) + 1))
+    return p_values
+
+
+def find_least_seeds(comparisons: int) -> tuple[int, float]:
+    """Return with how many seeds for each recipe a difference can be found at all, and their smallest p-value."""
+    for seeds in itertools.count(2):
+        if (smallest := comparisons * 2 / math.comb(2 * seeds, seeds)) < ALPHA:
+            return seeds, smallest
+    raise AssertionError
+
+
+def success_difference(baseline: Array, candidate: Array) -> Difference:
     """Compare two policies' successes, 0 or 1, on the same episodes: McNemar's exact test (McNemar, 1947).
 
     Both of shape (episodes,). The interval is that of Agresti and Min (2005), which is not empty where no episode
@@ -78,7 +179,7 @@ def success_difference(baseline: NDArray[np.float64], candidate: NDArray[np.floa
     return Difference(float(difference.mean()), max(-1.0, centre - half), min(1.0, centre + half), p, needed)
 
 
-def return_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64]) -> Difference:
+def return_difference(baseline: Array, candidate: Array) -> Difference:
     """Compare two policies' returns on the same episodes: a paired permutation test and a bootstrap interval.
 
     Both of shape (episodes,). Raises `ValueError` if the shapes differ.
@@ -97,7 +198,7 @@ def return_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float
     return Difference(mean, low, high, float(test.pvalue), _sample_size(mean, std, _LEAST_PAIRS))
 
 
-def seed_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64]) -> SeedDifference:
+def seed_difference(baseline: Array, candidate: Array) -> SeedDifference:
     """Compare two recipes by the final scores of their training seeds: an exact permutation test where it is small.
 
     Shapes (seeds,), two seeds or more each. The interval of the difference of means is a bootstrap over seeds.
@@ -117,31 +218,31 @@ def seed_difference(baseline: NDArray[np.float64], candidate: NDArray[np.float64
     return SeedDifference(mean, low, high, p, _sample_size(mean, std, _LEAST_SEEDS), improvement, smallest)
 
 
-def interquartile_mean_interval(scores: NDArray[np.float64]) -> tuple[float, float]:
+def interquartile_mean_interval(scores: Array) -> tuple[float, float]:
     """Return the 95 % bootstrap interval of the interquartile mean over seeds, shape (seeds,)."""
     from scipy.stats import trim_mean
 
-    def middle(values: NDArray[np.float64], axis: int = -1) -> Any:
+    def middle(values: Array, axis: int = -1) -> Any:
         return trim_mean(values, 0.25, axis=axis)
 
     return _interval((scores,), middle)
 
 
-def _difference_of_means(one: NDArray[np.float64], two: NDArray[np.float64], axis: int = -1) -> Any:
+def _difference_of_means(one: Array, two: Array, axis: int = -1) -> Any:
     return np.mean(one, axis=axis) - np.mean(two, axis=axis)
 
 
-def _interval(samples: tuple[NDArray[np.float64], ...], statistic: Any) -> tuple[float, float]:
+def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:
     """Return a percentile bootstrap interval; the statistic itself, twice, where no sample varies."""
     from scipy.stats import bootstrap
 
     if all(np.ptp(sample) == 0 for sample in samples):
         value = float(statistic(*samples))
         return value, value
-    found = bootstrap(
+    result = bootstrap(
         samples, statistic, confidence_level=1 - ALPHA, n_resamples=_RESAMPLES, method="percentile", rng=_rng()
     )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
 
 
 def _rng() -> np.random.Generator:

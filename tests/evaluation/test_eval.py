@@ -36,15 +36,26 @@ def result(success, total=1.0, terms=None):
     return EpisodeResult(0, 0, total, 10, success, terms or {}, None)
 
 
-def test_wilson_interval_by_hand():
+def test_success_interval_by_hand():
     results = [result(True)] * 8 + [result(False)] * 2
     assert success_rate(results) == 0.8
-    # p = 0.8, n = 10, z = 1.959964: centre (p + z^2 / 2n) / (1 + z^2 / n) = (0.8 + 0.192073) / 1.384146 = 0.716741
-    # half width z / (1 + z^2 / n) * sqrt(p q / n + z^2 / 4 n^2) = 1.416010 * sqrt(0.016 + 0.00960365) = 0.226577
-    assert success_interval(results) == pytest.approx((0.490162, 0.943318), abs=1e-5)
-    # At the ends: [0, z^2 / (n + z^2)] and [n / (n + z^2), 1], z^2 = 3.841459.
-    assert success_interval(results[8:]) == (0.0, pytest.approx(3.841459 / 5.841459, abs=1e-6))
-    assert success_interval(results[:8]) == (pytest.approx(8 / 11.841459, abs=1e-6), 1.0)
+    low, high = success_interval(results)
+    # Clopper and Pearson: at the lower end 8 or more of 10 have a probability of 0.025, at the upper end 8 or fewer.
+    assert sum(math.comb(10, k) * low**k * (1 - low) ** (10 - k) for k in (8, 9, 10)) == pytest.approx(0.025)
+    assert sum(math.comb(10, k) * high**k * (1 - high) ** (10 - k) for k in (9, 10)) == pytest.approx(0.975)
+    # At the ends [0, 1 - 0.025^(1/n)] and [0.025^(1/n), 1].
+    assert success_interval(results[8:]) == (0.0, pytest.approx(1 - 0.025 ** (1 / 2)))
+    assert success_interval(results[:8]) == (pytest.approx(0.025 ** (1 / 8)), 1.0)
+
+
+@pytest.mark.parametrize("rate", [0.5, 0.9, 0.995])
+def test_success_interval_covers_at_least_as_often_as_it_says(rate):
+    episodes = 100
+    covered = 0.0
+    for good in range(episodes + 1):
+        low, high = success_interval([result(True)] * good + [result(False)] * (episodes - good))
+        covered += math.comb(episodes, good) * rate**good * (1 - rate) ** (episodes - good) * (low <= rate <= high)
+    assert covered >= 0.95  # Wilson's interval covers 91 % at 0.995
 
 
 def test_no_success_is_not_zero_success():

@@ -67,7 +67,7 @@ def test_recipes_are_compared_seed_by_seed(root):
     (candidate,) = result.candidates
     assert candidate.recipe_changes == {"algo_kwargs.gamma": (0.99, 0.9)}
     assert candidate.verdict is Verdict.CANNOT_TELL
-    needed = format_needed(candidate, of_recipes=True)
+    needed = format_needed(candidate, comparisons=1)
     assert "smallest p-value that they can reach is 0.33" in needed
     assert "if the difference in return is as it seems, about " in needed
     content = json.loads(json.dumps(as_json(result)))

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from rlctl.runs.significance import (
+    ALPHA,
     Verdict,
+    compare_episodes,
+    compare_seeds,
+    exchange_seeds,
+    find_least_seeds,
+    flip_signs,
     interquartile_mean_interval,
     return_difference,
     seed_difference,
@@ -116,3 +122,51 @@ def test_intervals_cover_as_often_as_they_say():
         difference = return_difference(np.zeros(40), rng.normal(1.0, 2.0, 40))
         covered += difference.low <= 1.0 <= difference.high
     assert covered >= 86
+
+
+def test_success_and_return_are_tested_together_by_hand():
+    # Six episodes, all better in both: of 2^6 signs two are as extreme, and the two quantities go together.
+    ones = np.ones(6)
+    both = compare_episodes({"success": 0 * ones, "return": 0 * ones}, {"success": ones, "return": ones})
+    assert [difference.p for difference in both.values()] == [2 / 64, 2 / 64]
+    # Of three candidates each p-value counts three times.
+    assert compare_episodes({"return": 0 * ones}, {"return": ones}, comparisons=3)["return"].p == 6 / 64
+    # One episode of success says nothing of returns: its p-value stays 1, that of the return does not fall.
+    success = np.array([1.0, 0, 0, 0, 0, 0])
+    mixed = compare_episodes({"success": 0 * ones, "return": 0 * ones}, {"success": success, "return": ones})
+    assert mixed["success"].p == 1.0
+    assert 2 / 64 <= mixed["return"].p <= 4 / 64
+
+
+def test_seeds_of_two_quantities_are_exchanged_together():
+    low, high = np.arange(4.0), np.arange(4.0) + 10
+    both = compare_seeds({"success": low, "return": low}, {"success": high, "return": high})
+    assert [difference.p for difference in both.values()] == pytest.approx([2 / 70, 2 / 70])
+    assert compare_seeds({"return": low}, {"return": high}, comparisons=2)["return"].smallest_p == pytest.approx(4 / 70)
+    assert find_least_seeds(1) == (4, pytest.approx(2 / 70))
+    assert find_least_seeds(2) == (5, pytest.approx(4 / 252))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [0.5, 0.9])
+def test_equal_policies_are_called_different_in_5_percent(rate):
+    rng = np.random.default_rng(7)
+    false_alarms = 0
+    for _ in range(2000):
+        success = (rng.random((2, 100)) < rate).astype(float)
+        returns = rng.normal(0.0, 1.0, (2, 100)) + rng.normal(0.0, 1.0, 100) + success
+        false_alarms += flip_signs(np.array([success[1] - success[0], returns[1] - returns[0]])).min() < ALPHA
+    assert 0.04 <= false_alarms / 2000 <= 0.06
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [5, 8])
+def test_equal_recipes_are_called_different_in_5_percent(seeds):
+    rng = np.random.default_rng(8)
+    false_alarms = 0
+    for _ in range(2000):
+        returns = rng.normal(0.0, 1.0, (2, seeds))
+        success = rng.binomial(100, 1 / (1 + np.exp(-returns - rng.normal(0.0, 0.5, (2, seeds))))) / 100
+        one, two = ([success[side], returns[side]] for side in (0, 1))
+        false_alarms += exchange_seeds(np.array(one), np.array(two)).min() < ALPHA
+    assert 0.04 <= false_alarms / 2000 <= 0.06
