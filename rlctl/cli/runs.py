@@ -80,6 +80,7 @@ def compare_runs(
     threshold: Annotated[
         float | None, typer.Option(help="Success rate (or return) to be reached soon; 0.9 where success is known.")
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Compare although the task has changed.")] = False,
     gate: Annotated[Literal["not-worse"] | None, typer.Option(help="Exit 1 if one is worse than the first.")] = None,
     json: Json = None,
 ) -> None:
@@ -90,7 +91,9 @@ def compare_runs(
     from rlctl.runs.comparison_report import show
 
     changes = parse_changes(settings)
-    result = compare(runs, EvalRequest(None, task=task, episodes=episodes, seed=seed, changes=changes), threshold)
+    result = compare(
+        runs, EvalRequest(None, task=task, episodes=episodes, seed=seed, changes=changes), threshold, force=force
+    )
     show(result, json)
     if gate:
         result.check()

@@ -85,8 +85,34 @@ def refuse_tuning(path: Path) -> None:
 def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> FoundPolicy:
     """Return the policy for a user's word, which may be a policy file itself.
 
-    A task's name stands for its newest run that has such a policy; with `pretrained` for the policy it ships.
+    A task's name stands for its newest run that has such a policy; with `pretrained` for the policy it ships. Where
+    the source of the task has changed since the training a note says so.
     """
+    policy = _find_policy(text, which, root)
+    change = None if policy.run is None else describe_source_change(policy.run)
+    if change is None:
+        return policy
+    return dataclasses.replace(policy, notes=(*policy.notes, f"warning: {change}; its score may be another now"))
+
+
+def describe_source_change(run: RunDirectory) -> str | None:
+    """Say that the file of a run's task is not what it was when the run began; None where it is, or is not known."""
+    try:
+        status = run.status()
+        task, digest = locate_task(str(status["task"]), run), status.get("source_sha256")
+    except ArtifactError:
+        return None
+    return _describe_source_change(task, digest, "the run began")
+
+
+def _describe_source_change(task: str, digest: object, since: str) -> str | None:
+    # The version of the distribution alone changes nothing.
+    before = {"origin": registry.find_origin(task), "source_sha256": digest}
+    changes = describe_task_changes(before, task, since) if digest is not None else []
+    return changes[0] if changes else None
+
+
+def _find_policy(text: str | None, which: str, root: Path) -> FoundPolicy:
     if which == PRETRAINED:
         return _find_shipped(text)
     if text is not None and Path(text).suffix in (".safetensors", ".onnx"):
@@ -114,10 +140,9 @@ def _find_shipped(task: str | None) -> FoundPolicy:
     info = read_info(file)
     notes = [f"shipped policy {file}: step {info.training_steps:,}"]
     if info.provenance is not None:
-        # The version of the distribution alone changes nothing.
-        before = {"origin": registry.find_origin(info.spec.task), "source_sha256": info.provenance.source_sha256}
-        changes = describe_task_changes(before, info.spec.task, "this policy was exported")
-        notes += [f"warning: {each}; its score may be another now" for each in changes]
+        digest = info.provenance.source_sha256
+        if change := _describe_source_change(info.spec.task, digest, "this policy was exported"):
+            notes.append(f"warning: {change}; its score may be another now")
     return FoundPolicy(file, None, tuple(notes))
 
 

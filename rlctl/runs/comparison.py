@@ -20,7 +20,7 @@ from rlctl.evaluation.evaluate import EvalRequest, Evaluation, run_evaluation
 from rlctl.recipe.recipe import find_difference, find_mixed
 from rlctl.run.directory import RunDirectory, is_group
 from rlctl.run.group import find_group, read_group
-from rlctl.run.lookup import find_run
+from rlctl.run.lookup import describe_source_change, find_run
 from rlctl.runs.significance import Difference, Quantity, Verdict, compare_episodes, compare_seeds
 from rlctl.runs.summary import read_table, summarize
 
@@ -110,20 +110,26 @@ class Comparison:
             raise AnswerIsNo(f"gate missed: {', '.join(worse)} worse than {self.baseline.name}")
 
 
-def compare(texts: Sequence[str], request: EvalRequest, threshold: float | None = None) -> Comparison:
+def compare(
+    texts: Sequence[str], request: EvalRequest, threshold: float | None = None, *, force: bool = False
+) -> Comparison:
     """Evaluate every run as `request` says, without its `run`, and compare each side with the first.
 
     `texts` are runs, groups, globs, or folders of runs; the first is the baseline. `threshold` is a success rate, or a
-    return where a task has no success, whose first evaluation is looked for.
+    return where a task has no success, whose first evaluation is looked for. `force` compares although the task has
+    changed since a training.
 
     Raises `UsageError` for less than two sides, a run compared with itself, runs of different tasks without `task`,
-    and groups beside single runs; `ArtifactError` for runs that are missing, damaged or without a policy.
+    a task that has changed, and groups beside single runs; `ArtifactError` for runs that are missing, damaged or
+    without a policy.
     """
     if len(texts) < 2:
         raise UsageError("give two or more to compare, the baseline first: rlctl runs compare A B")
     groups = [find_runs_of(text) for text in texts]
     _refuse_unequal(texts, groups)
     task = _common_task([run for group in groups for run in group], request.task)
+    if request.task is None and not force:
+        _refuse_changed([run for group in groups for run in group])
     recipes = [[run.recipe() for run in group] for group in groups]
     first = _evaluate(groups[0][0], request, threshold)
     # All in the same world: a tolerance that is easier to keep makes no policy better.
@@ -195,6 +201,15 @@ def _common_task(runs: list[RunDirectory], task: str | None) -> str:
     if len(tasks) > 1:
         raise UsageError(f"these runs are of different tasks ({', '.join(tasks)}); --task TASK evaluates all on one")
     return tasks[0]
+
+
+def _refuse_changed(runs: list[RunDirectory]) -> None:
+    for run in runs:
+        if change := describe_source_change(run):
+            raise UsageError(
+                f"{run.path}: {change}\nwhat this run learned was another task, so no comparison is fair; "
+                "--force compares anyway"
+            )
 
 
 def _evaluate(run: RunDirectory, request: EvalRequest, threshold: float | None) -> EvaluatedRun:

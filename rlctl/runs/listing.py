@@ -10,7 +10,8 @@ from typing import Any
 from rlctl import output
 from rlctl.environments import registry
 from rlctl.errors import UsageError, did_you_mean, short_repr
-from rlctl.run.directory import ROOT
+from rlctl.run.directory import ROOT, RunDirectory
+from rlctl.run.lookup import describe_source_change
 from rlctl.runs.summary import RunSummary, find_runs, summarize
 
 _SORT_KEYS = {
@@ -53,6 +54,23 @@ def show(runs: list[RunSummary], json: str | None) -> None:
         out.print(f"no runs yet under {ROOT.resolve()}; train one: rlctl train reach")
         return
     output.print_table(_COLUMNS, map(_cells, runs), left=_LEFT)
+    for change, names in _find_source_changes(runs).items():
+        out.print(f"warning: {change}, in: {', '.join(names)}")
+
+
+def _find_source_changes(runs: list[RunSummary]) -> dict[str, list[str]]:
+    """Return the names of the runs whose task has changed since they began, by what has changed."""
+    changes: dict[str, list[str]] = {}
+    known: dict[tuple[str, str, str], str | None] = {}
+    for run in runs:
+        if run.state == "damaged" or not run.source_sha256:
+            continue
+        key = (run.task, run.folder, run.source_sha256)
+        if key not in known:
+            known[key] = describe_source_change(RunDirectory(run.path))
+        if (change := known[key]) is not None:
+            changes.setdefault(change, []).append(run.name)
+    return changes
 
 
 def _cells(run: RunSummary) -> list[Any]:

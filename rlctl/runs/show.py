@@ -14,6 +14,7 @@ from rlctl.errors import ArtifactError
 from rlctl.recipe.stages import format_value
 from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
+from rlctl.run.lookup import describe_source_change
 from rlctl.run.robustness import Robustness
 from rlctl.runs.diagnosis import diagnose, format_finding
 from rlctl.runs.diagnosis.history import History
@@ -32,6 +33,8 @@ class RunDescription(History):
         """Read a run; raises `ArtifactError` if its `run.json` is damaged."""
         super().__init__(run)
         self.warnings = list(_list_warnings(run.status()))
+        if change := describe_source_change(run):
+            self.warnings.append(f"{change}: what it learned was another task")
         self.summary = summarize(run.path)
         self.findings = diagnose(self)
         self.robustness: Robustness | None = None

@@ -120,7 +120,7 @@ def flip_signs(differences: Array) -> Array:
     scale = np.sqrt((moving**2).sum(axis=1, keepdims=True))
     scaled = np.divide(moving, scale, out=np.zeros_like(moving), where=scale > 0)
     if exact := 2**episodes <= _RESAMPLES:
-        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=episodes))).reshape(-1, episodes)
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=episodes))).reshape(2**episodes, episodes)
     else:
         signs = 2.0 * _rng().integers(2, size=(_RESAMPLES, episodes), dtype=np.int8) - 1.0
     return _step_down(np.abs(scaled.sum(axis=1)), np.abs(signs @ scaled.T), exact)

@@ -42,6 +42,10 @@ class RunSummary:
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Recipe keys, dotted, that differ from the task's own recipe, and their values."""
     versions: dict[str, str] = dataclasses.field(default_factory=dict)
+    folder: str = ""
+    """Where it was trained: a task named by a path is found from there."""
+    source_sha256: str = ""
+    """Of the task's file when the training began."""
 
     @property
     def name(self) -> str:
@@ -118,6 +122,8 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
         best_return=best["return"] if best else None,
         changes=dict(status.get("recipe_changes") or {}),
         versions=dict(status.get("versions") or {}),
+        folder=str(status.get("folder") or ""),
+        source_sha256=str(status.get("source_sha256") or ""),
     )
 
 
