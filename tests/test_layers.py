@@ -33,7 +33,6 @@ LAYERS = [
     {"task"},
     {"output"},
     {"storage"},
-    {"joints"},
     {"errors", "version"},
 ]
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}

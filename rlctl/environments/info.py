@@ -14,7 +14,7 @@ from gymnasium import spaces
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.spec import LARGEST_SPACE
 from rlctl.errors import ArtifactError, UsageError, short_repr
-from rlctl.joints import Joints
+from rlctl.task.joints import Joints
 
 _ONE_HOT = 10
 """How many elements of a Box an alternative of a discrete space counts for."""

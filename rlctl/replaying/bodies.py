@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rlctl.replaying.curves import Timelines
-from rlctl.replaying.mjcf import Shape
+from rlctl.replaying.mjcf import Shape, ShapeKind
 from rlctl.replaying.scene import BodyMotion, Scene, Warn
-from rlctl.task.bullet import pybullet
 
 _MARKER_COLORS = [(40, 200, 90), (70, 150, 255), (240, 120, 200), (250, 180, 40)]
 _HALO_RADIUS = 0.09  # [m]
@@ -157,20 +156,20 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]
 
 
 def _pose(shape: Shape) -> rr.Transform3D:
-    scale = shape.size if shape.kind == pybullet.GEOM_MESH else None
+    scale = shape.size if shape.kind == ShapeKind.MESH else None
     return rr.Transform3D(translation=shape.position, quaternion=rr.Quaternion(xyzw=shape.orientation), scale=scale)
 
 
 def _archetype(shape: Shape) -> rr.AsComponents | None:
     color = [round(255 * channel) for channel in shape.color]
     solid = rr.components.FillMode.Solid
-    if shape.kind == pybullet.GEOM_BOX:
+    if shape.kind == ShapeKind.BOX:
         return rr.Boxes3D(half_sizes=[[extent / 2 for extent in shape.size]], colors=[color], fill_mode=solid)
-    if shape.kind == pybullet.GEOM_SPHERE:
+    if shape.kind == ShapeKind.SPHERE:
         return rr.Ellipsoids3D(half_sizes=[[shape.size[0]] * 3], colors=[color], fill_mode=solid)
-    if shape.kind == pybullet.GEOM_CYLINDER:
+    if shape.kind == ShapeKind.CYLINDER:
         return rr.Cylinders3D(lengths=shape.size[0], radii=shape.size[1], colors=[color], fill_mode=solid)
-    if shape.kind == pybullet.GEOM_CAPSULE:
+    if shape.kind == ShapeKind.CAPSULE:
         length, radius = shape.size[:2]
         # Rerun's capsules start at the centre of one end; PyBullet's are centred.
         half = [[0.0, 0.0, -length / 2]]

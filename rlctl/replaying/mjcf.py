@@ -8,6 +8,7 @@ what was simulated: `axisangle` is in radians whatever the compiler says, `euler
 from __future__ import annotations
 
 import dataclasses
+import enum
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree
@@ -15,16 +16,25 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rlctl.task.bullet import pybullet
+
+class ShapeKind(enum.Enum):
+    """What a shape is; `OTHER` is known to be there and not drawn."""
+
+    SPHERE = "sphere"
+    CAPSULE = "capsule"
+    CYLINDER = "cylinder"
+    BOX = "box"
+    PLANE = "plane"
+    MESH = "mesh"
+    OTHER = "other"
 
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """One visual shape, as PyBullet has it: a kind, sizes [m], a pose in the frame of its link, a colour."""
+    """One visual shape of a link: a kind, sizes [m], a pose in the frame of its link, a colour."""
 
     link: str
-    kind: int
-    """`pybullet.GEOM_*`."""
+    kind: ShapeKind
     size: tuple[float, ...]
     """Box: full extents; sphere: radius; cylinder and capsule: length and radius; mesh: scale per axis."""
     mesh: Path | None
@@ -34,13 +44,7 @@ class Shape:
     """RGBA in [0, 1]."""
 
 
-_KINDS = {
-    "sphere": pybullet.GEOM_SPHERE,
-    "capsule": pybullet.GEOM_CAPSULE,
-    "cylinder": pybullet.GEOM_CYLINDER,
-    "box": pybullet.GEOM_BOX,
-    "plane": pybullet.GEOM_PLANE,
-}
+_KINDS = {kind.value: kind for kind in ShapeKind if kind not in (ShapeKind.MESH, ShapeKind.OTHER)}
 _COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, RGBA
 _OUTERMOST = "main"  # what MJCF calls the class of all geoms that name none
 _Defaults = Mapping[str, Mapping[str, str]]  # attributes of geoms, by class
@@ -82,16 +86,16 @@ def _of_body(body: ElementTree.Element, defaults: _Defaults, around: str) -> Ite
 
 
 def _shape(link: str, geom: Mapping[str, str]) -> Shape:
-    kind = _KINDS.get(geom.get("type", "sphere"), pybullet.GEOM_MESH)  # a mesh without a file: not drawn
+    kind = _KINDS.get(geom.get("type", "sphere"), ShapeKind.MESH)  # a mesh without a file: not drawn
     size, ends = _numbers(geom, "size"), _numbers(geom, "fromto")
     position, orientation, length = _numbers(geom, "pos") or (0.0, 0.0, 0.0), _orientation(geom), 0.0
-    if ends and kind in (pybullet.GEOM_CAPSULE, pybullet.GEOM_CYLINDER):
+    if ends and kind in (ShapeKind.CAPSULE, ShapeKind.CYLINDER):
         position, orientation, length = _between(np.array(ends[:3]), np.array(ends[3:]))
     elif len(size) > 1:
         length = 2 * size[1]
-    if kind == pybullet.GEOM_BOX:
+    if kind == ShapeKind.BOX:
         size = tuple(2 * half for half in size)
-    elif kind in (pybullet.GEOM_CAPSULE, pybullet.GEOM_CYLINDER):
+    elif kind in (ShapeKind.CAPSULE, ShapeKind.CYLINDER):
         size = (length, size[0])
     return Shape(link, kind, size, None, position, orientation, _numbers(geom, "rgba") or _COLOR)
 

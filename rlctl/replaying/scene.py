@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, describe_exception
-from rlctl.replaying.mjcf import Shape, read_shapes
+from rlctl.replaying.mjcf import Shape, ShapeKind, read_shapes
 from rlctl.task.body import Body
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
@@ -200,11 +200,13 @@ class _BodyReader:
                 return read_shapes(self.body.file)
             except ValueError:  # PyBullet's reader accepts more; the user is warned that nothing is drawn
                 return []
+        kinds = {getattr(pybullet, f"GEOM_{kind.name}", -1): kind for kind in ShapeKind}
         shapes = []
         for data in pybullet.getVisualShapeData(self.body.id, physicsClientId=self.client):
             _, link, kind, size, mesh, position, orientation, color = data[:8]
             file = Path(mesh.decode()) if mesh else None
-            shapes.append(Shape(self.links[link + 1], kind, tuple(size), file, position, orientation, color))
+            known = kinds.get(kind, ShapeKind.OTHER)
+            shapes.append(Shape(self.links[link + 1], known, tuple(size), file, position, orientation, color))
         return shapes
 
 

@@ -1,26 +1,59 @@
-"""Imports PyBullet without the line it prints to stderr, and reads what it prints of an error."""
+"""Imports PyBullet where a world is built, and reads what it prints of an error."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib
 import os
 import re
+import sys
 import tempfile
 from collections.abc import Callable
+from types import ModuleType
+from typing import Any
 
-_stderr = os.dup(2)
-_devnull = os.open(os.devnull, os.O_WRONLY)
-os.dup2(_devnull, 2)
-try:
-    import pybullet
-    import pybullet_data
-finally:
-    os.dup2(_stderr, 2)
-    os.close(_stderr)
-    os.close(_devnull)
+from rlctl.errors import UsageError
 
-__all__ = ["pybullet", "pybullet_data", "read_complaint"]
+_INSTALL = (
+    "pip install setuptools && pip install --no-build-isolation" if sys.version_info >= (3, 12) else "pip install"
+)
+
+
+class _LazyModule:
+    """Imports its module on first use; from then on it shares the module's namespace, so that calls cost the same."""
+
+    __slots__ = ("__dict__", "_name")
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, attribute: str) -> Any:
+        if attribute.startswith("__"):  # inspection is no use
+            raise AttributeError(attribute)
+        module = _import_silently(self._name)
+        self.__dict__ = vars(module)
+        return getattr(module, attribute)
+
+
+def _import_silently(name: str) -> ModuleType:
+    """Import a module without the line that PyBullet prints to stderr; raises `UsageError` where it is missing."""
+    stderr, devnull = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(devnull, 2)
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise UsageError(f"tasks of rlctl need PyBullet, which is not installed: {_INSTALL} pybullet") from None
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(devnull)
+
+
+pybullet: Any = _LazyModule("pybullet")
+pybullet_data: Any = _LazyModule("pybullet_data")
 
 
 def read_complaint(call: Callable[[], object]) -> str:

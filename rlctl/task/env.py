@@ -13,9 +13,9 @@ import numpy as np
 from gymnasium import spaces
 
 from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean, short_repr
-from rlctl.joints import Joints
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals
+from rlctl.task.joints import Joints
 from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_methods, check_parameters

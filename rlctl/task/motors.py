@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
-from rlctl.joints import Joints
 from rlctl.task.bullet import pybullet
+from rlctl.task.joints import Joints
 from rlctl.task.properties import Properties
 
 Array = NDArray[np.float64]

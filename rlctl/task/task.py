@@ -12,8 +12,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
-from rlctl.joints import Joints
 from rlctl.task.events import Event
+from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
 
 

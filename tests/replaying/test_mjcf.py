@@ -9,7 +9,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.bodies import shape_centers
-from rlctl.replaying.mjcf import Shape, read_shapes
+from rlctl.replaying.mjcf import Shape, ShapeKind, read_shapes
 from rlctl.replaying.recorder import make_drawable, play_episode
 from rlctl.replaying.rrd import write_rrd
 from rlctl.replaying.scene import BodyMotion, SceneReader
@@ -29,7 +29,7 @@ def turn(quaternion, vector):
 
 def ends(shape: Shape, position, orientation):
     """Return the ends of a capsule's axis in the world [m], or twice the middle of a sphere, and the radius [m]."""
-    half, radius = (shape.size[0] / 2, shape.size[1]) if shape.kind == pybullet.GEOM_CAPSULE else (0, shape.size[0])
+    half, radius = (shape.size[0] / 2, shape.size[1]) if shape.kind == ShapeKind.CAPSULE else (0, shape.size[0])
     middle = position + turn(orientation, shape.position)
     along = half * turn(orientation, turn(shape.orientation, (0, 0, 1)))
     return middle - along, middle + along, radius
@@ -106,7 +106,7 @@ def test_thin_capsules_are_where_pybullet_has_them():
             boxes = []
             for shape in (shape for shape in robot.shapes if shape.link == link):
                 low, high, radius = ends(shape, robot.positions[0, index], robot.orientations[0, index])
-                radius += MARGIN if shape.kind == pybullet.GEOM_CAPSULE else 0.0
+                radius += MARGIN if shape.kind == ShapeKind.CAPSULE else 0.0
                 boxes.append((np.minimum(low, high) - radius, np.maximum(low, high) + radius))
             lowest, highest = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
             theirs = pybullet.getAABB(sim.body("robot").id, index - 1, physicsClientId=sim.client)
@@ -243,8 +243,8 @@ def test_geoms_of_every_kind(tmp_path):
     # Straight down: half a turn, and its middle a metre below.
     assert (cylinder.size, cylinder.position, cylinder.color) == ((2, 0.1), (0, 0, -1), (1, 0, 0, 1))
     assert turn(cylinder.orientation, (0, 0, 1)) == pytest.approx([0, 0, -1])
-    assert (ball.kind, ball.size) == (pybullet.GEOM_SPHERE, (0.1,))
-    assert (other.kind, other.mesh) == (pybullet.GEOM_MESH, None)  # PyBullet knows no ellipsoids
+    assert (ball.kind, ball.size) == (ShapeKind.SPHERE, (0.1,))
+    assert (other.kind, other.mesh) == (ShapeKind.MESH, None)  # PyBullet knows no ellipsoids
 
 
 def test_shapes_turn_with_their_link():
@@ -259,7 +259,7 @@ def test_shapes_turn_with_their_link():
         links=["trunk"],
         positions=np.array([[[1.0, 2.0, 3.0]]]),
         orientations=np.array([[[0.0, 0.0, 0.5**0.5, 0.5**0.5]]]),  # a quarter turn about z
-        shapes=[Shape("trunk", pybullet.GEOM_SPHERE, (0.1,), None, (0.5, 0.0, 0.0), (0, 0, 0, 1), (1, 1, 1, 1))],
+        shapes=[Shape("trunk", ShapeKind.SPHERE, (0.1,), None, (0.5, 0.0, 0.0), (0, 0, 0, 1), (1, 1, 1, 1))],
         trunk=0,
         box=(np.zeros(3), np.ones(3)),
     )

@@ -7,10 +7,10 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.joints import Joints
 from rlctl.task import Box, Task
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import scale_mass
+from rlctl.task.joints import Joints
 
 
 class Whole(Task):

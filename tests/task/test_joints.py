@@ -9,8 +9,8 @@ from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.exporting.actor import metadata
-from rlctl.joints import Joints
 from rlctl.policy.policy import PolicyInfo
+from rlctl.task.joints import Joints
 
 
 def describe_task(task):
