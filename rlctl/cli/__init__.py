@@ -11,8 +11,9 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli import check_env, error_boundary, eval, export, identify, replay, runs, serve, tasks, train, tune
+from rlctl.cli import check_env, eval, export, identify, replay, runs, serve, tasks, train, tune
 from rlctl.errors import RlctlError
+from rlctl.processes import error_boundary
 from rlctl.version import __version__
 
 

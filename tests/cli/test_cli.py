@@ -273,7 +273,7 @@ def test_a_bug_shows_its_traceback(rlctl, tmp_path):
 
 def test_an_exit_handler_that_hangs_does_not_keep_the_process(tmp_path):
     code = (
-        "import atexit, sys, time; from rlctl import cli; from rlctl.cli import error_boundary\n"
+        "import atexit, sys, time; from rlctl import cli; from rlctl.processes import error_boundary\n"
         "error_boundary.EXIT_S = 0.2\n"
         "atexit.register(time.sleep, 100); sys.argv[1:] = ['reech']; cli.main()"
     )

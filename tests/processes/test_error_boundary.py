@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from rlctl import output
-from rlctl.cli import error_boundary
+from rlctl.processes import error_boundary
 
 RLCTL = f"{sys.executable} -m rlctl"
 
