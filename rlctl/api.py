@@ -29,7 +29,8 @@ def train(
     over `config`, a recipe file. `initial_policy` is a run, a policy file or a task's name, as `--from` takes it. Call
     it from a script's `if __name__ == "__main__":`, which processes may import. Raises what `rlctl.errors` has.
     """
-    from rlctl.training.request import TrainRequest, run_training
+    from rlctl.run.train_request import TrainRequest
+    from rlctl.training.request import run_training
 
     request = TrainRequest(
         task=task,

@@ -33,7 +33,7 @@ LAYERS = [
     {"task"},
     {"output"},
     {"storage"},
-    {"errors", "version"},
+    {"errors", "options", "version"},
 ]
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 MAY_IMPORT_TORCH = {  # besides training/

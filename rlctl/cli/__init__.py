@@ -12,7 +12,6 @@ from typing import Annotated
 import typer
 
 from rlctl.cli import check_env, eval, export, identify, replay, runs, serve, tasks, train, tune
-from rlctl.errors import RlctlError
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
 
@@ -31,7 +30,6 @@ def _root(
     pass
 
 
-_INTERRUPTED = 130
 COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "check-env": check_env.check_env,
     "train": train.train,
@@ -80,27 +78,17 @@ def main() -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line; return the exit code: the one error boundary."""
+    """Run a command line; return the exit code."""
+    return error_boundary.run(lambda: _call(arguments))
+
+
+def _call(arguments: list[str]) -> int:
+    # Typer reads the options of every command it is given, which takes longer than most commands need to begin.
+    app = build_app(arguments[:1] if arguments and arguments[0] in COMMANDS else COMMANDS)
     try:
-        # Typer reads the options of every command it is given, which takes longer than most commands need to begin.
-        app = build_app(arguments[:1] if arguments and arguments[0] in COMMANDS else COMMANDS)
         code = app(arguments, standalone_mode=False)
-        if code == _INTERRUPTED:
-            raise KeyboardInterrupt  # which Typer has caught
-        error_boundary.flush()
-        return code if isinstance(code, int) else 0
-    except RlctlError as error:
-        return error_boundary.report(error)
-    except (KeyboardInterrupt, typer.Abort):  # Abort: at a question
-        print("interrupted", file=sys.stderr)
-        return _INTERRUPTED
-    except BrokenPipeError:
-        error_boundary.close_stdout()
-        return 141
-    except SystemExit as end:
-        if isinstance(end.__context__, BrokenPipeError):  # what Typer and Rich make of it
-            error_boundary.close_stdout()
-            return 141
-        raise
-    except Exception as error:
-        return error_boundary.report_unexpected(error)
+    except typer.Abort:  # at a question
+        raise KeyboardInterrupt from None
+    if code == error_boundary.INTERRUPTED:
+        raise KeyboardInterrupt  # which Typer has caught
+    return code if isinstance(code, int) else 0

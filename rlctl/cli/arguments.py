@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+import dataclasses
+import inspect
+import typing
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rlctl.cli import completion
+from rlctl.options import TASK_FORMS as TASK_FORMS
+from rlctl.options import Argument, Option
 
 if TYPE_CHECKING:
     from rlctl.environments.spec import EnvChanges
 
-TASK_FORMS = "Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id."
 OptionalTask = Annotated[
     str | None, typer.Argument(metavar="TASK", help=TASK_FORMS, autocompletion=completion.complete_task)
 ]
@@ -27,17 +31,6 @@ Run = Annotated[
 Set = Annotated[
     list[str], typer.Option("--set", metavar="KEY=VALUE", help="Set a key, e.g. task.tolerance=0.02, randomize=true.")
 ]
-Config = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Recipe that goes over the task's own, or presets/NAME.")
-]
-Algo = Annotated[
-    str | None,
-    typer.Option(
-        help="ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.",
-        autocompletion=completion.complete_algorithm,
-    ),
-]
-RunsFolder = Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where run folders go.")]
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE", help="Write JSON too; - for stdout, alone.")]
 EpisodeSeed = Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)]
 EnvTimeout = Annotated[float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1)]
@@ -45,6 +38,89 @@ NEnvs = Annotated[int | None, typer.Option(help="Environments stepped side by si
 Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]
 
 Pretrained = Annotated[bool, typer.Option("--pretrained", help="The policy that ships with the task.")]
+
+_COMPLETIONS = {
+    "task": completion.complete_task,
+    "run": completion.complete_run,
+    "algorithm": completion.complete_algorithm,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class RecipeFlags:
+    """Keys of a recipe that are given on the command line; those with a flag of their own go over `--set`."""
+
+    settings: Annotated[
+        list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
+    ] = dataclasses.field(default_factory=list)
+    algo: Annotated[
+        str | None, Option("ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.", completes="algorithm")
+    ] = None
+    seed: Annotated[int | None, Option("Seed of everything random.")] = None
+    total_timesteps: Annotated[
+        str | None, Option("Environment steps; 1e6 is fine.", ("--total-timesteps", "-n"), metavar="STEPS")
+    ] = None
+    n_envs: Annotated[int | None, Option("Environments stepped side by side.", min=1)] = None
+
+    def merge(self) -> dict[str, Any]:
+        """Return all keys and values, nested as in a recipe."""
+        from rlctl.recipe.sources import merge_flags
+
+        return merge_flags(**vars(self))
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a function for Typer: each parameter that is a dataclass is replaced by its fields that are options."""
+    parameters, requests = [], {}
+    for parameter in inspect.signature(function, eval_str=True).parameters.values():
+        if not dataclasses.is_dataclass(parameter.annotation):
+            parameters.append(_make_parameter(parameter.name, parameter.annotation, parameter.default))
+            continue
+        request: Any = parameter.annotation
+        hints = typing.get_type_hints(request, include_extras=True)
+        fields = [field for field in dataclasses.fields(request) if _find_option(hints[field.name])]
+        parameters += [_make_parameter(field.name, hints[field.name], _find_default(field)) for field in fields]
+        requests[parameter.name] = (request, [field.name for field in fields])
+
+    def run(**values: Any) -> None:
+        for name, (request, fields) in requests.items():
+            values[name] = request(**{field: values.pop(field) for field in fields})
+        return function(**values)
+
+    run.__name__, run.__doc__ = function.__name__, function.__doc__
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+def _find_option(annotation: Any) -> Option | None:
+    return next((data for data in getattr(annotation, "__metadata__", ()) if isinstance(data, Option)), None)
+
+
+def _find_default(field: dataclasses.Field[Any]) -> Any:
+    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+
+
+def _make_parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+    if (option := _find_option(annotation)) is not None:
+        kind = annotation.__origin__
+        annotation = Annotated[kind, _make_typer_option(option, shows_default=kind is not bool)]
+    default = inspect.Parameter.empty if default is dataclasses.MISSING else default
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _make_typer_option(option: Option, *, shows_default: bool) -> Any:
+    """Return what Typer has for an option or argument of a request."""
+    make = typer.Argument if isinstance(option, Argument) else typer.Option
+    return make(
+        *option.flags,
+        help=option.help,
+        metavar=option.metavar,
+        min=option.min,
+        max=option.max,
+        autocompletion=None if option.completes is None else _COMPLETIONS[option.completes],
+        show_default=option.default_text or shows_default,
+    )
 
 
 def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:

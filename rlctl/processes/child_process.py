@@ -55,11 +55,11 @@ def set_start(start: StartProcess) -> None:
 class ChildProcess:
     """A process that runs `main(connection, **arguments)` of a module; `close` kills it and all that it has started.
 
-    It also ends, with its group, when its parent does; numeric libraries get one thread. Raises `OSError` if it cannot
-    be started.
+    It also ends, with its group, when its parent does; numeric libraries get one thread, except without `one_thread`.
+    Raises `OSError` if it cannot be started.
     """
 
-    def __init__(self, main: str, arguments: Mapping[str, Any], **options: Any) -> None:
+    def __init__(self, main: str, arguments: Mapping[str, Any], *, one_thread: bool = True, **options: Any) -> None:
         """`main` is "package.module:function"; `arguments` are what JSON can hold; `options` are those of
         `subprocess.Popen`, of which `pass_fds` and `env` are added to what every child gets.
         """
@@ -74,7 +74,7 @@ class ChildProcess:
             "lifeline": lifeline,
         }
         options["pass_fds"] = (theirs.fileno(), lifeline, *options.get("pass_fds", ()))
-        options["env"] = {**os.environ, **_ONE_THREAD, **options.get("env", {})}
+        options["env"] = {**os.environ, **(_ONE_THREAD if one_thread else {}), **options.get("env", {})}
         try:
             with theirs, open(lifeline, "rb"), _block_signals():
                 self.process = start_process(

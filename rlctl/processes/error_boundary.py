@@ -5,13 +5,39 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections.abc import Callable
 
 from rlctl.errors import RlctlError, short_repr
 from rlctl.version import __version__
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
 EXIT_S = 10.0
 """How long exit handlers may take [s]."""
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "can't allocate memory", "not enough memory")
+
+
+def run(main: Callable[[], int]) -> int:
+    """Return the exit code that `main` returns, or that of the exception that ends it, which is printed."""
+    try:
+        code = main()
+        flush()
+        return code
+    except RlctlError as error:
+        return report(error)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        close_stdout()
+        return 141
+    except SystemExit as end:
+        if isinstance(end.__context__, BrokenPipeError):  # what Typer and Rich make of it
+            close_stdout()
+            return 141
+        raise
+    except Exception as error:
+        return report_unexpected(error)
 
 
 def prepare_streams() -> None:

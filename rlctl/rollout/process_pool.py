@@ -6,6 +6,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable
 from multiprocessing.connection import wait
+from typing import Any
 
 from rlctl.processes.child_process import MAX_LINE_BYTES, ChildProcess, LineFilter, LineReader
 from rlctl.rollout import messages
@@ -39,7 +40,7 @@ class ProcessPool:
         try:
             for job in jobs:
                 printing, passed = self._output.descriptor, (job.memory, job.numbers)
-                options = {"stdout": printing, "stderr": printing, "pass_fds": passed}
+                options: dict[str, Any] = {"stdout": printing, "stderr": printing, "pass_fds": passed}
                 self._processes.append(
                     ChildProcess("rlctl.rollout.worker:main", {"job": dataclasses.asdict(job)}, **options)
                 )

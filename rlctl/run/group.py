@@ -10,8 +10,13 @@ from typing import Any
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, create_group_folder, is_group
 from rlctl.run.lookup import find_run, refuse_tuning
+from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 
+VERSION = 2
+"""Of the format of `group.json`."""
+_PLACES = {"root", "resume"}
+"""What is not stored of a request: a group's runs are in its folder, whatever its file says."""
 _MOST_SEEDS = 1000
 _RANGE = re.compile(r"(\d{1,9})-(\d{1,9})")
 
@@ -21,10 +26,14 @@ class Group:
     """The folder of a group and what its `group.json` says."""
 
     path: Path
-    task: str
     seeds: list[int]
-    options: list[str]
-    """Of `rlctl train`, for every seed."""
+    request: TrainRequest
+    """What every seed trains; the seed is set for each."""
+
+    @property
+    def task(self) -> str:
+        """The task that is trained."""
+        return self.request.task or ""
 
     @property
     def scores_file(self) -> Path:
@@ -72,11 +81,12 @@ def parse_seeds(text: str) -> list[int]:
     return seeds
 
 
-def create_group(task: str, seeds: list[int], options: list[str], root: Path) -> Group:
-    """Make a new group folder, `<root>/<task>/<time>_seeds`."""
-    folder = create_group_folder(task, "seeds", root)
-    files.write_json(folder / GROUP_FILE, {"task": task, "seeds": seeds, "options": options})
-    return Group(folder, task, seeds, options)
+def create_group(request: TrainRequest, seeds: list[int]) -> Group:
+    """Make a new group folder, `<root>/<task>/<time>_seeds`, for the task of a request."""
+    folder = create_group_folder(request.task or "", "seeds", request.root)
+    content = {key: value for key, value in request.to_json().items() if key not in _PLACES}
+    files.write_json(folder / GROUP_FILE, {"version": VERSION, "seeds": seeds, "request": content})
+    return Group(folder, seeds, dataclasses.replace(request, root=folder))
 
 
 def find_group(text: str, root: Path = ROOT) -> Path | None:
@@ -92,11 +102,19 @@ def read_group(path: Path) -> Group:
     refuse_tuning(path)
     if not is_group(path):
         raise ArtifactError(f"{path}: not a group of runs: it has no {GROUP_FILE}")
-    content: Any = files.read_json(path / GROUP_FILE)
+    file = path / GROUP_FILE
+    content: Any = files.read_json(file)
+    if isinstance(content, dict) and content.get("version") != VERSION:
+        raise ArtifactError(
+            f"{file}: of another version of rlctl, which cannot be resumed as a group; its runs can, one by one"
+        )
     try:
-        task, seeds, options = content["task"], content["seeds"], content["options"]
-        if not isinstance(task, str) or not all(isinstance(each, int) for each in seeds):
-            raise TypeError
-        return Group(path, task, list(seeds), [str(each) for each in options])
-    except (KeyError, TypeError):
-        raise ArtifactError(f"{path / GROUP_FILE}: damaged: it does not name a task, seeds and options") from None
+        if content["request"].keys() & _PLACES:
+            raise ValueError
+        seeds = content["seeds"]
+        request = TrainRequest.from_json({**content["request"], "root": str(path)})
+        if request.task is None or not all(type(seed) is int and seed >= 0 for seed in seeds):
+            raise ValueError
+        return Group(path, list(seeds), request)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise ArtifactError(f"{file}: damaged: it does not hold seeds and the request of a training") from None

@@ -9,14 +9,13 @@ from pathlib import Path
 from rlctl.errors import TaskError
 from rlctl.recipe.recipe import Recipe
 from rlctl.run.directory import RunDirectory
+from rlctl.run.train_request import TrainRequest
 from rlctl.training import status
 from rlctl.training.display import make_display
 from rlctl.training.prepare import prepare
 from rlctl.training.progress import Progress
 from rlctl.training.signals import StopSignals
-from rlctl.training.start import Start, TrainRequest, find_start
-
-__all__ = ["TrainRequest", "TrainResult", "run_training"]
+from rlctl.training.start import Start, find_start
 
 
 @dataclasses.dataclass(frozen=True)

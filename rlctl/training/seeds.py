@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from rlctl import output
@@ -18,8 +17,8 @@ from rlctl.evaluation.group import GroupScore, as_json, evaluate_group
 from rlctl.recipe.sources import resolve
 from rlctl.rollout.workers import available_cores
 from rlctl.run.group import Group, create_group, parse_seeds, read_group
+from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
-from rlctl.training.request import TrainRequest
 from rlctl.training.start import check_arguments, preserve_process_state
 from rlctl.training.trainings import CORES_PER_TRAINING, Trainings, choose_jobs
 from rlctl.training.warm_start import find_source
@@ -63,19 +62,18 @@ def train_seeds(
     when all have saved their checkpoints.
     """
     if seeds is not None:
-        group, options = _begin(request, seeds), []
+        group, resume = _begin(request, seeds), TrainRequest()
     else:
         check_arguments(request)
-        group, options = read_group(Path(str(request.resume))), list_options(request)
-    waiting = [seed for seed in group.seeds if not group.is_done(seed) or options]
-    jobs = _choose_jobs(group, len(waiting), jobs)
-    trainings = Trainings(jobs)
+        group, resume = read_group(Path(str(request.resume))), request
+    requests = {seed: _make_request(group, seed, resume) for seed in group.seeds if _is_waiting(group, seed, resume)}
+    trainings = Trainings(_choose_jobs(group, len(requests), jobs))
     calls = [
-        functools.partial(trainings.train, _make_command(group, seed, options), functools.partial(_print_line, seed))
-        for seed in waiting
+        functools.partial(trainings.train, request_of_seed, functools.partial(_print_line, seed))
+        for seed, request_of_seed in requests.items()
     ]
     codes = trainings.run(calls, f"rlctl train --resume {shlex.quote(str(group.path))}")
-    failed = {seed: code for seed, code in zip(waiting, codes, strict=True) if code}
+    failed = {seed: code for seed, code in zip(requests, codes, strict=True) if code}
     score = evaluate_group(group, EvalRequest(None, episodes=episodes))
     files.write_json(group.scores_file, as_json(score))
     return SeedsResult(score, failed)
@@ -94,23 +92,7 @@ def _begin(request: TrainRequest, seeds: str) -> Group:
     recipe = resolve(request.task, request.config, request.settings)
     if request.initial_policy is not None:
         find_source(request.initial_policy, recipe)
-    return create_group(request.task, numbers, list_options(request), request.root)
-
-
-def list_options(request: TrainRequest) -> list[str]:
-    """Return the options of `rlctl train` that a request stands for, but for its task, seed and folder."""
-    options = [f"--set={key}={json.dumps(value)}" for key, value in request.settings.items()]
-    options += [f"--config={request.config}"] if request.config is not None else []
-    options += [f"--from={request.initial_policy}"] if request.initial_policy is not None else []
-    options += [f"--record={request.record}"] if request.record else []
-    options += ["--force"] if request.force else []
-    default = TrainRequest(None)
-    for name, value, usual in (
-        ("device", request.device, default.device),
-        ("env-timeout", request.env_timeout_s, default.env_timeout_s),
-    ):
-        options += [f"--{name}={value}"] if value != usual else []
-    return options if request.check else [*options, "--no-check"]
+    return create_group(request, numbers)
 
 
 def _choose_jobs(group: Group, waiting: int, jobs: int | None) -> int:
@@ -128,11 +110,24 @@ def _choose_jobs(group: Group, waiting: int, jobs: int | None) -> int:
     return chosen
 
 
-def _make_command(group: Group, seed: int, options: Sequence[str]) -> list[str]:
+def _make_request(group: Group, seed: int, resume: TrainRequest) -> TrainRequest:
+    """Return a seed's request: that of its group, with what `resume` changes; a run that has begun is resumed."""
+    default = TrainRequest()
+    changes = {name: value for name, value in vars(resume).items() if value != getattr(default, name)}
+    request = dataclasses.replace(group.request, **{**changes, "root": group.path})
     run = group.find_run(seed)
-    if run is not None:
-        return ["train", "--resume", str(run.path), *options]
-    return ["train", group.task, "--seed", str(seed), "--output", str(group.path), *group.options, *options]
+    if run is None:
+        settings = {**group.request.settings, **resume.settings, "seed": seed}
+        return dataclasses.replace(request, resume=None, settings=settings)
+    return dataclasses.replace(
+        request, task=None, config=None, initial_policy=None, resume=str(run.path), settings=resume.settings
+    )
+
+
+def _is_waiting(group: Group, seed: int, resume: TrainRequest) -> bool:
+    """Say whether a seed is to be trained: it has not finished, or something is to be different now."""
+    asks_for_more = resume != TrainRequest(resume=resume.resume, root=resume.root)
+    return asks_for_more or not group.is_done(seed)
 
 
 def _print_line(seed: int, line: str) -> None:

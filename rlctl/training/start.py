@@ -9,7 +9,6 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,34 +17,15 @@ from rlctl.environments.task_version import describe_task_changes
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.recipe.recipe import Recipe, validate
 from rlctl.recipe.sources import describe_rounding, resolve_with_stages
-from rlctl.run import directory, lookup
+from rlctl.run import lookup
 from rlctl.run.directory import RunDirectory, RunLock
+from rlctl.run.train_request import TrainRequest
 from rlctl.training.warm_start import find_source
 
 if TYPE_CHECKING:
     from rlctl.training.checkpoint import Checkpoint
 
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainRequest:
-    """The arguments of `rlctl train`."""
-
-    task: str | None
-    resume: str | None = None
-    config: Path | None = None
-    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    device: str = "cpu"
-    record: int = 0
-    env_timeout_s: float = 60.0
-    root: Path = directory.ROOT
-    check: bool = False
-    """Whether to check the environment first, and to refuse one that has errors."""
-    force: bool = False
-    """Whether to go on with a run even if its task has changed."""
-    initial_policy: str | None = None
-    """A run, a policy file, or the name of a task that ships a policy: what the training begins with."""
 
 
 @dataclasses.dataclass(frozen=True)

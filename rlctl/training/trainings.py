@@ -14,8 +14,9 @@ from types import FrameType
 from typing import TypeVar
 
 from rlctl.errors import Interrupted
-from rlctl.processes.child_process import LineReader, start_process
+from rlctl.processes.child_process import ChildProcess, LineReader
 from rlctl.rollout.workers import available_cores
+from rlctl.run.train_request import TrainRequest
 from rlctl.training.signals import HandledSignals
 
 CORES_PER_TRAINING = 2
@@ -58,37 +59,43 @@ class Trainings:
 
     def train(
         self,
-        arguments: Sequence[str],
+        request: TrainRequest,
         receive: Callable[[str], None],
         is_hopeless: Callable[[], bool] | None = None,
     ) -> int:
-        """Run `rlctl` with arguments; return its exit code. `receive` gets its lines.
+        """Train in a process that ends with this one; return the exit code. `receive` gets the lines that it prints.
 
         `is_hopeless` is asked twice a second, and ends the training with a checkpoint.
         """
         if self.stopped_by is not None:
             return 0
         reader = LineReader(receive)
-        process = start_process(
-            [sys.executable, "-m", "rlctl", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
+        child = ChildProcess(
+            "rlctl.training.child:main",
+            {"request": request.to_json(), "command": sys.argv},
+            one_thread=False,
+            stdout=reader.descriptor,
             stderr=reader.descriptor,
-            process_group=0,  # which a terminal's Ctrl-C does not reach: signals are passed on, once each
         )
-        self._running.add(process.pid)
         reader.close_descriptor()
-        if self.stopped_by is not None:  # meanwhile
-            os.kill(process.pid, self.stopped_by)
-        while is_hopeless is not None:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(_WATCH_S)
-                break
-            if is_hopeless():
-                os.kill(process.pid, signal.SIGINT)
-                break
-        code = process.wait()
-        self._running.discard(process.pid)
+        process = child.process
+        try:
+            with contextlib.suppress(EOFError, OSError):
+                child.connection.recv_bytes()  # until then it ignores signals
+            self._running.add(process.pid)
+            if self.stopped_by is not None:  # meanwhile
+                os.kill(process.pid, self.stopped_by)
+            while is_hopeless is not None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_WATCH_S)
+                    break
+                if is_hopeless():
+                    os.kill(process.pid, signal.SIGINT)
+                    break
+            code = process.wait()
+        finally:
+            self._running.discard(process.pid)
+            child.close()
         reader.wait()
         return code if code >= 0 else 128 - code
 

@@ -12,9 +12,8 @@ from optuna.trial import TrialState
 
 from rlctl.environments.spec import merge
 from rlctl.errors import UsageError
+from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
-from rlctl.training.request import TrainRequest
-from rlctl.training.seeds import list_options
 from rlctl.training.trainings import Trainings
 from rlctl.tuning.space import get_value, nest
 from rlctl.tuning.tuning import Trial, Tuning, find_best
@@ -155,7 +154,7 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
 
     changes = [f"{key.rpartition('.')[2]}={value}" for key, value in trial.values.items()]
     print(f"trial {trial.number}: {', '.join(changes) or 'the recipe as it is'}", file=sys.stderr, flush=True)
-    code = trainings.train(_make_arguments(tuning, trial), receive, pruning.is_hopeless if pruning else lacks_metric)
+    code = trainings.train(_make_request(tuning, trial), receive, pruning.is_hopeless if pruning else lacks_metric)
     if pruning is None and lacks_metric():
         raise UsageError(f"--metric {tuning.metric}: this task reports no success (no is_success); use --metric return")
     run = tuning.find_run(trial)
@@ -176,12 +175,14 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
         files.remove_tree(run.checkpoint(0).parent)
 
 
-def _make_arguments(tuning: Tuning, trial: Trial) -> list[str]:
+def _make_request(tuning: Tuning, trial: Trial) -> TrainRequest:
     run = tuning.find_run(trial)
     if run is not None and run.checkpoints():
-        return ["train", "--resume", str(run.path)]
-    settings = merge(tuning.settings, nest(trial.values))
-    # The recipe as it is has had the environment checked.
-    request = TrainRequest(tuning.task, config=tuning.config, settings=settings, check=trial.number == 0)
-    seed = tuning.seed + trial.number
-    return ["train", tuning.task, *list_options(request), f"--seed={seed}", "--output", str(tuning.path)]
+        return TrainRequest(resume=str(run.path), check=trial.number == 0)
+    return TrainRequest(
+        tuning.task,
+        config=tuning.config,
+        settings=merge(tuning.settings, nest(trial.values)) | {"seed": tuning.seed + trial.number},
+        check=trial.number == 0,  # the recipe as it is has had the environment checked
+        root=tuning.path,
+    )

@@ -7,11 +7,9 @@ that are below the median of the others at the same evaluation are stopped.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import shlex
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 from rlctl import output
@@ -20,47 +18,42 @@ from rlctl.errors import TaskError, UsageError
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import Recipe
 from rlctl.recipe.sources import find_config, resolve_with_stages
-from rlctl.run.directory import ROOT, RunLock, create_group_folder
+from rlctl.run.directory import RunLock, create_group_folder
 from rlctl.training.start import preserve_process_state
 from rlctl.training.trainings import Trainings, choose_jobs
 from rlctl.tuning.space import Dimension, fill_parameters, list_usual_steps, nest, parse_search
-from rlctl.tuning.tuning import Metric, Trial, Tuning, load
+from rlctl.tuning.tune_request import TuneRequest
+from rlctl.tuning.tuning import Trial, Tuning, load
 
 _FEWEST_EVALUATIONS = 6
 _EVALUATIONS = 10
 _OF_THE_RETURN = ("task", "reward_weights", "events", "randomize")
 
 
-@dataclasses.dataclass(frozen=True)
-class TuneRequest:
-    """The arguments of `rlctl tune`."""
-
-    task: str
-    config: Path | None = None
-    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    search: Sequence[str] = ()
-    """`KEY=LOW:HIGH` or `KEY=A,B,C`, all searched together; none: the usual ladder."""
-    trials: int = 8
-    """Per step of the ladder."""
-    metric: Metric = "return"
-    root: Path = ROOT
-
-
 def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
-    """Search hyperparameters; return every trial.
+    """Search hyperparameters, or resume a tuning, whose interrupted trials are resumed; return every trial.
 
     Raises `UsageError` without optuna, or for a search that is none; `RecipeError` for values that a recipe cannot
     have; `TaskError` if the recipe as it is cannot be trained; `Interrupted` after a signal.
     """
+    if (request.task is None) == (request.resume is None):
+        raise UsageError("give a task to tune, or --resume FOLDER")
     _require_optuna()
+    # It is read before a lock is written into a folder that is none, and again by the holder of the lock.
+    tuning = _begin(request, request.task or "") if request.resume is None else load(request.resume)
+    with RunLock(tuning.path):
+        return _search(load(tuning.path), jobs)
+
+
+def _begin(request: TuneRequest, task: str) -> Tuning:
     with preserve_process_state():
-        recipe = resolve_with_stages(request.task, request.config, request.settings)
+        recipe = resolve_with_stages(task, request.config, request.settings)
     steps = [parse_search(request.search)] if request.search else list_usual_steps(recipe)
-    for dimension in (each for step in steps for each in step):
-        _check(dimension, request)
+    for dimension in (dimension for step in steps for dimension in step):
+        _check(dimension, task, request)
     tuning = Tuning(
-        path=create_group_folder(request.task, "tune", request.root),
-        task=request.task,
+        path=create_group_folder(task, "tune", request.root),
+        task=task,
         config=None if request.config is None else find_config(request.config).absolute(),
         settings=_evaluate_often_enough(recipe, request.settings),
         metric=request.metric,
@@ -69,16 +62,7 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
         steps=steps,
     )
     tuning.save()
-    with RunLock(tuning.path):
-        return _search(tuning, jobs)
-
-
-def resume(path: Path, *, jobs: int | None = None) -> Tuning:
-    """Go on with a tuning; trials that were interrupted go on where they stopped."""
-    _require_optuna()
-    load(path)  # before a lock is written into a folder that is none
-    with RunLock(path):
-        return _search(load(path), jobs)
+    return tuning
 
 
 def _require_optuna() -> None:
@@ -88,7 +72,7 @@ def _require_optuna() -> None:
         raise UsageError(f"rlctl tune needs {error.name}: pip install 'rlctl[tune]'") from None
 
 
-def _check(dimension: Dimension, request: TuneRequest) -> None:
+def _check(dimension: Dimension, task: str, request: TuneRequest) -> None:
     """Raise `UsageError` for a key that cannot be searched, and `RecipeError` for a value that it cannot have."""
     first = dimension.key.partition(".")[0]
     if dimension.key in ("seed", "total_timesteps", "stop_success") or first in ("eval", "checkpoint"):
@@ -101,7 +85,7 @@ def _check(dimension: Dimension, request: TuneRequest) -> None:
             "give --metric success"
         )
     for value in dimension.ends():
-        resolve_with_stages(request.task, request.config, merge(request.settings, nest({dimension.key: value})))
+        resolve_with_stages(task, request.config, merge(request.settings, nest({dimension.key: value})))
 
 
 def _evaluate_often_enough(recipe: Recipe, settings: Mapping[str, Any]) -> dict[str, Any]:

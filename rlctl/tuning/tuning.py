@@ -17,8 +17,8 @@ from rlctl.run.group import find_run_of_seed
 from rlctl.runs.summary import list_points, read_table
 from rlctl.storage import files, yaml_text
 from rlctl.tuning.space import Dimension, nest
+from rlctl.tuning.tune_request import Metric
 
-Metric = Literal["return", "success"]
 _PART_JUDGED = 3  # the last third of the evaluations
 
 

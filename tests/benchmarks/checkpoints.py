@@ -98,10 +98,11 @@ def _train(settings: dict) -> tuple[float, int, float, float, float]:
 
 
 def _run(settings: dict) -> None:
-    from rlctl.training.request import TrainRequest, run_training
+    from rlctl.run.train_request import TrainRequest
+    from rlctl.training.request import run_training
 
     with tempfile.TemporaryDirectory() as folder:
-        run_training(TrainRequest("reach", settings=settings, root=Path(folder)))
+        run_training(TrainRequest("reach", settings=settings, root=Path(folder), check=False))
 
 
 @contextlib.contextmanager

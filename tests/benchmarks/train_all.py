@@ -23,6 +23,7 @@ from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.group import as_json, evaluate_group
 from rlctl.run.directory import GROUP_FILE
 from rlctl.run.group import Group, parse_seeds, read_group
+from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 
 BEGIN, END = "<!-- scores: make train-all -->\n", "<!-- end of scores -->\n"
@@ -43,7 +44,7 @@ def find_group(task: str, seeds: Sequence[int], root: Path) -> Group | None:
     groups = sorted((root / registry.make_slug(task)).glob(f"*_seeds/{GROUP_FILE}"))
     if groups:
         return read_group(groups[-1].parent)
-    alone = Group(root / registry.make_slug(task), task, list(seeds), [])
+    alone = Group(root / registry.make_slug(task), list(seeds), TrainRequest(task))
     return alone if all(alone.is_done(seed) for seed in seeds) else None
 
 
@@ -51,7 +52,7 @@ def find_finished(task: str, root: Path) -> Group | None:
     """Return the finished runs of a task outside of groups, a run per seed; None if there are none."""
     folder = root / registry.make_slug(task)
     seeds = {int(match[1]) for file in folder.glob("*/run.json") if (match := _SEED.search(file.parent.name))}
-    alone = Group(folder, task, [], [])
+    alone = Group(folder, [], TrainRequest(task))
     finished = sorted(seed for seed in seeds if alone.is_done(seed))
     return dataclasses.replace(alone, seeds=finished) if finished else None
 

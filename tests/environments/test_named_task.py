@@ -13,8 +13,9 @@ from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.policy.policy import compute_digest, read_policy
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
+from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
-from rlctl.training.request import TrainRequest, run_training
+from rlctl.training.request import run_training
 from tests.training.conftest import ENVS, SMALL_PPO
 
 ENV = """
@@ -90,7 +91,9 @@ def test_what_does_not_exist_is_a_usage_error():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     root = tmp_path_factory.mktemp("runs")
-    return run_training(TrainRequest(f"{ENVS}:Line", settings={**SMALL_PPO, "total_timesteps": 64}, root=root)).run
+    return run_training(
+        TrainRequest(f"{ENVS}:Line", settings={**SMALL_PPO, "total_timesteps": 64}, root=root, check=False)
+    ).run
 
 
 def test_a_policy_that_names_a_function_runs_nothing(run, tmp_path):
@@ -124,5 +127,5 @@ def test_a_run_that_names_a_function_runs_nothing(run, tmp_path):
     recipe = run.recipe().model_copy(update={"task": {"command": f"touch {mark}"}})
     files.write_sealed(run.recipe_file, recipe.to_yaml())
     with pytest.raises(ArtifactError, match=r"^run.json names 'os:system' as its task"):
-        run_training(TrainRequest(None, resume=str(run.path), settings={"total_timesteps": 256}, force=True))
+        run_training(TrainRequest(resume=str(run.path), settings={"total_timesteps": 256}, force=True, check=False))
     assert not mark.exists()

@@ -13,8 +13,9 @@ from rlctl.evaluation.group import GroupScore, SeedScore
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.score import measure_score
 from rlctl.rollout.messages import EpisodeResult
+from rlctl.run.train_request import TrainRequest
 from rlctl.runs.summary import read_table
-from rlctl.training.request import TrainRequest, run_training
+from rlctl.training.request import run_training
 from tests import fork_server
 from tests.training.conftest import ENVS, SMALL_PPO
 
@@ -24,7 +25,7 @@ def reach_run(tmp_path_factory):
     """A barely trained policy for reach: evaluation does not care how good it is."""
     root = tmp_path_factory.mktemp("runs")
     settings = {**SMALL_PPO, "eval": {"episodes": 2, "every_steps": 256}}
-    return run_training(TrainRequest("reach", settings=settings, root=root)).run
+    return run_training(TrainRequest("reach", settings=settings, root=root, check=False)).run
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +164,7 @@ def test_a_return_to_reach_is_a_number():
 
 
 def test_a_gate_on_success_needs_success(tmp_path):
-    run = run_training(TrainRequest(f"{ENVS}:NoSuccess", settings=SMALL_PPO, root=tmp_path)).run
+    run = run_training(TrainRequest(f"{ENVS}:NoSuccess", settings=SMALL_PPO, root=tmp_path, check=False)).run
     with pytest.raises(UsageError, match="--min-success: this task reports no success"):
         run_evaluation(EvalRequest(str(run.path), episodes=2), Gates(min_success=0.5))
     assert run_evaluation(EvalRequest(str(run.path), episodes=2), Gates(min_return=-1e9)).success_rate is None

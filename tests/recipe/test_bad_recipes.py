@@ -4,7 +4,8 @@ import pytest
 
 from rlctl.errors import RecipeError, UsageError
 from rlctl.recipe.sources import parse_settings, resolve
-from rlctl.training.request import TrainRequest, run_training
+from rlctl.run.train_request import TrainRequest
+from rlctl.training.request import run_training
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 9)}]\n" for level in range(1, 10)
@@ -154,7 +155,7 @@ def test_a_key_that_never_ends():
 def not_built(task, root, settings):
     """The message with which a recipe is refused when the model is to be built; no run is left behind."""
     with pytest.raises(UsageError) as caught:
-        run_training(TrainRequest(task, settings=parse_settings(settings), root=root))
+        run_training(TrainRequest(task, settings=parse_settings(settings), root=root, check=False))
     assert caught.value.exit_code == 2
     assert not root.exists()
     message = str(caught.value)

@@ -8,10 +8,11 @@ import pytest
 from rlctl.environments.spec import EnvSpec, merge
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, choose_spec, load_player
+from rlctl.run.train_request import TrainRequest
 from rlctl.runs.comparison import Candidate, Comparison, Side, compare, find_runs_of
 from rlctl.runs.comparison_report import as_json, format_needed
 from rlctl.runs.significance import Verdict
-from rlctl.training.request import TrainRequest, run_training
+from rlctl.training.request import run_training
 from tests.training.conftest import ENVS, TINY
 
 

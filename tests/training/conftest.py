@@ -6,8 +6,9 @@ from rlctl.errors import TaskError
 from rlctl.recipe import recipe
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.run.directory import RunDirectory
+from rlctl.run.train_request import TrainRequest
 from rlctl.training import saving
-from rlctl.training.request import TrainRequest, TrainResult, run_training
+from rlctl.training.request import TrainResult, run_training
 
 ENVS = Path(__file__).with_name("envs.py")
 FAULTY = ENVS.with_name("faulty_envs.py")
@@ -34,7 +35,9 @@ def train(tmp_path: Path):
 
     def run(env: str, settings: dict, envs: str | Path = ENVS, **request) -> TrainResult:
         task = f"{envs}:{env}" if env[0].isupper() else env
-        return run_training(TrainRequest(task, settings=settings, root=tmp_path / "runs", **request))
+        return run_training(
+            TrainRequest(task, settings=settings, root=tmp_path / "runs", **{"check": False, **request})
+        )
 
     return run
 
@@ -44,7 +47,7 @@ def resume(tmp_path: Path):
     def run(run: TrainResult | RunDirectory, *, force=False, **settings) -> TrainResult:
         path = run.path if isinstance(run, RunDirectory) else run.run.path
         return run_training(
-            TrainRequest(None, resume=str(path), settings=settings, root=tmp_path / "runs", force=force)
+            TrainRequest(resume=str(path), settings=settings, root=tmp_path / "runs", force=force, check=False)
         )
 
     return run

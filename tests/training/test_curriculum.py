@@ -13,9 +13,10 @@ from rlctl.policy.policy import read_policy
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.rollout.workers import available_cores
 from rlctl.run.episode import load_episode
+from rlctl.run.train_request import TrainRequest
 from rlctl.training import checkpoint
 from rlctl.training.display import LiveDisplay
-from rlctl.training.request import TrainRequest, run_training
+from rlctl.training.request import run_training
 from tests.training.comparing import replay_buffer
 from tests.training.conftest import ENVS, SMALL, SMALL_PPO
 
@@ -42,7 +43,9 @@ def saved(run):
 def staged(tmp_path_factory):
     """A run that goes from EASY to HARD at step 128, the second boundary."""
     root = tmp_path_factory.mktemp("runs")
-    return run_training(TrainRequest(f"{ENVS}:Staged", settings={**SMALL_PPO, "stages": BY_SUCCESS}, root=root))
+    return run_training(
+        TrainRequest(f"{ENVS}:Staged", settings={**SMALL_PPO, "stages": BY_SUCCESS}, root=root, check=False)
+    )
 
 
 def test_promotion_by_success(staged):
@@ -226,7 +229,7 @@ def test_reach_in_stages_of_its_class(write_module, tmp_path):
         "algo_kwargs": {"n_steps": 128, "batch_size": 128, "n_epochs": 1},
         "events": {"mass": {"factor": {"from": [1.0, 1.0], "to": [0.9, 1.1]}}},
     }
-    result = run_training(TrainRequest(task, settings=settings, root=tmp_path))
+    result = run_training(TrainRequest(task, settings=settings, root=tmp_path, check=False))
     # 128 steps hold an episode of 120.
     assert column(result.run.metrics_file, "stage") == [1, 2, 2]
     assert result.run.recipe().stages[0].task == {"tolerance": 0.2}
@@ -246,4 +249,4 @@ def test_reach_in_stages_of_its_class(write_module, tmp_path):
 def test_success_of_a_task_that_has_none_is_refused(write_module, tmp_path, small_ppo):
     task = f"{write_module('my_reach.py', REACH)}:NoSuccess"
     with pytest.raises(RecipeError, match=r"^stage 1 of 2: promote.success: .*NoSuccess does not report success"):
-        run_training(TrainRequest(task, settings=small_ppo, root=tmp_path))
+        run_training(TrainRequest(task, settings=small_ppo, root=tmp_path, check=False))

@@ -33,12 +33,15 @@ def _two_workers():
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The run that nothing stops."""
-    from rlctl.training.request import TrainRequest, run_training
+    from rlctl.run.train_request import TrainRequest
+    from rlctl.training.request import run_training
 
     root = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e9)
-        return run_training(TrainRequest(f"{ENVS}:Faulty", settings={**TINY, "task": {"fault": ""}}, root=root)).run
+        return run_training(
+            TrainRequest(f"{ENVS}:Faulty", settings={**TINY, "task": {"fault": ""}}, root=root, check=False)
+        ).run
 
 
 # The same faults without a training, and many more, are in tests/rollout/test_returned.py.

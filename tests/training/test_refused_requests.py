@@ -4,7 +4,8 @@ import pytest
 
 from rlctl.errors import RecipeError, UsageError
 from rlctl.recipe import recipe as recipes
-from rlctl.training.request import TrainRequest, run_training
+from rlctl.run.train_request import TrainRequest
+from rlctl.training.request import run_training
 
 
 @pytest.mark.parametrize(
@@ -36,7 +37,7 @@ def test_a_reward_weight_of_the_other_sign_is_warned_of(train, small_ppo, capsys
 
 
 def test_task_and_resume_exclude_each_other():
-    for request in (TrainRequest(None), TrainRequest("reach", resume="latest")):
+    for request in (TrainRequest(check=False), TrainRequest("reach", resume="latest", check=False)):
         with pytest.raises(UsageError, match="give a task to train, or --resume RUN"):
             run_training(request)
 

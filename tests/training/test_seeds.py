@@ -3,21 +3,23 @@
 import json
 import os
 import signal
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Gates
 from rlctl.evaluation.group import as_json, evaluate_group
-from rlctl.run.group import find_group, parse_seeds, read_group
+from rlctl.run.group import create_group, find_group, parse_seeds, read_group
 from rlctl.run.lookup import find_policy, find_run
+from rlctl.run.train_request import TrainRequest
 from rlctl.runs.comparison import find_runs_of
 from rlctl.runs.listing import list_runs
 from rlctl.runs.removal import plan_removal
-from rlctl.training.request import TrainRequest
-from rlctl.training.seeds import list_options, train_seeds
+from rlctl.training.seeds import train_seeds
 from tests.training.conftest import ENVS, TINY
 
 LINE = f"{ENVS}:Line"
@@ -51,7 +53,7 @@ def test_what_is_no_seeds(text, message):
 def group(tmp_path_factory):
     """Two seeds of PPO on the line, side by side."""
     root = tmp_path_factory.mktemp("runs")
-    result = train_seeds(TrainRequest(LINE, settings=TINY, root=root), "4-5", jobs=2, episodes=3)
+    result = train_seeds(TrainRequest(LINE, settings=TINY, root=root, check=False), "4-5", jobs=2, episodes=3)
     assert result.failed == {}
     return result.score.group
 
@@ -62,7 +64,7 @@ def test_each_seed_is_an_ordinary_run(group):
         run = group.find_run(seed)
         assert run.status()["seed"] == seed
         assert run.recipe().algo_kwargs["n_steps"] == 16
-        assert "train" in run.status()["command"]
+        assert run.status()["command"] == ["rlctl", *sys.argv[1:]]  # that of the process that started it
     content = json.loads(group.scores_file.read_text())
     assert [(each["seed"], each["steps"], each["algo"]) for each in content["seeds"]] == [
         (4, 128, "ppo"),
@@ -125,7 +127,7 @@ def test_what_is_done_stays_and_a_damaged_run_stops_no_other(group, tmp_path):
     before = group.find_run(4).last_policy.stat().st_mtime_ns
     file.write_text("{")
     try:
-        result = train_seeds(TrainRequest(None, resume=str(group.path)), None, episodes=2)
+        result = train_seeds(TrainRequest(resume=str(group.path), check=False), None, episodes=2)
         assert result.failed == {5: 5}
         with pytest.raises(Exception, match="1 of 2 seeds failed: seed 5 with exit code 5") as caught:
             result.check()
@@ -153,7 +155,7 @@ def test_a_signal_stops_all_with_checkpoints(tmp_path):
 
     threading.Thread(target=interrupt, daemon=True).start()
     with pytest.raises(Interrupted, match=r"interrupted; go on with: rlctl train --resume .*_seeds") as caught:
-        train_seeds(TrainRequest(LINE, settings=settings, root=tmp_path), "0-1", jobs=2)
+        train_seeds(TrainRequest(LINE, settings=settings, root=tmp_path, check=False), "0-1", jobs=2)
     assert caught.value.exit_code == 130
     (path,) = tmp_path.glob("*/*_seeds")
     for seed in (0, 1):
@@ -163,20 +165,45 @@ def test_a_signal_stops_all_with_checkpoints(tmp_path):
 
 
 def test_what_is_wrong_for_every_seed_is_said_at_once(tmp_path):
-    request = TrainRequest(LINE, settings={"algo_kwargs": {"gama": 1}}, root=tmp_path)
+    request = TrainRequest(LINE, settings={"algo_kwargs": {"gama": 1}}, root=tmp_path, check=False)
     with pytest.raises(RecipeError, match="gamma"):
         train_seeds(request, "0-1")
     with pytest.raises(UsageError, match="--seeds and --seed: give one of the two"):
-        train_seeds(TrainRequest(LINE, settings={"seed": 1}, root=tmp_path), "0-1")
+        train_seeds(TrainRequest(LINE, settings={"seed": 1}, root=tmp_path, check=False), "0-1")
     with pytest.raises(ArtifactError, match=r"not a group of runs: it has no group\.json"):
-        train_seeds(TrainRequest(None, resume=str(tmp_path)), None)
+        train_seeds(TrainRequest(resume=str(tmp_path), check=False), None)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_options_of_a_request():
+def test_a_request_is_the_same_after_json():
     settings = {"algo": "sac", "algo_kwargs": {"gamma": 0.97}, "task": {}, "n_envs": 2}
-    request = TrainRequest("reach", settings=settings, check=True, initial_policy="reach", device="cuda")
-    assert list_options(request) == [
-        '--set=algo="sac"', '--set=algo_kwargs={"gamma": 0.97}', "--set=task={}", "--set=n_envs=2", "--from=reach",
-        "--device=cuda",
-    ]  # fmt: skip
+    request = TrainRequest("reach", settings=settings, config=Path("my.yaml"), initial_policy="reach", device="cuda")
+    assert TrainRequest.from_json(json.loads(json.dumps(request.to_json()))) == request
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"root": "/elsewhere"},
+        {"resume": "/elsewhere/run"},
+        {"json": "/elsewhere/file"},
+        {"record": "--json=/elsewhere"},
+        {"task": None},
+    ],
+)
+def test_the_file_of_a_group_names_no_other_place(change, tmp_path):
+    """It came from somebody else: nothing in it is an option of a command line."""
+    group = create_group(TrainRequest(LINE, settings=TINY, root=tmp_path), [0])
+    assert read_group(group.path) == group
+    file = group.path / "group.json"
+    content = json.loads(file.read_text())
+    content["request"] |= change
+    file.write_text(json.dumps(content))
+    with pytest.raises(ArtifactError, match=r"group\.json: damaged: it does not hold seeds and the request"):
+        read_group(group.path)
+
+
+def test_a_group_of_another_version(tmp_path):
+    (tmp_path / "group.json").write_text('{"task": "reach", "seeds": [0], "options": ["--json=/elsewhere"]}')
+    with pytest.raises(ArtifactError, match="of another version of rlctl"):
+        read_group(tmp_path)

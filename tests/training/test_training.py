@@ -14,9 +14,10 @@ from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
+from rlctl.run.train_request import TrainRequest
 from rlctl.runs.summary import summarize
 from rlctl.training import checkpoint
-from rlctl.training.request import TrainRequest, TrainResult, run_training
+from rlctl.training.request import TrainResult, run_training
 from tests import fork_server
 from tests.training.conftest import ENVS, SMALL, SMALL_PPO
 
@@ -30,7 +31,7 @@ def rows(path):
 def finished(tmp_path_factory) -> TrainResult:
     """A training that has ended; nobody writes to its run."""
     root = tmp_path_factory.mktemp("finished")
-    return run_training(TrainRequest(f"{ENVS}:Line", settings=SMALL_PPO, root=root))
+    return run_training(TrainRequest(f"{ENVS}:Line", settings=SMALL_PPO, root=root, check=False))
 
 
 @pytest.fixture

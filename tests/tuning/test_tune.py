@@ -3,7 +3,6 @@
 Trainings are played by a function that writes what a run would; one test trains.
 """
 
-import argparse
 import json
 import signal
 import threading
@@ -20,7 +19,8 @@ from rlctl.run.lookup import find_run
 from rlctl.runs.listing import list_runs
 from rlctl.runs.removal import plan_removal
 from rlctl.training.trainings import Trainings
-from rlctl.tuning.tune import TuneRequest, resume, tune
+from rlctl.tuning.tune import tune
+from rlctl.tuning.tune_request import TuneRequest
 from tests.training.conftest import ENVS, TINY
 
 LINE = f"{ENVS}:Line"
@@ -37,19 +37,15 @@ class PlayedTrainings:
         self.lock = threading.Lock()
         monkeypatch.setattr(Trainings, "train", lambda trainings, *arguments: self.train(trainings, *arguments))
 
-    def train(self, trainings, arguments, receive, is_hopeless=None):
-        parser = argparse.ArgumentParser()
-        for name in ("--set", "--seed", "--output", "--resume"):
-            parser.add_argument(name, action="append", default=[])
-        options, _ = parser.parse_known_args(arguments[1:])
+    def train(self, trainings, request, receive, is_hopeless=None):
         with self.lock:
-            self.calls.append(arguments)
-        if options.resume:
-            run = RunDirectory(Path(options.resume[0]))
+            self.calls.append(request)
+        if request.resume is not None:
+            run = RunDirectory(Path(request.resume))
             settings = run.status()["settings"]
         else:
-            settings = {key: json.loads(value) for key, _, value in (each.partition("=") for each in options.set)}
-            run = directory.create(LINE, int(options.seed[0]), Path(options.output[0]))
+            settings = request.settings
+            run = directory.create(LINE, settings["seed"], request.root)
         run.write_status({"task": LINE, "status": "running", "settings": settings})
         run.checkpoint(64).mkdir(parents=True, exist_ok=True)
         if self.interrupts_at == len(self.calls):
@@ -80,7 +76,11 @@ def played(monkeypatch):
 
 def begin(tmp_path, *search, jobs=1, **options):
     settings = {**TINY, **options.pop("settings", {})}
-    return tune(TuneRequest(LINE, settings=settings, search=search, root=tmp_path / "runs", **options), jobs=jobs)
+    return tune(TuneRequest(LINE, settings=settings, search=list(search), root=tmp_path / "runs", **options), jobs=jobs)
+
+
+def resume(folder, jobs=None):
+    return tune(TuneRequest(resume=folder), jobs=jobs)
 
 
 def test_the_best_of_all_trials_is_a_recipe(played, tmp_path, rlctl):
@@ -117,8 +117,7 @@ def test_too_few_evaluations_are_named(played, tmp_path, capsys):
 
 def test_only_the_first_trial_checks_the_environment(played, tmp_path):
     begin(tmp_path, RATES, trials=2)
-    assert ["--no-check" in call for call in played.calls] == [False, True, True]
-    assert [call[-3] for call in played.calls] == ["--seed=0", "--seed=1", "--seed=2"]
+    assert [(call.check, call.settings["seed"]) for call in played.calls] == [(True, 0), (False, 1), (False, 2)]
 
 
 def test_a_step_keeps_what_the_one_before_found(played, tmp_path):
@@ -187,7 +186,7 @@ def test_an_interrupted_tuning_goes_on(played, tmp_path, interrupted_at):
     assert len(played.calls) == interrupted_at
     (folder,) = (tmp_path / "runs").glob("*/*_tune")
     tuning = resume(folder, jobs=1)
-    assert played.calls[interrupted_at][:2] == ["train", "--resume"]
+    assert played.calls[interrupted_at].resume is not None
     assert [each.number for each in tuning.trials] == [0, 1, 2, 3, 4]
     assert {each.state for each in tuning.trials} <= {"done", "pruned"}
     again = resume(folder, jobs=1)
@@ -265,7 +264,7 @@ def test_trainings_that_are_real(rlctl):
     ("arguments", "message"),
     [
         ((), "give a task to tune, or --resume FOLDER"),
-        (("reach", "--metric", "score"), "--metric score: give return or success"),
+        (("reach", "--metric", "score"), "Invalid value for '--metric'"),
         (("reach", "--search", "gamma"), "--search 'gamma': write KEY=LOW:HIGH"),
     ],
 )

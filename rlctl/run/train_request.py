@@ -1,0 +1,61 @@
+"""What a training is asked for: the arguments of `rlctl train` as data. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+from rlctl.options import Config, EnvTimeout, Option, OptionalTask, RunsFolder
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainRequest:
+    """The arguments of `rlctl train`; either `task` or `resume` is given."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
+
+    task: OptionalTask = None
+    resume: Annotated[
+        str | None,
+        Option(
+            "Resume a run, or a group of seeds: its folder, a task's name, or latest.", metavar="RUN", completes="run"
+        ),
+    ] = None
+    initial_policy: Annotated[
+        str | None,
+        Option(
+            "Begin with a policy: a run, a .safetensors file, or the name of a task that ships one.",
+            ("--from",),
+            metavar="POLICY",
+            completes="run",
+        ),
+    ] = None
+    config: Config = None
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Keys of the recipe and their values, nested as in a recipe; they go over `config`."""
+    device: Annotated[str, Option("cpu, cuda, or auto.")] = "cpu"
+    record: Annotated[int, Option("Write the last N evaluation episodes as .rrd.", metavar="N", min=0)] = 0
+    check: Annotated[bool, Option("Train without checking the environment first.", (" /--no-check",))] = True
+    """Whether to check the environment first, and to refuse one that has errors."""
+    force: Annotated[bool, Option("Resume a run even if its task has changed.", ("--force",))] = False
+    env_timeout_s: EnvTimeout = 60.0
+    """How long a step or reset may take [s]."""
+    root: RunsFolder = Path("runs")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the request as what JSON can hold."""
+        return {
+            field.name: str(value) if isinstance(value := getattr(self, field.name), Path) else value
+            for field in dataclasses.fields(self)
+        }
+
+    @classmethod
+    def from_json(cls, content: Any) -> TrainRequest:
+        """Return the request of `to_json`; raises `ValueError` for data that is none."""
+        import pydantic
+
+        adapter: pydantic.TypeAdapter[TrainRequest] = pydantic.TypeAdapter(cls)
+        return adapter.validate_json(json.dumps(content))  # JSON, where a path is a string

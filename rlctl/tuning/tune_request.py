@@ -1,0 +1,34 @@
+"""What a tuning is asked for: the arguments of `rlctl tune` as data. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from rlctl.options import Config, Option, OptionalTask, RunsFolder
+
+Metric = Literal["return", "success"]
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneRequest:
+    """The arguments of `rlctl tune`; either `task` or `resume` is given."""
+
+    task: OptionalTask = None
+    resume: Annotated[Path | None, Option("Resume a tuning that was interrupted.", metavar="FOLDER")] = None
+    search: Annotated[
+        list[str],
+        Option(
+            "Search this key, or KEY=A,B,C; repeat it for more, searched together.",
+            metavar="KEY=LOW:HIGH",
+            default_text="learning rate; then n_steps and batch_size; then gamma",
+        ),
+    ] = dataclasses.field(default_factory=list)
+    trials: Annotated[int, Option("Trainings per step of the search, at most.", min=1, max=1000)] = 8
+    metric: Annotated[Metric, Option("What to maximise.", metavar="return|success")] = "return"
+    config: Config = None
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Keys of the recipe and their values, for every trial; they go over `config`."""
+    root: RunsFolder = Path("runs")

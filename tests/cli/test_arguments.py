@@ -1,0 +1,58 @@
+"""Options of the command line from the fields of a request."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from rlctl.cli.arguments import command
+from rlctl.options import Argument, Option
+
+
+@dataclasses.dataclass(frozen=True)
+class Picking:
+    item: Annotated[str, Argument("What to pick.", metavar="ITEM")]
+    limits: dict = dataclasses.field(default_factory=dict)
+    check: Annotated[bool, Option("Do not look first.", (" /--no-check",))] = True
+    folder: Annotated[Path, Option("Where to.", ("--output", "-o"))] = Path("here")
+    tries: Annotated[int, Option("How often.", min=1)] = 3
+    names: Annotated[list[str], Option("Names.", ("--name",))] = dataclasses.field(default_factory=list)
+
+
+@pytest.fixture
+def app():
+    """A command that prints the request that it gets, and an option of its own."""
+
+    def pick(request: Picking, loud: Annotated[bool, Option("Print twice.", ("--loud",))] = False) -> None:
+        """Pick."""
+        print(request, loud)
+
+    app = typer.Typer()
+    app.command()(command(pick))
+    return app
+
+
+@pytest.mark.parametrize(
+    ("arguments", "filled", "loud"),
+    [
+        (["cup"], Picking("cup"), False),
+        (["cup", "--no-check", "-o", "there", "--loud"], Picking("cup", check=False, folder=Path("there")), True),
+        (["--tries", "7", "cup", "--name", "a", "--name", "b"], Picking("cup", tries=7, names=["a", "b"]), False),
+    ],
+)
+def test_the_command_line_fills_a_request(app, arguments, filled, loud):
+    result = CliRunner().invoke(app, arguments)
+    assert result.output == f"{filled} {loud}\n"
+
+
+def test_what_a_field_does_not_take_and_help(app):
+    assert "Invalid value for '--tries'" in CliRunner().invoke(app, ["cup", "--tries", "0"]).output
+    shown = CliRunner().invoke(app, ["--help"], terminal_width=200).output
+    assert "ITEM" in shown
+    assert "How often." in shown
+    assert "--no-check" in shown
+    assert "--check" not in shown
+    assert "limits" not in shown
