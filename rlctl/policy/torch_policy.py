@@ -17,6 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import VecTransposeImage
+from threadpoolctl import threadpool_limits
 
 from rlctl.environments.dict_spaces import Observations, join, split
 from rlctl.errors import ArtifactError, short_repr
@@ -59,8 +60,9 @@ _NOT_KEPT = frozenset(
 
 
 def pin_threads() -> None:
-    """Let torch use one thread: the last bit of a result depends on how many, and small networks gain nothing."""
+    """Let torch and NumPy use one thread: the last bit of a result depends on how many; small networks gain nothing."""
     torch.set_num_threads(1)
+    threadpool_limits(1, "blas")
 
 
 def policy_name(algo: str, observation_space: spaces.Space[Any]) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import collections
 import functools
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,26 +18,26 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.distributions import DiagGaussianDistribution, StateDependentNoiseDistribution
 from stable_baselines3.common.utils import explained_variance
-from torch import Tensor
 
 from rlctl.environments.dict_spaces import join, split
-from rlctl.training.updates.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
+from rlctl.training.updates.mlp import LOG_SQRT_TAU, Floats, MlpStack, allocate_gradient, is_mlp
 from rlctl.training.updates.side_by_side import SideBySide
 
 _FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
 
 
 class PpoUpdate:
-    """Updates a PPO model whose networks are multi-layer perceptrons and whose actions are normally distributed."""
+    """Updates a PPO model, on the CPU, with multi-layer perceptrons and normally distributed actions."""
 
     def __init__(self, model: PPO) -> None:
         policy: Any = model.policy
         self._model: Any = model
         self._policy = policy
-        self._actor = Mlp(_actor_modules(policy))
-        self._critic = Mlp(_critic_modules(policy))
-        self._gradients = share_gradients(policy.parameters())
-        self._side_by_side = SideBySide([self._actor, self._critic], model.batch_size)
+        networks = (_actor_modules(policy), _critic_modules(policy))
+        self._actor, self._critic = (MlpStack([network]) for network in networks)
+        self._log_std_gradient = allocate_gradient(policy.log_std)
+        self._gradients = [*self._actor.gradients, *self._critic.gradients, self._log_std_gradient]
+        self._side_by_side = SideBySide(networks, model.batch_size)
 
     @staticmethod
     def supports(model: Any) -> bool:
@@ -75,21 +76,23 @@ class PpoUpdate:
                 break
         self._log(logged, clip_range, clip_range_vf)
 
-    def _read_buffer(self) -> dict[str, Tensor]:
+    def _read_buffer(self) -> dict[str, NDArray[Any]]:
         """Return a rollout, shape (steps * environments, ...) each; of the observations what the networks get."""
-        buffer, device = self._model.rollout_buffer, self._model.device
-
-        def to_tensor(rows: NDArray[Any]) -> Tensor:
-            return torch.as_tensor(buffer.swap_and_flatten(rows), device=device)
-
-        observations = join({key: to_tensor(rows) for key, rows in split(buffer.observations).items()})
-        data = {name: to_tensor(getattr(buffer, name)) for name in _FIELDS}
-        data |= {name: data[name].flatten() for name in _FIELDS[1:]}
-        data["actions"] = data["actions"].float()  # the buffer has the type of the space
-        return {"features": self._policy.extract_features(observations), **data}
+        buffer = self._model.rollout_buffer
+        observations = join(
+            {key: torch.from_numpy(buffer.swap_and_flatten(rows)) for key, rows in split(buffer.observations).items()}
+        )
+        data = {name: buffer.swap_and_flatten(getattr(buffer, name)) for name in _FIELDS}
+        data |= {name: data[name].ravel() for name in _FIELDS[1:]}
+        data["actions"] = data["actions"].astype(np.float32)  # the buffer has the type of the space
+        return {"features": self._policy.extract_features(observations).numpy(), **data}
 
     def _update(
-        self, batch: dict[str, Tensor], clip_range: float, clip_range_vf: float | None, logged: dict[str, list[float]]
+        self,
+        batch: dict[str, NDArray[Any]],
+        clip_range: float,
+        clip_range_vf: float | None,
+        logged: dict[str, list[float]],
     ) -> bool:
         """Learn from a minibatch; return False, and do not, where the policy has moved further than `target_kl`."""
         model = self._model
@@ -109,69 +112,74 @@ class PpoUpdate:
         self._step()
         return True
 
-    def _compute_actor_gradients(self, batch: dict[str, Tensor], clip_range: float) -> dict[str, float]:
+    def _compute_actor_gradients(self, batch: dict[str, NDArray[Any]], clip_range: float) -> dict[str, float]:
         """Set the gradients of the actor's weights; return the losses that SB3 logs."""
         model, size = self._model, len(batch["actions"])
-        actor = self._actor.run(batch["features"])
+        actor = self._actor.run(batch["features"][None], "learning")
         std = self._compute_std(actor)
-        z = (batch["actions"] - actor[-1]) / std
-        log_std = std.log()
-        log_prob = (z.square() * -0.5 - log_std - LOG_SQRT_TAU).sum(1)
-        entropy = (log_std.expand_as(z) + (0.5 + LOG_SQRT_TAU)).sum(1)
+        z = (batch["actions"] - actor[-1][0]) / std
+        log_std = np.log(std)
+        log_prob = (np.square(z) * -0.5 - log_std - LOG_SQRT_TAU).sum(1)
+        entropy = (np.broadcast_to(log_std, z.shape) + (0.5 + LOG_SQRT_TAU)).sum(1)
 
         advantages = batch["advantages"]
         if model.normalize_advantage and size > 1:
-            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+            advantages = (advantages - advantages.mean()) / (advantages.std(ddof=1) + 1e-8)
         log_ratio = log_prob - batch["log_probs"]
-        ratio = log_ratio.exp()
-        unclipped, clipped = advantages * ratio, advantages * ratio.clamp(1 - clip_range, 1 + clip_range)
+        ratio = np.exp(log_ratio)
+        unclipped, clipped = advantages * ratio, advantages * ratio.clip(1 - clip_range, 1 + clip_range)
         # Where the clipped term is the smaller one, the loss does not depend on the policy.
-        to_log_prob = (unclipped * (unclipped <= clipped) / -size).unsqueeze(1)
-        self._actor.backpropagate(actor, to_log_prob * z / std)
-        self._set_std_gradient(actor, std, to_log_prob * (z.square() - 1) - model.ent_coef / size)
+        to_log_prob = (unclipped * (unclipped <= clipped) / -size)[:, None]
+        self._actor.backpropagate(actor, (to_log_prob * z / std)[None])
+        self._set_std_gradient(actor, std, to_log_prob * (np.square(z) - 1) - model.ent_coef / size)
         return {
-            "policy_gradient_loss": -torch.minimum(unclipped, clipped).mean().item(),
-            "entropy_loss": -entropy.mean().item(),
-            "clip_fraction": ((ratio - 1).abs() > clip_range).float().mean().item(),
-            "approx_kl": (ratio - 1 - log_ratio).mean().item(),
+            "policy_gradient_loss": -float(np.minimum(unclipped, clipped).mean()),
+            "entropy_loss": -float(entropy.mean()),
+            "clip_fraction": float((np.abs(ratio - 1) > clip_range).mean()),
+            "approx_kl": float((ratio - 1 - log_ratio).mean()),
         }
 
-    def _compute_critic_gradients(self, batch: dict[str, Tensor], clip_range_vf: float | None) -> dict[str, float]:
+    def _compute_critic_gradients(
+        self, batch: dict[str, NDArray[Any]], clip_range_vf: float | None
+    ) -> dict[str, float]:
         """Set the gradients of the critic's weights; return its loss."""
-        critic = self._critic.run(batch["features"])
-        values = critic[-1].flatten()
+        critic = self._critic.run(batch["features"][None], "learning")
+        values = critic[-1].ravel()
         to_value = values - batch["returns"]
         if clip_range_vf is not None:
             moved = values - batch["values"]
-            to_value = batch["values"] + moved.clamp(-clip_range_vf, clip_range_vf) - batch["returns"]
-        loss = to_value.square().mean().item()
+            to_value = batch["values"] + moved.clip(-clip_range_vf, clip_range_vf) - batch["returns"]
+        loss = float(np.square(to_value).mean())
         if clip_range_vf is not None:
-            to_value = to_value * (moved.abs() <= clip_range_vf)
-        self._critic.backpropagate(critic, to_value.unsqueeze(1) * (2 * self._model.vf_coef / len(values)))
+            to_value = to_value * (np.abs(moved) <= clip_range_vf)
+        self._critic.backpropagate(critic, to_value[None, :, None] * (2 * self._model.vf_coef / len(values)))
         return {"value_loss": loss}
 
-    def _compute_std(self, actor: list[Tensor]) -> Tensor:
+    def _compute_std(self, actor: list[Floats]) -> Floats:
         """Return the standard deviation of actions: of all alike, or with gSDE of each, shape (batch, actions)."""
         policy = self._policy
+        log_std: Floats = policy.log_std.numpy()
         if not policy.use_sde:
-            return torch.exp(policy.log_std)
-        variance = actor[-2].square() @ torch.exp(2 * policy.log_std) + float(policy.action_dist.epsilon)
-        return variance.sqrt()
+            return np.exp(log_std)
+        variance = np.square(actor[-2][0]) @ np.exp(2 * log_std) + float(policy.action_dist.epsilon)
+        std: Floats = np.sqrt(variance)
+        return std
 
-    def _set_std_gradient(self, actor: list[Tensor], std: Tensor, to_log_std: Tensor) -> None:
+    def _set_std_gradient(self, actor: list[Floats], std: Floats, to_log_std: Floats) -> None:
         """Set the gradient of `log_std` from that of the logarithm of `_compute_std`, shape (batch, actions)."""
-        parameter = self._policy.log_std
         if not self._policy.use_sde:
-            torch.sum(to_log_std, 0, out=parameter.grad)
+            np.sum(to_log_std, 0, out=self._log_std_gradient)
             return
         # std^2 = latent^2 @ exp(2 log_std) + epsilon; no gradient flows into the latent values, as in SB3.
-        torch.mul(actor[-2].square().t() @ (to_log_std / std.square()), (2 * parameter).exp(), out=parameter.grad)
+        of_variance = np.square(actor[-2][0]).T @ (to_log_std / np.square(std))
+        np.multiply(of_variance, np.exp(2 * self._policy.log_std.numpy()), out=self._log_std_gradient)
 
     def _step(self) -> None:
-        gradients, limit = self._gradients, self._model.max_grad_norm
-        norm = gradients.norm().item()
+        limit = self._model.max_grad_norm
+        norm = math.sqrt(sum(float(np.vdot(gradient, gradient)) for gradient in self._gradients))
         if not norm <= limit:
-            gradients *= limit / (norm + 1e-6)
+            for gradient in self._gradients:
+                gradient *= limit / (norm + 1e-6)
         self._policy.optimizer.step()
 
     def _log(self, logged: dict[str, list[float]], clip_range: float, clip_range_vf: float | None) -> None:
@@ -188,10 +196,10 @@ class PpoUpdate:
             logger.record("train/clip_range_vf", clip_range_vf)
 
 
-def _shuffle(data: dict[str, Tensor], size: int) -> Iterator[dict[str, Tensor]]:
+def _shuffle(data: dict[str, NDArray[Any]], size: int) -> Iterator[dict[str, NDArray[Any]]]:
     """Yield minibatches of an epoch, in the order that SB3's buffer has them."""
     total = len(data["actions"])
-    order = torch.from_numpy(np.random.permutation(total))  # noqa: NPY002 (SB3's generator: checkpoints hold its state)
+    order = np.random.permutation(total)  # noqa: NPY002 (SB3's generator: checkpoints hold its state)
     shuffled = {name: rows[order] for name, rows in data.items()}
     for first in range(0, total, size):
         yield {name: rows[first : first + size] for name, rows in shuffled.items()}

@@ -12,31 +12,29 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from stable_baselines3 import SAC
-from torch import Tensor
 
-from rlctl.training.updates.mlp import Mlp, is_mlp, share_gradients
+from rlctl.training.updates.batches import Batch, sample_batches
+from rlctl.training.updates.mlp import Floats, is_mlp
 from rlctl.training.updates.side_by_side import SideBySide
 from rlctl.training.updates.squashed_actor import Sample, SquashedActor
 
 _LOSS_EVERY = 8
-"""Of so many updates in a row the first computes the critics' loss, which is only logged and takes TQC a while."""
+"""Of so many updates in a row the first computes the losses, which are only logged."""
 
 
 class SacUpdate:
-    """Updates a SAC model whose networks are multi-layer perceptrons."""
+    """Updates a SAC model whose networks are multi-layer perceptrons on the CPU."""
 
     algorithm: ClassVar[Any] = SAC
 
     def __init__(self, model: Any) -> None:
         self._model = model
         self._actor = SquashedActor(model.actor)
-        self._critics, self._targets = (
-            [Mlp(network) for network in critic.q_networks] for critic in (model.critic, model.critic_target)
-        )
-        share_gradients(model.critic.parameters())
-        self._side_by_side = SideBySide(self._critics, model.batch_size)
-        self._followed = [each.data for each in model.critic.parameters()]
-        self._following = [each.data for each in model.critic_target.parameters()]
+        self._side_by_side = SideBySide(list(model.critic.q_networks), model.batch_size)
+        self._critics = self._side_by_side.make_stacks(model.critic.q_networks)
+        self._targets = self._side_by_side.make_stacks(model.critic_target.q_networks)
+        self._followed = [values for critic in self._critics for values in critic.parameters]
+        self._following = [values for target in self._targets for values in target.parameters]
 
     @classmethod
     def supports(cls, model: Any) -> bool:
@@ -48,7 +46,7 @@ class SacUpdate:
         return (
             SquashedActor.supports(actor)
             and all(is_mlp(network) for network in critic.q_networks)
-            and not any(list(each.parameters()) for each in extractors)
+            and not any(list(extractor.parameters()) for extractor in extractors)
         )
 
     @torch.no_grad()
@@ -60,8 +58,7 @@ class SacUpdate:
             optimizers.append(model.ent_coef_optimizer)
         model._update_learning_rate(optimizers)
         logged: dict[str, list[float]] = collections.defaultdict(list)
-        for step in range(gradient_steps):
-            batch = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
+        for step, batch in enumerate(sample_batches(model, gradient_steps, batch_size)):
             self._update(batch, logged, with_loss=step % _LOSS_EVERY == 0)
             if step % model.target_update_interval == 0:
                 torch._foreach_lerp_(self._following, self._followed, model.tau)
@@ -70,21 +67,16 @@ class SacUpdate:
             model.logger.record(f"train/{name}", np.mean(values))
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
-    def _update(self, batch: Any, logged: dict[str, list[float]], *, with_loss: bool) -> None:
-        actor = self._model.actor
-        features, next_features = (
-            actor.extract_features(each, actor.features_extractor)
-            for each in (batch.observations, batch.next_observations)
-        )
+    def _update(self, batch: Batch, logged: dict[str, list[float]], *, with_loss: bool) -> None:
         if self._model.use_sde:
-            actor.reset_noise()
-        sample = self._actor.sample(features)
+            self._model.actor.reset_noise()
+        sample = self._actor.sample(batch.features, "learning")
         coefficient = self._update_coefficient(sample, logged)
-        target = self._compute_target(batch, next_features, coefficient)
-        outputs = self._update_critics(torch.cat([features, batch.actions], 1), target)
+        target = self._compute_target(batch, coefficient)
+        outputs = self._update_critics(np.concatenate([batch.features, batch.actions], 1), target)
         if with_loss:
-            logged["critic_loss"].append(sum(self._compute_loss(output, target) for output in outputs))
-        logged["actor_loss"].append(self._update_actor(features, sample, coefficient))
+            logged["critic_loss"].append(self._compute_loss(outputs, target))
+        logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
 
     def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> float:
         """Return the entropy coefficient, and learn it if it is to be learnt."""
@@ -93,66 +85,66 @@ class SacUpdate:
             coefficient: float = model.ent_coef_tensor.item()
         else:
             coefficient = model.log_ent_coef.exp().item()
-            missing = -(sample.log_prob.mean() + model.target_entropy)
-            logged["ent_coef_loss"].append((model.log_ent_coef * missing).item())
-            model.log_ent_coef.grad = missing.view_as(model.log_ent_coef)
+            missing = -(float(sample.log_prob.mean()) + float(model.target_entropy))
+            logged["ent_coef_loss"].append(model.log_ent_coef.item() * missing)
+            model.log_ent_coef.grad = torch.full_like(model.log_ent_coef, missing)
             model.ent_coef_optimizer.step()
         logged["ent_coef"].append(coefficient)
         return coefficient
 
-    def _compute_target(self, batch: Any, next_features: Tensor, coefficient: float) -> Tensor:
+    def _compute_target(self, batch: Batch, coefficient: float) -> Floats:
         """Return what the critics are to expect, shape (batch, estimates)."""
-        sample = self._actor.sample(next_features)
-        inputs = torch.cat([next_features, sample.action], 1)
-        outputs = self._side_by_side.run([functools.partial(target.run, inputs) for target in self._targets])
-        estimates = self._choose_estimates([values[-1] for values in outputs])
-        discount = self._model.gamma if batch.discounts is None else batch.discounts
-        result: Tensor = batch.rewards + (1 - batch.dones) * discount * (estimates - coefficient * sample.log_prob)
-        return result
+        sample = self._actor.sample(batch.next_features, "next")
+        inputs = np.concatenate([batch.next_features, sample.action], 1)[None]
+        passes = self._side_by_side.run([functools.partial(stack.run, inputs, "target") for stack in self._targets])
+        estimates = self._choose_estimates(np.concatenate([values[-1] for values in passes]))
+        target: Floats = batch.rewards + batch.discounts * (estimates - coefficient * sample.log_prob)
+        return target
 
-    def _update_critics(self, inputs: Tensor, target: Tensor) -> list[Tensor]:
-        """Return the critics' outputs before the update."""
-        outputs = self._side_by_side.run(
-            [functools.partial(self._compute_critic_gradients, critic, inputs, target) for critic in self._critics]
-        )
+    def _update_critics(self, inputs: Floats, target: Floats) -> Floats:
+        """Return the critics' outputs before the update, shape (critics, batch, outputs)."""
+
+        def learn(index: int) -> Floats:
+            critics = self._critics[index]
+            values = critics.run(inputs[None], "learning")
+            critics.backpropagate(values, self._differentiate_loss(values[-1], target))
+            return values[-1]
+
+        outputs = self._side_by_side.run([functools.partial(learn, index) for index in range(len(self._critics))])
         self._model.critic.optimizer.step()
-        return outputs
+        return np.concatenate(outputs)
 
-    def _compute_critic_gradients(self, critic: Mlp, inputs: Tensor, target: Tensor) -> Tensor:
-        """Set the gradients of a critic's weights; return its output."""
-        values = critic.run(inputs)
-        critic.backpropagate(values, self._differentiate_loss(values[-1], target))
-        return values[-1]
-
-    def _update_actor(self, features: Tensor, sample: Sample, coefficient: float) -> float:
+    def _update_actor(self, features: Floats, sample: Sample, coefficient: float) -> float:
         """Return the actor's loss."""
-        inputs = torch.cat([features, sample.action], 1)
-        passes = self._side_by_side.run([functools.partial(critic.run, inputs) for critic in self._critics])
-        value, to_outputs = self._judge([values[-1] for values in passes])
-        to_inputs = self._side_by_side.run(
-            [
-                functools.partial(critic.input_gradient, values, to_output / -len(value))
-                for critic, values, to_output in zip(self._critics, passes, to_outputs, strict=True)
-            ]
-        )
-        to_action = torch.stack(to_inputs).sum(0)[:, features.shape[1] :]
+        inputs = np.concatenate([features, sample.action], 1)[None]
+        passes = self._side_by_side.run([functools.partial(critics.run, inputs, "actor") for critics in self._critics])
+        value, to_outputs = self._value(np.concatenate([values[-1] for values in passes]))
+        to_outputs /= -len(value)
+        calls, first = [], 0
+        for critics, values in zip(self._critics, passes, strict=True):
+            part = to_outputs[first : first + critics.count]
+            calls.append(functools.partial(critics.input_gradient, values, part, features.shape[1]))
+            first += critics.count
+        to_action = np.concatenate(self._side_by_side.run(calls)).sum(0)
         self._actor.backpropagate(sample, to_action, coefficient / len(value))
         self._model.actor.optimizer.step()
-        return (coefficient * sample.log_prob - value).mean().item()
+        return float((coefficient * sample.log_prob - value).mean())
 
-    def _choose_estimates(self, outputs: list[Tensor]) -> Tensor:
+    def _choose_estimates(self, outputs: Floats) -> Floats:
         """Return the estimates of target critics that count, shape (batch, estimates)."""
-        return torch.cat(outputs, 1).amin(1, keepdim=True)
+        estimates: Floats = outputs.min(0)
+        return estimates
 
-    def _compute_loss(self, output: Tensor, target: Tensor) -> float:
-        """Return a critic's share of the loss."""
-        return 0.5 * (output - target).square().mean().item()
+    def _compute_loss(self, outputs: Floats, target: Floats) -> float:
+        """Return the critics' loss."""
+        return 0.5 * float(np.square(outputs - target).mean((1, 2)).sum())
 
-    def _differentiate_loss(self, output: Tensor, target: Tensor) -> Tensor:
-        """Return the gradient of a critic's share of the loss with respect to its output."""
-        return (output - target) / len(output)
+    def _differentiate_loss(self, outputs: Floats, target: Floats) -> Floats:
+        """Return the gradient of the critics' loss with respect to their outputs, shape (critics, batch, outputs)."""
+        return (outputs - target) / np.float32(outputs.shape[1])
 
-    def _judge(self, outputs: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        """Return the value of actions by the critics' outputs, shape (batch, 1), and its gradient for each output."""
-        value, lowest = torch.cat(outputs, 1).min(1, keepdim=True)
-        return value, [(lowest == index).float() for index in range(len(outputs))]
+    def _value(self, outputs: Floats) -> tuple[Floats, Floats]:
+        """Return the value of actions by the critics' outputs, shape (batch, 1), and its gradient for the outputs."""
+        lowest = outputs.argmin(0)
+        to_outputs = (np.arange(len(outputs))[:, None, None] == lowest).astype(np.float32)
+        return outputs.min(0), to_outputs

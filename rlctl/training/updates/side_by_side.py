@@ -7,9 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import torch
+from torch import nn
 
 from rlctl.rollout.workers import available_cores
-from rlctl.training.updates.mlp import Mlp
+from rlctl.training.updates.mlp import MlpStack, count_weights
 
 Result = TypeVar("Result")
 
@@ -23,11 +24,17 @@ class SideBySide:
     For small networks and on one core, all on this thread. The results are the same to the last bit.
     """
 
-    def __init__(self, networks: Iterable[Mlp], batch_size: int) -> None:
-        smallest = min(network.count_weights() for network in networks)
+    def __init__(self, networks: Sequence[Iterable[nn.Module]], batch_size: int) -> None:
+        smallest = min(count_weights(network) for network in networks)
         self._second: ThreadPoolExecutor | None = None
         if batch_size * smallest >= _WORTHWHILE and available_cores() > 1:
             self._second = ThreadPoolExecutor(1, initializer=_prepare_thread)
+
+    def make_stacks(self, networks: Iterable[Iterable[nn.Module]]) -> list[MlpStack]:
+        """Return networks of equal shape as one stack, or as one each where a second thread is used."""
+        if self._second is None:
+            return [MlpStack(list(networks))]
+        return [MlpStack([network]) for network in networks]
 
     def run(self, calls: Sequence[Callable[[], Result]]) -> list[Result]:
         """Return what each call returns."""

@@ -8,11 +8,19 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import numpy as np
 import torch
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution, StateDependentNoiseDistribution
-from torch import Tensor
 
-from rlctl.training.updates.mlp import LOG_SQRT_TAU, Mlp, is_mlp, share_gradients
+from rlctl.training.updates.mlp import (
+    LOG_SQRT_TAU,
+    Floats,
+    MlpStack,
+    allocate_gradient,
+    is_mlp,
+    join_outputs,
+    share_joined,
+)
 
 _LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE
 
@@ -21,13 +29,13 @@ _LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE
 class Sample:
     """Actions of a batch that the actor drew, and what their gradients are computed from; (batch, actions) each."""
 
-    values: list[Tensor]
+    values: list[Floats]
     """What the layers of the actor made of the observations."""
-    noise: Tensor
+    noise: Floats
     """What was added to the mean before the actions were squashed."""
-    std: Tensor
-    action: Tensor
-    log_prob: Tensor
+    std: Floats
+    action: Floats
+    log_prob: Floats
     """Shape (batch, 1)."""
 
 
@@ -36,10 +44,18 @@ class SquashedActor:
 
     def __init__(self, actor: Any) -> None:
         self._actor = actor
-        self._network = Mlp(_actor_modules(actor))
         self._epsilon = float(actor.action_dist.epsilon)
         self._mean_limit = float(actor.clip_mean) if actor.use_sde and actor.clip_mean > 0 else None
-        share_gradients(actor.parameters())
+        modules = _list_modules(actor)
+        if actor.use_sde:
+            self._network = MlpStack([modules])
+            self._log_std_gradient = allocate_gradient(actor.log_std)
+        else:
+            heads = [modules[-1], actor.log_std]
+            joined = join_outputs(heads)
+            self._network = MlpStack([[*modules[:-1], joined]])
+            share_joined(heads, joined)
+        self._count = modules[-1].out_features
 
     @staticmethod
     def supports(actor: Any) -> bool:
@@ -49,60 +65,67 @@ class SquashedActor:
             plain = distribution.full_std and not distribution.use_expln
         else:
             plain = type(distribution) is SquashedDiagGaussianDistribution
-        return plain and len(actor.latent_pi) > 0 and is_mlp(_actor_modules(actor))
+        return plain and len(actor.latent_pi) > 0 and is_mlp(_list_modules(actor))
 
-    def sample(self, features: Tensor) -> Sample:
-        """Draw actions; with gSDE by the matrix that was drawn last."""
-        values = self._network.run(features)
-        latent, mean = values[-2:]
+    def sample(self, features: Floats, use: str) -> Sample:
+        """Draw actions for features, shape (batch, features); with gSDE by the matrix that was drawn last.
+
+        The next sample for the same `use` overwrites the `values` of this one.
+        """
+        values = self._network.run(features[None], use)
+        latent, mean = values[-2][0], values[-1][0, :, : self._count]
         if self._actor.use_sde:
             if self._mean_limit is not None:
-                mean = mean.clamp(-self._mean_limit, self._mean_limit)
-            noise = latent @ self._actor.action_dist.exploration_mat
-            std = (latent.square() @ torch.exp(2 * self._actor.log_std) + self._epsilon).sqrt()
-            log_std, z = std.log(), noise / std
+                mean = mean.clip(-self._mean_limit, self._mean_limit)
+            noise = latent @ self._actor.action_dist.exploration_mat.numpy()
+            std = np.sqrt(np.square(latent) @ self._read_variances() + self._epsilon)
+            log_std, z = np.log(std), noise / std
         else:
-            log_std = self._actor.log_std(latent).clamp(_LOG_STD_MIN, _LOG_STD_MAX)
-            std, z = log_std.exp(), torch.randn_like(mean)
+            log_std = values[-1][0, :, self._count :].clip(_LOG_STD_MIN, _LOG_STD_MAX)
+            z = np.empty_like(log_std)
+            torch.from_numpy(z).normal_()  # torch's generator, as in SB3
+            std = np.exp(log_std)
             noise = std * z
-        action = torch.tanh(mean + noise)
-        squashing = (1 - action.square() + self._epsilon).log()
-        log_prob = (z.square() * -0.5 - log_std - squashing - LOG_SQRT_TAU).sum(1, keepdim=True)
+        action = np.tanh(mean + noise)
+        squashing = np.log(1 - np.square(action) + self._epsilon)
+        log_prob = (np.square(z) * -0.5 - log_std - squashing - LOG_SQRT_TAU).sum(1, keepdims=True)
         return Sample(values, noise, std, action, log_prob)
 
-    def backpropagate(self, sample: Sample, to_action: Tensor, to_log_prob: float) -> None:
-        """Set the gradients of the weights from those of drawn actions and of each of their log-probabilities."""
-        slope = 1 - sample.action.square()
-        to_mean = to_action * slope + sample.action * slope / (slope + self._epsilon) * (2 * to_log_prob)
-        latent, mean = sample.values[-2:]
-        if self._actor.use_sde:
-            to_latent = self._backpropagate_gsde(latent, sample, to_mean, to_log_prob)
-            if self._mean_limit is not None:
-                to_mean = to_mean * (mean.abs() < self._mean_limit)
-        else:
-            layer = self._actor.log_std
-            log_std = layer(latent)
-            within = (log_std >= _LOG_STD_MIN) & (log_std <= _LOG_STD_MAX)
-            to_log_std = (to_mean * sample.noise - to_log_prob) * within
-            torch.mm(to_log_std.t(), latent, out=layer.weight.grad)
-            torch.sum(to_log_std, 0, out=layer.bias.grad)
-            to_latent = to_log_std @ layer.weight
-        self._network.backpropagate(sample.values, to_mean, latent=to_latent)
+    def _read_variances(self) -> Floats:
+        """Return exp(2 log_std), of gSDE."""
+        variances: Floats = np.exp(2 * self._actor.log_std.numpy())
+        return variances
 
-    def _backpropagate_gsde(self, latent: Tensor, sample: Sample, to_mean: Tensor, to_log_prob: float) -> Tensor:
+    def backpropagate(self, sample: Sample, to_action: Floats, to_log_prob: float) -> None:
+        """Set the gradients of the weights from those of drawn actions and of each of their log-probabilities."""
+        slope = 1 - np.square(sample.action)
+        to_mean = to_action * slope + sample.action * slope / (slope + self._epsilon) * (2 * to_log_prob)
+        outputs = sample.values[-1][0]
+        if self._actor.use_sde:
+            to_latent = self._backpropagate_gsde(sample.values[-2][0], sample, to_mean, to_log_prob)
+            if self._mean_limit is not None:
+                to_mean = to_mean * (np.abs(outputs) < self._mean_limit)
+            self._network.backpropagate(sample.values, to_mean[None], latent=to_latent[None])
+            return
+        log_std = outputs[:, self._count :]
+        within = (log_std >= _LOG_STD_MIN) & (log_std <= _LOG_STD_MAX)
+        to_log_std = (to_mean * sample.noise - np.float32(to_log_prob)) * within
+        self._network.backpropagate(sample.values, np.concatenate([to_mean, to_log_std], 1)[None])
+
+    def _backpropagate_gsde(self, latent: Floats, sample: Sample, to_mean: Floats, to_log_prob: float) -> Floats:
         """Set the gradient of `log_std`, and return that of the latent values."""
         # noise = latent @ matrix, where matrix = exp(log_std) * normal numbers, and
         # std^2 = latent^2 @ exp(2 log_std) + epsilon.
-        matrix, variances = self._actor.action_dist.exploration_mat, torch.exp(2 * self._actor.log_std)
-        precision = sample.std.square().reciprocal()
+        matrix, variances = self._actor.action_dist.exploration_mat.numpy(), self._read_variances()
+        precision = np.reciprocal(np.square(sample.std))
         to_noise = to_mean - sample.noise * precision * to_log_prob
-        to_variance = (sample.noise.square() * precision - 1) * precision * (0.5 * to_log_prob)
-        torch.mul(latent.t() @ to_noise, matrix, out=self._actor.log_std.grad)
-        self._actor.log_std.grad += (latent.square().t() @ to_variance) * variances * 2
-        gradient: Tensor = to_noise @ matrix.t() + latent * (to_variance @ variances.t()) * 2
+        to_variance = (np.square(sample.noise) * precision - 1) * precision * (0.5 * to_log_prob)
+        np.multiply(latent.T @ to_noise, matrix, out=self._log_std_gradient)
+        self._log_std_gradient += (np.square(latent).T @ to_variance) * variances * 2
+        gradient: Floats = to_noise @ matrix.T + latent * (to_variance @ variances.T) * 2
         return gradient
 
 
-def _actor_modules(actor: Any) -> list[torch.nn.Module]:
+def _list_modules(actor: Any) -> list[Any]:
     mean = actor.mu[0] if isinstance(actor.mu, torch.nn.Sequential) else actor.mu  # gSDE clips it
     return [*actor.latent_pi, mean]
