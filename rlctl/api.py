@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rlctl.evaluation.evaluate import Evaluation
-    from rlctl.policy.policy import Policy
+    from rlctl.policy.file import Policy
     from rlctl.training.request import TrainResult
 
 

@@ -136,7 +136,7 @@ def test_recipes_are_recipes(block):
 
 def test_limits_are_limits_of_reach():
     from rlctl.deploy import Limits, SafetyFilter
-    from rlctl.policy.policy import read_info
+    from rlctl.policy.file import read_info
     from rlctl.policy.shipped import PRETRAINED
     from rlctl.run.lookup import find_policy
 

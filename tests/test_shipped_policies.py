@@ -10,7 +10,7 @@ from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.score import measure_score
 from rlctl.exporting.policy_file import export_actor
-from rlctl.policy.policy import PolicyInfo, read_info, read_policy, save_policy
+from rlctl.policy.file import PolicyInfo, read_info, read_policy, save_policy
 from rlctl.policy.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
 from rlctl.recipe.sources import resolve_packaged
 from rlctl.run.directory import RunDirectory

@@ -22,8 +22,8 @@ from rlctl.evaluation.episode_statistics import (
     success_interval,
     success_rate,
 )
-from rlctl.policy.acting import Exploration, check_playable
-from rlctl.policy.policy import PolicyInfo, load_policy, read_policy
+from rlctl.policy.file import PolicyInfo, load_policy, read_policy
+from rlctl.policy.players.policy_player import Exploration, check_playable
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores

@@ -19,8 +19,8 @@ from rlctl.evaluation import axes as axes_of
 from rlctl.evaluation.episode_statistics import summarize
 from rlctl.evaluation.evaluate import NO_GATES, EvalRequest, Gates, LoadedPolicy, find_player, start_workers
 from rlctl.evaluation.push import measure_push
-from rlctl.policy.acting import Exploration
-from rlctl.policy.policy import collect_versions
+from rlctl.policy.file import collect_versions
+from rlctl.policy.players.policy_player import Exploration
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds

@@ -10,11 +10,11 @@ from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import SINGLE, split_space
 from rlctl.exporting.layers import BATCH, Graph, concatenate, emit, emit_lstm, unsupported
+from rlctl.policy.file import PolicyInfo
 from rlctl.policy.layers import Lstm, Normalize, OneHot
 from rlctl.policy.network import Network, Tensors
 from rlctl.policy.onnx_file import METADATA_KEY
 from rlctl.policy.onnx_policy import ACTION, SINGLE_INPUT, STATE_INPUTS, STATE_OUTPUTS
-from rlctl.policy.policy import PolicyInfo
 from rlctl.task.joints import Joints
 
 _STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of the step before"

@@ -18,9 +18,9 @@ from rlctl.errors import AnswerIsNo, UsageError, short_repr
 from rlctl.exporting.c_layers import CWriter
 from rlctl.output import format_count
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type, observation_type
+from rlctl.policy.file import PolicyInfo
 from rlctl.policy.layers import ScaleImage
 from rlctl.policy.network import Network, Tensors, select_actor_tensors
-from rlctl.policy.policy import PolicyInfo
 from rlctl.version import __version__
 
 LARGEST = 3_000_000

@@ -12,9 +12,9 @@ from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.report import ExportReport, format_agreement, format_closed_loop
 from rlctl.output import print_notes
 from rlctl.policy import onnx_file
-from rlctl.policy.acting import check_playable
+from rlctl.policy.file import Policy, PolicyInfo, read_policy
 from rlctl.policy.network import Tensors
-from rlctl.policy.policy import Policy, PolicyInfo, read_policy
+from rlctl.policy.players.policy_player import check_playable
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import lookup

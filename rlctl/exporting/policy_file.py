@@ -13,10 +13,10 @@ from rlctl.environments.task_version import identify_task
 from rlctl.errors import UsageError
 from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.score import describe_score, measure_score
+from rlctl.policy.file import PolicyInfo, read_info, read_policy, save_policy
 from rlctl.policy.network import select_actor_tensors
-from rlctl.policy.policy import PolicyInfo, read_info, read_policy, save_policy
+from rlctl.policy.players.baselines import BASELINES
 from rlctl.policy.shipped import Provenance
-from rlctl.rollout.baselines import BASELINES
 from rlctl.run import lookup
 from rlctl.run.lookup import FoundPolicy
 

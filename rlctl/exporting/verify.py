@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import map_parts, stack, take_row
 from rlctl.policy.c_policy import CPolicy
+from rlctl.policy.file import Policy
 from rlctl.policy.onnx_policy import OnnxPolicy
-from rlctl.policy.policy import Policy
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers

@@ -15,7 +15,7 @@ from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 from rlctl.importing.sb3_model import SavedModel, SavedNormalization, read_model, read_normalization
-from rlctl.policy.policy import PolicyInfo, collect_versions, load_policy, save_policy
+from rlctl.policy.file import PolicyInfo, collect_versions, load_policy, save_policy
 from rlctl.storage import files
 
 

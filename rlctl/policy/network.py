@@ -14,8 +14,8 @@ from gymnasium import spaces
 from rlctl.environments.dict_spaces import split_space
 from rlctl.errors import UsageError
 from rlctl.policy import layers
+from rlctl.policy.file import PolicyInfo
 from rlctl.policy.layers import Activation, Array, Layer, Linear, apply
-from rlctl.policy.policy import PolicyInfo
 
 Tensors = Mapping[str, Array]
 

@@ -21,9 +21,9 @@ from threadpoolctl import threadpool_limits
 
 from rlctl.environments.dict_spaces import Observations, join, split
 from rlctl.errors import ArtifactError, short_repr
+from rlctl.policy.file import Policy, PolicyInfo, read_policy
 from rlctl.policy.layers import Normalize
 from rlctl.policy.network import select_actor_tensors
-from rlctl.policy.policy import Policy, PolicyInfo, read_policy
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": stable_baselines3.PPO,

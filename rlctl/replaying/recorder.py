@@ -17,7 +17,7 @@ from rlctl.environments import dict_spaces, registry
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
-from rlctl.policy.policy import collect_versions
+from rlctl.policy.file import collect_versions
 from rlctl.replaying.scene import Env, Scene, Warn, make_reader
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 

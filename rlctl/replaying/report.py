@@ -11,7 +11,7 @@ from typing import Any
 from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.errors import AnswerIsNo
-from rlctl.policy.policy import collect_versions
+from rlctl.policy.file import collect_versions
 from rlctl.replaying.difference import Difference
 
 

@@ -13,8 +13,8 @@ import pydantic
 
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.acting import Exploration
-from rlctl.policy.policy import PolicyInfo
+from rlctl.policy.file import PolicyInfo
+from rlctl.policy.players.policy_player import Exploration
 
 
 @dataclasses.dataclass(frozen=True)

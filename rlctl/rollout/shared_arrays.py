@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import split_space
 from rlctl.environments.info import EnvInfo
+from rlctl.policy.file import PolicyInfo
 from rlctl.policy.network import select_actor_tensors
-from rlctl.policy.policy import PolicyInfo
 from rlctl.rollout.messages import EpisodeResult
 
 Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]

@@ -24,10 +24,10 @@ from rlctl.environments.dict_spaces import SINGLE
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
-from rlctl.policy.acting import Player, PolicyPlayer
+from rlctl.policy.players.baselines import make_player
+from rlctl.policy.players.policy_player import Player, PolicyPlayer
 from rlctl.processes.child_process import write_stderr
 from rlctl.rollout import messages
-from rlctl.rollout.baselines import make_player
 from rlctl.rollout.failures import FailedInEpisode, describe_failure
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
 from rlctl.rollout.returned_values import ObservationWriter, compute_rewards

@@ -20,7 +20,7 @@ from rlctl.environments.dict_spaces import Observations, join
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
-from rlctl.policy.policy import PolicyInfo
+from rlctl.policy.file import PolicyInfo
 from rlctl.processes.child_process import anonymous_file, write_stderr
 from rlctl.rollout import messages
 from rlctl.rollout.failures import format_hint, make_error

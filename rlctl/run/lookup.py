@@ -16,7 +16,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.environments.task_version import describe_task_changes
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 from rlctl.output import format_duration
-from rlctl.policy.policy import PolicyInfo, read_info
+from rlctl.policy.file import PolicyInfo, read_info
 from rlctl.policy.shipped import PRETRAINED, find_shipped_policy
 from rlctl.run.directory import ROOT, TUNE_FILE, RunDirectory, is_group
 

@@ -18,7 +18,7 @@ from rlctl.checking.leaves import Leaf, find_leaves
 from rlctl.environments import registry
 from rlctl.environments.plugin_code import call_plugin
 from rlctl.errors import TaskError
-from rlctl.policy.policy import PolicyInfo, read_info
+from rlctl.policy.file import PolicyInfo, read_info
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
 

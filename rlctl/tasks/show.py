@@ -7,7 +7,7 @@ from typing import Any
 
 from rlctl import output
 from rlctl.evaluation.score import describe_score
-from rlctl.policy.policy import PolicyInfo
+from rlctl.policy.file import PolicyInfo
 from rlctl.recipe.stages import Stage
 from rlctl.tasks.description import Description
 

@@ -24,7 +24,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from rlctl.errors import ArtifactError
-from rlctl.policy.policy import PolicyInfo, collect_versions, encode_policy
+from rlctl.policy.file import PolicyInfo, collect_versions, encode_policy
 from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
 from rlctl.training import replay_segments, snapshot

@@ -12,8 +12,8 @@ import numpy as np
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, EpisodeFailed, RlctlError
-from rlctl.policy.acting import Exploration
-from rlctl.policy.policy import PolicyInfo, collect_versions
+from rlctl.policy.file import PolicyInfo, collect_versions
+from rlctl.policy.players.policy_player import Exploration
 from rlctl.recipe.recipe import Recipe
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds

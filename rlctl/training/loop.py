@@ -14,7 +14,7 @@ from typing import Any
 
 from rlctl.errors import ArtifactError, Interrupted, RlctlError, TaskError, UsageError
 from rlctl.evaluation.episode_statistics import mean_return, success_rate
-from rlctl.policy.policy import Score
+from rlctl.policy.file import Score
 from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.rollout.collect import Episode
 from rlctl.runs.diagnosis import Grade, diagnose

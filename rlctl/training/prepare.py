@@ -18,7 +18,7 @@ from rlctl.environments.named_task import RUN
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.output import format_count
-from rlctl.policy.policy import read_policy
+from rlctl.policy.file import read_policy
 from rlctl.recipe.recipe import ON_POLICY
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.policy.policy import PolicyInfo
+from rlctl.policy.file import PolicyInfo
 from rlctl.recipe.recipe import Recipe
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.training.progress import Progress

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rlctl.errors import ArtifactError
-from rlctl.policy.policy import PolicyInfo, read_policy, save_policy
+from rlctl.policy.file import PolicyInfo, read_policy, save_policy
 from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
 from rlctl.storage.table import Table

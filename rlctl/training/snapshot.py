@@ -20,7 +20,7 @@ from rlctl.environments.dict_spaces import split
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, DivergedError
-from rlctl.policy.policy import PolicyInfo, collect_versions
+from rlctl.policy.file import PolicyInfo, collect_versions
 from rlctl.policy.torch_policy import describe_network, policy_name
 
 Tensors = dict[str, NDArray[Any]]

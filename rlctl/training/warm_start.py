@@ -9,8 +9,8 @@ from typing import Any
 from rlctl.environments import registry
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import UsageError
+from rlctl.policy.file import PolicyInfo, read_info, read_policy
 from rlctl.policy.network import select_actor_tensors
-from rlctl.policy.policy import PolicyInfo, read_info, read_policy
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.recipe.recipe import Recipe
 from rlctl.run.lookup import find_policy

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.acting import Exploration
-from rlctl.policy.policy import PolicyInfo
+from rlctl.policy.file import PolicyInfo
+from rlctl.policy.players.policy_player import Exploration
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import Play
 from rlctl.rollout.seeds import Stream, episode_seed

@@ -50,7 +50,7 @@ def c_function(repeat: int) -> Row:
     """Time C for one observation, called through ctypes, beside onnxruntime's own `session.run`; both from Python."""
     from rlctl.exporting.c_source import build_library, find_compiler, write_c
     from rlctl.policy.c_policy import CPolicy
-    from rlctl.policy.policy import read_policy
+    from rlctl.policy.file import read_policy
 
     run = short_run()
     rlctl_command("export", str(run), "--onnx")

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import rlctl
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.acting import Exploration
+from rlctl.policy.players.policy_player import Exploration
 from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.task.bullet import pybullet, pybullet_data

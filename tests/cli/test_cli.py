@@ -47,7 +47,7 @@ def policy(tmp_path_factory):
 
     from rlctl.environments.info import EnvInfo, space_to_json
     from rlctl.environments.spec import EnvSpec
-    from rlctl.policy.policy import PolicyInfo, save_policy
+    from rlctl.policy.file import PolicyInfo, save_policy
     from rlctl.policy.torch_policy import build_network
 
     env = EnvInfo(

@@ -3,7 +3,7 @@
 import csv
 from pathlib import Path
 
-from rlctl.policy.policy import read_policy
+from rlctl.policy.file import read_policy
 from rlctl.run.directory import RunDirectory
 from tests.crash.trials import Ended, Trials, only_run, resume
 from tests.training.comparing import assert_same_run

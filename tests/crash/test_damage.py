@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import ArtifactError
-from rlctl.policy.policy import read_policy
+from rlctl.policy.file import read_policy
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from tests.crash.conftest import PARTS, parts

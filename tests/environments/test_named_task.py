@@ -11,7 +11,7 @@ from rlctl.environments import named_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
-from rlctl.policy.policy import compute_digest, read_policy
+from rlctl.policy.file import compute_digest, read_policy
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files

@@ -8,7 +8,7 @@ import pytest
 
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.policy import save_policy
+from rlctl.policy.file import save_policy
 from rlctl.run.directory import RunDirectory
 from tests.rollout.policies import linear
 

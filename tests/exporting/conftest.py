@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.policy import save_policy
+from rlctl.policy.file import save_policy
 from rlctl.policy.torch_policy import ALGORITHMS, policy_name
 from rlctl.recipe.recipe import Normalize
 from rlctl.training.algorithms import keep_compiler_out, wrap_normalize

@@ -12,8 +12,8 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.report import format_closed_loop, show
 from rlctl.exporting.verify import Comparison, compare_episodes, verify
+from rlctl.policy.file import read_policy
 from rlctl.policy.onnx_policy import OnnxPolicy
-from rlctl.policy.policy import read_policy
 from rlctl.policy.torch_policy import TorchPolicy
 from rlctl.rollout.collect import Episode
 from rlctl.rollout.messages import EpisodeResult

@@ -12,7 +12,7 @@ from rlctl.errors import UsageError
 from rlctl.exporting.c_source import FLAGS, build_library, find_compiler, write_c
 from rlctl.exporting.export import export_policy
 from rlctl.policy.c_policy import CPolicy
-from rlctl.policy.policy import read_policy
+from rlctl.policy.file import read_policy
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy
 from tests.exporting.test_export_graph import random_observations
 

@@ -11,8 +11,8 @@ from rlctl.environments.info import describe
 from rlctl.errors import UsageError
 from rlctl.exporting.actor import build
 from rlctl.policy import onnx_file
+from rlctl.policy.file import read_policy
 from rlctl.policy.onnx_policy import OnnxPolicy
-from rlctl.policy.policy import read_policy
 from rlctl.policy.torch_policy import ACTIVATIONS
 
 ALGORITHMS = ["ppo", "a2c", "sac", "td3", "ddpg", "tqc", "crossq", "recurrent_ppo", "dqn"]

@@ -11,8 +11,8 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.policy import onnx_file
+from rlctl.policy.file import PolicyInfo
 from rlctl.policy.onnx_policy import OnnxPolicy
-from rlctl.policy.policy import PolicyInfo
 
 BOX = {"type": "Box", "low": "-1.0", "high": "1.0", "shape": [4], "dtype": "float32"}
 ENV = EnvInfo(observation_space=BOX, action_space=BOX)

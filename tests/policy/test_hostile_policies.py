@@ -13,7 +13,7 @@ from rlctl import load_policy
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError
-from rlctl.policy.policy import PolicyInfo, compute_digest, save_policy
+from rlctl.policy.file import PolicyInfo, compute_digest, save_policy
 from rlctl.policy.torch_policy import TorchPolicy, build_network
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)

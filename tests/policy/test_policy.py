@@ -14,8 +14,8 @@ from rlctl import load_policy
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
+from rlctl.policy.file import PolicyInfo, compute_digest, read_policy, save_policy
 from rlctl.policy.network import Network, select_actor_tensors
-from rlctl.policy.policy import PolicyInfo, compute_digest, read_policy, save_policy
 from rlctl.policy.torch_policy import TorchPolicy, build_network, pin_threads
 from rlctl.run.directory import RunDirectory
 

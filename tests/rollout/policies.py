@@ -3,7 +3,7 @@
 import numpy as np
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.policy import PolicyInfo
+from rlctl.policy.file import PolicyInfo
 
 
 def linear(info, weight, log_std=None, bias=0.0):

@@ -5,7 +5,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import DivergedError, EpisodeFailed, TaskError
-from rlctl.policy.acting import Exploration
+from rlctl.policy.players.policy_player import Exploration
 from rlctl.rollout import collect
 from rlctl.rollout.collect import play_episodes
 from tests.rollout.policies import linear

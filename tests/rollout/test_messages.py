@@ -6,8 +6,8 @@ import pytest
 
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.acting import Exploration
-from rlctl.policy.policy import PolicyInfo
+from rlctl.policy.file import PolicyInfo
+from rlctl.policy.players.policy_player import Exploration
 from rlctl.rollout import messages
 
 ENV = EnvInfo(observation_space={"type": "Discrete", "n": 2}, action_space={}, control_dt=math.inf)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import EpisodeFailed
-from rlctl.policy.acting import Exploration, PolicyPlayer
+from rlctl.policy.players.policy_player import Exploration, PolicyPlayer
 from rlctl.rollout.messages import Play
 from rlctl.rollout.seeds import Stream, episode_seed
 from tests.rollout.policies import linear

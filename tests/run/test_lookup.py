@@ -11,7 +11,7 @@ from rlctl.environments import registry
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.policy.policy import PolicyInfo, Score, save_policy
+from rlctl.policy.file import PolicyInfo, Score, save_policy
 from rlctl.run import directory, lookup
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import find_policy, find_run

@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.policy import PolicyInfo, save_policy
+from rlctl.policy.file import PolicyInfo, save_policy
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.runs.diagnosis import Grade, diagnose, format_end

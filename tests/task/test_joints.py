@@ -9,7 +9,7 @@ from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.exporting.actor import metadata
-from rlctl.policy.policy import PolicyInfo
+from rlctl.policy.file import PolicyInfo
 from rlctl.task.joints import Joints
 
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from rlctl import load_policy
 from rlctl.errors import RecipeError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
-from rlctl.policy.policy import read_policy
+from rlctl.policy.file import read_policy
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.rollout.workers import available_cores
 from rlctl.run.episode import load_episode

@@ -8,8 +8,8 @@ import pytest
 
 from rlctl import load_policy
 from rlctl.errors import ArtifactError, DivergedError, TaskError, UsageError
-from rlctl.policy.acting import PolicyPlayer
-from rlctl.policy.policy import read_policy
+from rlctl.policy.file import read_policy
+from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
 from rlctl.run.directory import RunDirectory

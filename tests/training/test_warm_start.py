@@ -5,7 +5,7 @@ import pytest
 
 from rlctl.environments.spec import merge
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.policy.policy import read_policy
+from rlctl.policy.file import read_policy
 from rlctl.policy.shipped import find_shipped_policy
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.request import run_training

@@ -11,9 +11,9 @@ import numpy as np
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError
-from rlctl.policy.acting import NumpyPolicy, check_playable
+from rlctl.policy.file import Policy, PolicyInfo, read_policy
 from rlctl.policy.network import DETERMINISTIC, Network, select_actor_tensors
-from rlctl.policy.policy import Policy, PolicyInfo, read_policy
+from rlctl.policy.players.policy_player import NumpyPolicy, check_playable
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RlctlError
-from rlctl.policy.policy import read_policy
+from rlctl.policy.file import read_policy
 from rlctl.recipe import sources
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.run.directory import RunDirectory

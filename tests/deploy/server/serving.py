@@ -14,7 +14,7 @@ from rlctl.deploy.server.client import PolicyClient
 from rlctl.deploy.server.serve import ServerSettings, make_loop, make_server, serve_until
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.policy import PolicyInfo, save_policy
+from rlctl.policy.file import PolicyInfo, save_policy
 from tests.rollout.policies import linear
 
 OBSERVATION = {"positions": [0.1, 0.2], "goal": [1.0, 2.0, 3.0]}

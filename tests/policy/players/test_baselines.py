@@ -7,7 +7,7 @@ from gymnasium import spaces
 from rlctl.errors import PolicyError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.evaluation.report import as_json
-from rlctl.rollout.baselines import load_function, make_player
+from rlctl.policy.players.baselines import load_function, make_player
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 OBSERVATIONS = spaces.Box(-1.0, 1.0, (3,))

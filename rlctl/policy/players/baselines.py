@@ -21,7 +21,7 @@ from rlctl.errors import (
     format_plugin_traceback,
     short_repr,
 )
-from rlctl.policy.acting import ExportedPlayer, Player, make_generator
+from rlctl.policy.players.policy_player import ExportedPlayer, Player, make_generator
 
 BASELINES = ("zero", "random")
 SERVER = ("ws://", "wss://")

@@ -10,9 +10,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.policy.acting import Exploration, PolicyPlayer, check_playable
+from rlctl.policy.file import PolicyInfo
 from rlctl.policy.network import select_actor_tensors
-from rlctl.policy.policy import PolicyInfo
+from rlctl.policy.players.policy_player import Exploration, PolicyPlayer, check_playable
 from rlctl.policy.torch_policy import ALGORITHMS, TorchPolicy, describe_network, policy_name
 
 FLAT, BOX = spaces.Box(-np.inf, np.inf, (6,)), spaces.Box(-2, 3, (2,))

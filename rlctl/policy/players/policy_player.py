@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from rlctl.environments.dict_spaces import join, split_space
 from rlctl.errors import ArtifactError, DivergedError, UsageError, short_repr
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, CPolicy
+from rlctl.policy.file import Policy, PolicyInfo, load_policy, read_policy
 from rlctl.policy.layers import Array, apply
 from rlctl.policy.network import DETERMINISTIC, Network, Tensors, select_actor_tensors
-from rlctl.policy.policy import Policy, PolicyInfo, load_policy, read_policy
 
 _BLOCK = 64
 """Steps whose random numbers are drawn together."""

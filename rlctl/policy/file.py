@@ -228,6 +228,6 @@ def load_policy(path: Path) -> Policy:
         from rlctl.policy.onnx_policy import OnnxPolicy
 
         return OnnxPolicy.load(path)
-    from rlctl.policy.acting import NumpyPolicy
+    from rlctl.policy.players.policy_player import NumpyPolicy
 
     return NumpyPolicy.load(path)
