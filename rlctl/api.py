@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rlctl.evaluation.evaluate import Evaluation
-    from rlctl.policy.file import Policy
+    from rlctl.policy.policy import Policy
     from rlctl.training.request import TrainResult
 
 
@@ -86,7 +86,7 @@ def load_policy(path: str | os.PathLike[str], /) -> Policy:
     is the policy that ships with it, never that of a run. Raises `ArtifactError` for a file that is not one.
     """
     from rlctl.environments import registry
-    from rlctl.policy import policy
+    from rlctl.policy import numpy_policy
     from rlctl.policy.shipped import find_shipped_policy
     from rlctl.run.directory import RunDirectory
 
@@ -95,4 +95,4 @@ def load_policy(path: str | os.PathLike[str], /) -> Policy:
         file = find_shipped_policy(name)
     if RunDirectory(file).status_file.is_file():
         file = RunDirectory(file).policy_file()
-    return policy.load_policy(file)
+    return numpy_policy.load_policy(file)

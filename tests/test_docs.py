@@ -136,11 +136,11 @@ def test_recipes_are_recipes(block):
 
 def test_limits_are_limits_of_reach():
     from rlctl.deploy import Limits, SafetyFilter
-    from rlctl.policy.file import read_info
+    from rlctl.policy.file import PolicyFile
     from rlctl.policy.shipped import PRETRAINED
     from rlctl.run.lookup import find_policy
 
-    info = read_info(find_policy("reach", PRETRAINED).file)
+    info = PolicyFile.read_info(find_policy("reach", PRETRAINED).file)
     (block,) = [each for each in find_blocks("yaml") if is_limits(each)]
     SafetyFilter(info.env, Limits.model_validate(yaml_text.load(block.text, str(block))))
 

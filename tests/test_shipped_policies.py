@@ -10,7 +10,7 @@ from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.score import measure_score
 from rlctl.exporting.policy_file import export_actor
-from rlctl.policy.file import PolicyInfo, read_info, read_policy, save_policy
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
 from rlctl.recipe.sources import resolve_packaged
 from rlctl.run.directory import RunDirectory
@@ -47,7 +47,7 @@ def check_score(task: str, info: PolicyInfo, episodes: int = 20) -> None:
     "task", [pytest.param(task, marks=[] if task == "reach" else pytest.mark.slow) for task in OURS]
 )
 def test_a_shipped_policy_scores_what_its_metadata_says(task):
-    check_score(task, read_info(find_shipped_policy(task)))
+    check_score(task, PolicyFile.read_info(find_shipped_policy(task)))
 
 
 @pytest.mark.parametrize("task", OURS)
@@ -57,7 +57,7 @@ def test_the_file_of_a_task_is_as_its_policy_was_exported(task):
 
 
 def test_a_task_that_has_changed_is_noticed():
-    info = read_info(find_shipped_policy("reach"))
+    info = PolicyFile.read_info(find_shipped_policy("reach"))
     better = info.provenance.score.model_copy(update={"return_interval": (900.0, 901.0)})
     other = info.model_copy(update={"provenance": info.provenance.model_copy(update={"score": better})})
     with pytest.raises(pytest.fail.Exception, match=r"(900.0, 901.0).* Has reach changed .* rlctl export reach"):
@@ -70,7 +70,7 @@ def test_shipped_policies_are_small_actors_of_installed_tasks():
     assert all(file.stat().st_size <= 400_000 for file in files)
     assert sum(file.stat().st_size for file in files) <= 4_000_000
     for task, file in zip(OURS, files, strict=True):
-        info = read_info(file)
+        info = PolicyFile.read_info(file)
         assert info.spec.task == task
         assert info.provenance.baselines.keys() == {"zero", "random"}
         assert info.provenance.score.episodes == 100
@@ -93,14 +93,15 @@ def test_what_is_not_shipped():
 
 def test_the_actor_of_a_run_and_its_score(tmp_path):
     run = RunDirectory(tmp_path / "reach" / "2026-01-01_00-00-00_s3")
-    info = read_info(find_shipped_policy("reach")).model_copy(update={"provenance": None})
-    _, tensors = read_policy(find_shipped_policy("reach"))
-    save_policy(run.best_policy, info, {**tensors, "policy/value_net.weight": np.zeros((1, 64), np.float32)})
+    info = PolicyFile.read_info(find_shipped_policy("reach")).model_copy(update={"provenance": None})
+    tensors = PolicyFile.read(find_shipped_policy("reach")).tensors
+    PolicyFile(info, {**tensors, "policy/value_net.weight": np.zeros((1, 64), np.float32)}).write(run.best_policy)
     run.write_status({"task": "reach", "git_commit": "abc"})
     run.write_recipe(resolve_packaged("reach"))
     target = tmp_path / "reach.safetensors"
     report = export_actor(str(run.path), checkpoint="best", target=target, episodes=3)
-    written, actor = read_policy(target)
+    policy = PolicyFile.read(target)
+    written, actor = policy.info, policy.tensors
     assert actor.keys() == tensors.keys()
     assert written.provenance == report.provenance
     assert written.provenance.run == "reach/2026-01-01_00-00-00_s3"
@@ -113,7 +114,7 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
     assert scores["policy"].mean_return > scores["zero"].mean_return
     with pytest.raises(UsageError, match=r"policy.txt: the name of a policy file ends in .safetensors"):
         export_actor(str(run.path), checkpoint="best", target=tmp_path / "policy.txt")
-    save_policy(target, info, tensors)
+    PolicyFile(info, tensors).write(target)
     with pytest.raises(UsageError, match="no recipe is known of this policy; give the run"):
         export_actor(str(target), checkpoint="best", target=tmp_path / "other.safetensors")
     (tmp_path / "policy.onnx").touch()
@@ -122,14 +123,14 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
 
 
 def test_a_shipped_policy_is_measured_anew(tmp_path):
-    shipped = read_info(find_shipped_policy("reach")).provenance
+    shipped = PolicyFile.read_info(find_shipped_policy("reach")).provenance
     target = tmp_path / "reach.safetensors"
     for source, checkpoint in (("reach", "pretrained"), (str(target), "best")):  # the second in its own place
         again = export_actor(source, checkpoint=checkpoint, target=target, episodes=2).provenance
         assert (again.run, again.recipe, again.git_commit) == (shipped.run, shipped.recipe, shipped.git_commit)
         assert again.source_sha256 == shipped.source_sha256
         assert again.score.episodes == 2
-    before, after = (read_policy(each)[1] for each in (find_shipped_policy("reach"), target))
+    before, after = (PolicyFile.read(each).tensors for each in (find_shipped_policy("reach"), target))
     assert all((before[name] == after[name]).all() for name in before)
     assert before.keys() == after.keys()
 
@@ -160,7 +161,7 @@ def write_push_policy(path, size):
     )  # fmt: skip
     provenance = Provenance(run="push/x", source_sha256="0" * 64, recipe={}, score=score)
     info = PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec("push"), provenance=provenance)
-    save_policy(path, info, {f"policy/{k}": v.numpy() for k, v in build_network(info).state_dict().items()})
+    PolicyFile(info, {f"policy/{k}": v.numpy() for k, v in build_network(info).state_dict().items()}).write(path)
 
 
 def test_a_plugin_ships_a_policy_and_its_task_changes(rlctl, install):

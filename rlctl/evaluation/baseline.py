@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.policy.players.baselines import BASELINES, SERVER, load_function
+from rlctl.policy.players.baselines import BASELINES, load_function
+from rlctl.policy.players.named import SERVER
 from rlctl.rollout.workers import Workers
 
 if TYPE_CHECKING:

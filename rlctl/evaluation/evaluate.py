@@ -7,8 +7,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from rlctl import output
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
@@ -22,8 +20,9 @@ from rlctl.evaluation.episode_statistics import (
     success_interval,
     success_rate,
 )
-from rlctl.policy.file import PolicyInfo, load_policy, read_policy
-from rlctl.policy.players.policy_player import Exploration, check_playable
+from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.policy.numpy_policy import check_playable, load_policy
+from rlctl.policy.players.player import Exploration
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
@@ -151,7 +150,7 @@ class LoadedPolicy:
 
     path: Path
     info: PolicyInfo
-    tensors: dict[str, NDArray[Any]] | None
+    policy: PolicyFile | None
     """None for an exported file, which the workers load themselves."""
 
     @property
@@ -162,22 +161,21 @@ class LoadedPolicy:
     def give_to(self, workers: Workers) -> None:
         """Let workers act with it; raises `ArtifactError` if it is for other spaces than their environments have."""
         self.info.check_fits(workers.info, self.path)
-        if self.tensors is None:
+        if self.policy is None:
             workers.set_other_policy(str(self.path.resolve()))
         else:
-            workers.set_policy(self.info, self.tensors)
+            workers.set_policy(self.policy)
 
 
 def load_player(path: Path, deterministic: bool) -> LoadedPolicy:
     """Read and try a policy; raises `ArtifactError` for a damaged one."""
     if path.suffix == ".onnx":
-        policy = load_policy(path)
+        info = load_policy(path).info
         if not deterministic:
             raise UsageError("an exported policy cannot sample: only its deterministic action is in the ONNX file")
-        return LoadedPolicy(path, policy.info, None)
-    info, tensors = read_policy(path)
-    check_playable(info, tensors, path)
-    return LoadedPolicy(path, info, tensors)
+        return LoadedPolicy(path, info, None)
+    policy = check_playable(PolicyFile.read(path))
+    return LoadedPolicy(path, policy.info, policy)
 
 
 def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:

@@ -11,7 +11,7 @@ from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.evaluate import Evaluation
-from rlctl.policy.file import collect_versions
+from rlctl.version import collect_versions
 
 
 def show(result: Evaluation, json: str | None) -> None:

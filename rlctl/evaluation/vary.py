@@ -19,14 +19,14 @@ from rlctl.evaluation import axes as axes_of
 from rlctl.evaluation.episode_statistics import summarize
 from rlctl.evaluation.evaluate import NO_GATES, EvalRequest, Gates, LoadedPolicy, find_player, start_workers
 from rlctl.evaluation.push import measure_push
-from rlctl.policy.file import collect_versions
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.players.player import Exploration
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
 from rlctl.run import robustness
 from rlctl.run.robustness import Axis, Cell, Robustness, RobustnessMap
+from rlctl.version import collect_versions
 
 ASK_ABOVE_S = 600.0
 """A measurement that takes longer than this [s] is begun only after asking."""

@@ -10,9 +10,9 @@ from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import SINGLE, split_space
 from rlctl.exporting.layers import BATCH, Graph, concatenate, emit, emit_lstm, unsupported
-from rlctl.policy.file import PolicyInfo
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import Lstm, Normalize, OneHot
-from rlctl.policy.network import Network, Tensors
+from rlctl.policy.network import Network
 from rlctl.policy.onnx_file import METADATA_KEY
 from rlctl.policy.onnx_policy import ACTION, SINGLE_INPUT, STATE_INPUTS, STATE_OUTPUTS
 from rlctl.task.joints import Joints
@@ -20,12 +20,13 @@ from rlctl.task.joints import Joints
 _STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of the step before"
 
 
-def build(info: PolicyInfo, tensors: Tensors) -> onnx.ModelProto:
+def build(policy: PolicyFile) -> onnx.ModelProto:
     """Write a policy file as ONNX: normalisation, the deterministic actor, and SB3's clip or unscaling of its action.
 
     Raises `UsageError` for what has no translation.
     """
-    graph, network = Graph(), Network(info, tensors)
+    info = policy.info
+    graph, network = Graph(), Network(policy)
     observation_space, action_space = info.env.spaces()
     inputs = {key: _add_input(graph, info, key, part) for key, part in split_space(observation_space).items()}
     value = concatenate(graph, [_emit_part(graph, inputs[key], network, key) for key in network.parts])

@@ -18,9 +18,9 @@ from rlctl.errors import AnswerIsNo, UsageError, short_repr
 from rlctl.exporting.c_layers import CWriter
 from rlctl.output import format_count
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type, observation_type
-from rlctl.policy.file import PolicyInfo
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import ScaleImage
-from rlctl.policy.network import Network, Tensors, select_actor_tensors
+from rlctl.policy.network import Network
 from rlctl.version import __version__
 
 LARGEST = 3_000_000
@@ -70,16 +70,17 @@ void rlctl_repeat(const void *observation, void *state, void *action, long count
 """
 
 
-def write_c(info: PolicyInfo, tensors: Tensors, file_name: str) -> CSource:
+def write_c(policy: PolicyFile, file_name: str) -> CSource:
     """Write a policy as C; functions are called after the file, `reach.c` -> `reach_act`.
 
     Raises `UsageError` for what has no translation: images, and networks of more than `LARGEST` weights.
     """
-    if (weights := sum(each.size for each in select_actor_tensors(info, tensors).values())) > LARGEST:
+    info = policy.info
+    if (weights := sum(tensor.size for tensor in policy.actor_only().tensors.values())) > LARGEST:
         raise UsageError(
             f"export --c: {weights:,} weights are too many for a C file (at most {LARGEST:,}); rlctl export --onnx"
         )
-    name, layout, network = _make_identifier(file_name), _Layout(info), Network(info, tensors)
+    name, layout, network = _make_identifier(file_name), _Layout(info), Network(policy)
     has_images = any(isinstance(layer, ScaleImage) for part in network.parts.values() for layer in part)
     if has_images or (layout.frames > 1 and [len(part.shape or ()) for part in layout.parts.values()] != [1]):
         raise UsageError("export --c: images cannot be written as C; rlctl export --onnx can")

@@ -12,9 +12,9 @@ from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.report import ExportReport, format_agreement, format_closed_loop
 from rlctl.output import print_notes
 from rlctl.policy import onnx_file
-from rlctl.policy.file import Policy, PolicyInfo, read_policy
-from rlctl.policy.network import Tensors
-from rlctl.policy.players.policy_player import check_playable
+from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.policy.numpy_policy import check_playable
+from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import lookup
@@ -37,7 +37,6 @@ class _Export(NamedTuple):
     # What the exports of one policy share.
     file: Path
     info: PolicyInfo
-    tensors: Tensors
     policy: TorchPolicy
     workers: Workers
 
@@ -67,8 +66,8 @@ def export_policy(
 
 
 def _export(found: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
-    info, tensors = read_policy(found.file)
-    check_playable(info, tensors, found.file)
+    policy = check_playable(PolicyFile.read(found.file))
+    info = policy.info
     # The environments are built while torch is imported.
     with Workers(found.locate(info.spec), available_cores()) as workers:
         from rlctl.exporting.actor import build
@@ -76,9 +75,9 @@ def _export(found: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
         from rlctl.policy.torch_policy import TorchPolicy, pin_threads
 
         pin_threads()
-        models = [(target, build(info, tensors)) for target in targets if target.suffix == ".onnx"]
-        sources = [(target, write_c(info, tensors, target.stem)) for target in targets if target.suffix == ".c"]
-        job = _Export(found.file, info, tensors, TorchPolicy.load(found.file), workers)
+        models = [(target, build(policy)) for target in targets if target.suffix == ".onnx"]
+        sources = [(target, write_c(policy, target.stem)) for target in targets if target.suffix == ".c"]
+        job = _Export(found.file, info, TorchPolicy.load(found.file), workers)
         _check_environment(found.file, info, workers)
         return [*(_export_onnx(job, *each) for each in models), *(_export_c(job, *each) for each in sources)]
 
@@ -173,7 +172,7 @@ def _verify(
     """Return what a report says of a verified file."""
     from rlctl.exporting.verify import measure_latency, verify
 
-    agreement, loop = verify(job.policy, exported, job.tensors, file, job.workers, min_observations)
+    agreement, loop = verify(job.policy, exported, file, job.workers, min_observations)
     if not (agreement.agrees and (loop.agrees or loop.magnified)):
         raise AnswerIsNo(_explain_failure(job, target, what, agreement, loop))
     latency = measure_latency(job.policy, exported)

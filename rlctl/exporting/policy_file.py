@@ -13,8 +13,7 @@ from rlctl.environments.task_version import identify_task
 from rlctl.errors import UsageError
 from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.score import describe_score, measure_score
-from rlctl.policy.file import PolicyInfo, read_info, read_policy, save_policy
-from rlctl.policy.network import select_actor_tensors
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.players.baselines import BASELINES
 from rlctl.policy.shipped import Provenance
 from rlctl.run import lookup
@@ -43,8 +42,8 @@ def export_actor(run: str | None, *, checkpoint: str, target: Path, episodes: in
     found = lookup.find_policy(run, checkpoint)
     output.print_notes(found.notes)
     origin = _find_origin(found)
-    info, tensors = read_policy(found.file)
-    spec = found.locate(info.spec)
+    policy = PolicyFile.read(found.file)
+    spec = found.locate(policy.info.spec)
     request = EvalRequest(run=str(found.file), episodes=episodes)
     provenance = Provenance(
         **origin,
@@ -52,9 +51,9 @@ def export_actor(run: str | None, *, checkpoint: str, target: Path, episodes: in
         score=measure_score(request),
         baselines={name: measure_score(dataclasses.replace(request, baseline=name, spec=spec)) for name in BASELINES},
     )
-    info = info.model_copy(update={"provenance": provenance})
-    save_policy(target, info, select_actor_tensors(info, tensors))
-    return PolicyFileReport(target, info, provenance, target.stat().st_size)
+    policy = policy.actor_only().with_info(provenance=provenance)
+    policy.write(target)
+    return PolicyFileReport(target, policy.info, provenance, target.stat().st_size)
 
 
 def _find_origin(found: FoundPolicy) -> dict[str, Any]:
@@ -65,7 +64,7 @@ def _find_origin(found: FoundPolicy) -> dict[str, Any]:
             "git_commit": found.run.status().get("git_commit"),
             "recipe": found.run.recipe().model_dump(mode="json", by_alias=True),
         }
-    before = read_info(found.file).provenance if found.file.suffix == ".safetensors" else None
+    before = PolicyFile.read_info(found.file).provenance if found.file.suffix == ".safetensors" else None
     if before is None:
         raise UsageError(f"{found.file}: no recipe is known of this policy; give the run that it is from")
     return before.model_dump(include={"run", "git_commit", "recipe"})

@@ -6,7 +6,7 @@ import dataclasses
 import operator
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import map_parts, stack, take_row
 from rlctl.policy.c_policy import CPolicy
-from rlctl.policy.file import Policy
+from rlctl.policy.file import PolicyFile
 from rlctl.policy.onnx_policy import OnnxPolicy
+from rlctl.policy.policy import Policy
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
@@ -152,20 +153,19 @@ class Latency:
 def verify(
     torch_policy: TorchPolicy,
     exported: Policy,
-    tensors: Mapping[str, NDArray[Any]],
     file: Path,
     workers: Workers,
     min_observations: int = MIN_OBSERVATIONS,
 ) -> tuple[Agreement, ClosedLoop]:
     """Play the same episodes with both; on every observation of either, ask torch and the exported policy.
 
-    `tensors` are the policy file's; `file` is the exported one, an ONNX file or a compiled library.
-    Rollouts go on until `min_observations` were compared. Where all actions agree and the episodes do not, the policy
-    plays them with other last bits. Raises `TaskError` if the environment fails.
+    `file` is the exported one, an ONNX file or a compiled library. Rollouts go on until `min_observations` were
+    compared. Where all actions agree and the episodes do not, the policy plays them with other last bits. Raises
+    `TaskError` if the environment fails.
     """
     comparison = Comparison(torch_policy)
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
-    workers.set_policy(torch_policy.info, dict(tensors))
+    workers.set_policy(torch_policy.file)
     expected = play_episodes(workers, seeds, record=True)
     _compare_actions(torch_policy, exported, expected, comparison)
     if isinstance(exported, OnnxPolicy):
@@ -185,23 +185,22 @@ def verify(
     comparison.close()
     loop = compare_episodes(expected, done)
     if comparison.found.agrees and not loop.agrees:
-        loop = dataclasses.replace(loop, magnified=_magnifies_rounding(torch_policy, tensors, workers, expected))
+        loop = dataclasses.replace(loop, magnified=_magnifies_rounding(torch_policy.file, workers, expected))
     return comparison.found, loop
 
 
-def _magnifies_rounding(
-    torch_policy: TorchPolicy, tensors: Mapping[str, NDArray[Any]], workers: Workers, expected: Sequence[Episode]
-) -> bool:
+def _magnifies_rounding(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> bool:
     """Say whether an environment repeats itself, but not for a policy whose weights have other last bits.
 
     Contacts do that to a robot within some hundred steps; its episodes cannot tell whether a policy is the same.
     """
     seeds = [episode.result.seed for episode in expected]
-    workers.set_policy(torch_policy.info, dict(tensors))
+    workers.set_policy(policy)
     again = compare_episodes(expected, play_episodes(workers, seeds))
     if again.max_return_difference > 0.0 or not again.agrees:
         return False
-    workers.set_policy(torch_policy.info, {name: _change_last_bits(values) for name, values in tensors.items()})
+    changed = {name: _change_last_bits(values) for name, values in policy.tensors.items()}
+    workers.set_policy(PolicyFile(policy.info, changed))
     return not compare_episodes(expected, play_episodes(workers, seeds)).agrees
 
 

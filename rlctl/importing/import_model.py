@@ -15,8 +15,10 @@ from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 from rlctl.importing.sb3_model import SavedModel, SavedNormalization, read_model, read_normalization
-from rlctl.policy.file import PolicyInfo, collect_versions, load_policy, save_policy
+from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.policy.numpy_policy import load_policy
 from rlctl.storage import files
+from rlctl.version import collect_versions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +78,7 @@ def import_model(
     except (TypeError, ValueError, AssertionError) as error:
         raise ArtifactError(f"{file}: its policy_kwargs make no network for {task}: {error}") from None
     read = f"{file} with {normalization}" if normalization else str(file)
-    _write_checked(target, read, info, _collect_tensors(model, statistics))
+    _write_checked(target, read, PolicyFile(info, _collect_tensors(model, statistics)))
     return ImportedPolicy(target, info)
 
 
@@ -135,12 +137,12 @@ def _collect_tensors(model: SavedModel, normalization: SavedNormalization | None
     return tensors
 
 
-def _write_checked(output: Path, read: str, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
-    """Write the file beside its place, load it, and put it in place only if it acts; errors name what was `read`."""
+def _write_checked(output: Path, read: str, policy: PolicyFile) -> None:
+    """Write the file under another name, load it, and rename it only if it acts; errors name what was `read`."""
     from rlctl.policy.torch_policy import TorchPolicy
 
     def write(part: Path) -> None:
-        save_policy(part, info, tensors)
+        policy.write(part)
         try:
             load_policy(part)
             TorchPolicy.load(part)  # which is stricter

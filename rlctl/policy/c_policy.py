@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE, split, split_space
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.policy.file import Policy, PolicyInfo
+from rlctl.policy.file import PolicyInfo
+from rlctl.policy.policy import Policy
 
 LIBRARY_SUFFIX = ".so"
 

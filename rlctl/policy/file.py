@@ -1,18 +1,13 @@
-"""Policy files, and policies to run: numpy in, numpy out.
+"""Policy files: tensors, normalisation, and as JSON everything needed to use them, in a `.safetensors` file.
 
-A policy is a `.safetensors` file: tensors, normalisation, and as JSON everything needed to use it. The format is
-read without pickle. An exported `.onnx` file is a policy too.
+They are read without pickle.
 """
 
 from __future__ import annotations
 
-import abc
 import dataclasses
-import functools
 import hashlib
-import platform
-from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +16,6 @@ import pydantic
 from numpy.typing import NDArray
 from pydantic import Field
 
-from rlctl.environments.dict_spaces import join, map_parts, split, split_space
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.named_spec import PolicySpec
 from rlctl.environments.named_task import POLICY
@@ -29,9 +23,14 @@ from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.policy.shipped import Provenance
 from rlctl.storage import files, untrusted
-from rlctl.version import __version__
 
 FORMAT = 1
+
+SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq")
+DETERMINISTIC = ("td3", "ddpg")
+"""Algorithms whose policy has no distribution to sample from."""
+ACTOR_CRITIC = (*SQUASHED_GAUSSIAN, *DETERMINISTIC)
+"""Algorithms whose policy has an `actor` of its own."""
 
 
 class Score(pydantic.BaseModel, extra="forbid"):
@@ -42,7 +41,7 @@ class Score(pydantic.BaseModel, extra="forbid"):
 
 
 class PolicyInfo(pydantic.BaseModel, extra="forbid"):
-    """Everything about a policy but its numbers."""
+    """Everything about a policy except its tensors."""
 
     format: int = FORMAT
     algo: str
@@ -78,41 +77,81 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
             raise ArtifactError(f"{file}: this policy is not for this task: {difference}")
 
 
-def collect_versions() -> dict[str, str]:
-    """Return the versions that a result depends on."""
-    return dict(_read_versions())
+Tensors = Mapping[str, NDArray[Any]]
+"""Arrays by name: the network's under `policy/`, mean and variance per observation key under `normalize/`."""
 
 
-@functools.cache  # each is read from a file, and every checkpoint needs them
-def _read_versions() -> dict[str, str]:
-    found = {"python": platform.python_version(), "rlctl": __version__}
-    for name in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
+@dataclasses.dataclass(frozen=True, eq=False)
+class PolicyFile:
+    """A policy as its file holds it: a description and tensors."""
+
+    info: PolicyInfo
+    tensors: Tensors = dataclasses.field(repr=False)
+    path: Path | None = None
+    """Where it was read from."""
+
+    @classmethod
+    def read(cls, path: Path) -> PolicyFile:
+        """Read a policy file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
+        metadata, info, tensors = _read(path)
+        if "sha256" not in metadata:
+            raise ArtifactError(f"{path}: damaged: its metadata has no sha256, which every policy of rlctl has")
+        if metadata["sha256"] != compute_digest(metadata["rlctl"], tensors):
+            raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
+        for name, values in tensors.items():
+            if not np.isfinite(values).all():
+                raise ArtifactError(f"{path}: damaged: {short_repr(name)} is not finite")
+        return cls(info, tensors, path)
+
+    @staticmethod
+    def read_info(path: Path) -> PolicyInfo:
+        """Read only the description of a policy file; raises `ArtifactError` as `read` does."""
+        return _read(path, tensors=False)[1]
+
+    @property
+    def weights(self) -> dict[str, NDArray[Any]]:
+        """The network's tensors, by the names of SB3's `state_dict`."""
+        prefix = "policy/"
+        return {name.removeprefix(prefix): values for name, values in self.tensors.items() if name.startswith(prefix)}
+
+    def actor_only(self) -> PolicyFile:
+        """Return the policy with the tensors that acting needs: the actor's and the normalisation's."""
+        names = list_actor_tensors(self.info.algo, self.tensors)
+        return dataclasses.replace(self, tensors={name: self.tensors[name] for name in names})
+
+    def with_info(self, **changes: Any) -> PolicyFile:
+        """Return the policy with some fields of its description changed."""
+        return dataclasses.replace(self, info=self.info.model_copy(update=changes))
+
+    def encode(self) -> bytes:
+        """Return the content of the file."""
+        from safetensors.numpy import save
+
+        contiguous = {name: np.asarray(value, order="C") for name, value in self.tensors.items()}
+        text = self.info.model_dump_json()
+        return save(contiguous, metadata={"rlctl": text, "sha256": compute_digest(text, contiguous)})
+
+    def write(self, path: Path) -> None:
+        """Write the file atomically."""
+        files.write_bytes(path, self.encode())
 
 
-def save_policy(path: Path, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> None:
-    """Write a policy file, whole or not at all; see `encode_policy`."""
-    files.write_bytes(path, encode_policy(info, tensors))
+def list_actor_tensors(algo: str, names: Iterable[str]) -> list[str]:
+    """Return which of the tensors of a policy file acting needs."""
+    prefixes = ("normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(algo)))
+    return [name for name in names if name.startswith(prefixes)]
 
 
-def encode_policy(info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> bytes:
-    """Return the content of a policy file.
-
-    `tensors` has the network's under `policy/`, and mean and variance per observation key under `normalize/`.
-    """
-    from safetensors.numpy import save
-
-    contiguous = {name: np.asarray(value, order="C") for name, value in tensors.items()}
-    text = info.model_dump_json()
-    return save(contiguous, metadata={"rlctl": text, "sha256": compute_digest(text, contiguous)})
+def _list_prefixes(algo: str) -> tuple[str, ...]:
+    if algo in ACTOR_CRITIC:
+        return ("actor.",)
+    if algo == "dqn":
+        return ("q_net.",)
+    return ("pi_features_extractor.", "mlp_extractor.policy_net.", "action_net.", "log_std", "lstm_actor.")
 
 
-def compute_digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
-    """Return the sha256 of what a policy file says: a disk may return other bits, and they load as well."""
+def compute_digest(info: str, tensors: Tensors) -> str:
+    """Return the sha256 of a policy file's content: a disk may return other bits, and they load as well."""
     content = hashlib.sha256(info.encode())
     for name, values in sorted(tensors.items()):
         content.update(f"{name} {values.dtype} {values.shape}".encode())
@@ -120,25 +159,7 @@ def compute_digest(info: str, tensors: Mapping[str, NDArray[Any]]) -> str:
     return content.hexdigest()
 
 
-def read_info(path: Path) -> PolicyInfo:
-    """Read what a policy file says of its policy, without its numbers; raises `ArtifactError` as `read_policy` does."""
-    return _read_file(path, tensors=False)[1]
-
-
-def read_policy(path: Path) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
-    """Read a policy file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
-    metadata, info, tensors = _read_file(path)
-    if "sha256" not in metadata:
-        raise ArtifactError(f"{path}: damaged: its metadata has no sha256, which every policy of rlctl has")
-    if metadata["sha256"] != compute_digest(metadata["rlctl"], tensors):
-        raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
-    for name, values in tensors.items():
-        if not np.isfinite(values).all():
-            raise ArtifactError(f"{path}: damaged: {short_repr(name)} is not finite")
-    return info, tensors
-
-
-def _read_file(path: Path, tensors: bool = True) -> tuple[dict[str, str], PolicyInfo, dict[str, NDArray[Any]]]:
+def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], PolicyInfo, dict[str, NDArray[Any]]]:
     from safetensors import SafetensorError, safe_open
 
     untrusted.check_safetensors(path)
@@ -156,78 +177,3 @@ def parse_info(text: str | None, path: Path) -> PolicyInfo:
     if text is None:
         raise ArtifactError(f"{path}: not an rlctl policy: its metadata has no 'rlctl' entry")
     return untrusted.parse_model(text, PolicyInfo, path, "policy")
-
-
-class Policy(abc.ABC):
-    """A policy that can be run, one observation after the other."""
-
-    def __init__(self, info: PolicyInfo) -> None:
-        self.info = info
-        self.observation_space, self.action_space = info.env.spaces()
-        self._parts = {
-            key: (space.shape or (), space.dtype) for key, space in split_space(self.observation_space).items()
-        }
-
-    @abc.abstractmethod
-    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the action for one observation, as the environment takes it.
-
-        A recurrent policy remembers; call `reset` when an episode begins. Raises `ValueError` for an observation of
-        another shape.
-        """
-
-    @abc.abstractmethod
-    def reset(self) -> None:
-        """Begin an episode: forget what is remembered."""
-
-    def read_observation(self, observation: Any) -> dict[str, NDArray[Any]]:
-        """Return the parts of an observation by key, in their dtypes; raises `ValueError` for another shape."""
-        given = split(observation)
-        parts = {}
-        for key, (shape, dtype) in self._parts.items():
-            value = np.asarray(given[key], dtype) if key in given else None
-            if value is not None and value.dtype.kind == "u" and (odd := value != given[key]).any():
-                raise ValueError(f"observation has {np.asarray(given[key])[odd][0]:g}, the policy expects {dtype}")
-            if value is None or value.shape != shape:
-                expected = join({key: shape for key, (shape, _) in self._parts.items()})
-                raise ValueError(
-                    f"observation of shape {map_parts(np.shape, observation)}, the policy expects {expected}"
-                    + _describe_additions(self.info.spec)
-                )
-            parts[key] = value
-        return parts
-
-    def try_once(self, *, deterministic: bool = True) -> None:
-        """Act once, on a made-up observation; raises `ValueError` for an action that the action space cannot have.
-
-        Whatever else is wrong with a file that somebody has written by hand raises here too.
-        """
-        spaces = split_space(self.observation_space).items()
-        zeros = {key: np.full(space.shape or (), getattr(space, "start", 0), space.dtype) for key, space in spaces}
-        action = self.predict(join(zeros), deterministic=deterministic)
-        self.reset()
-        if action.shape != (self.action_space.shape or ()):
-            raise ValueError(
-                f"its actions have shape {action.shape}, those of its action space {self.action_space.shape}"
-            )
-        if not np.isfinite(action).all():
-            raise ValueError("its actions are not finite")
-
-
-def _describe_additions(spec: EnvSpec) -> str:
-    """Say what a policy observes beyond what its task returns, and where that comes from."""
-    added = ["the part of the episode that is left"] if spec.time_feature else []
-    if spec.frame_stack > 1:
-        added.append(f"{spec.frame_stack} frames")
-    return f", with {' and '.join(added)}, as policy.info.spec.make() returns it" if added else ""
-
-
-def load_policy(path: Path) -> Policy:
-    """Load a `.safetensors` or an exported `.onnx` file, without torch; raises `ArtifactError` if it is not one."""
-    if path.suffix == ".onnx":
-        from rlctl.policy.onnx_policy import OnnxPolicy
-
-        return OnnxPolicy.load(path)
-    from rlctl.policy.players.policy_player import NumpyPolicy
-
-    return NumpyPolicy.load(path)

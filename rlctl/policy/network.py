@@ -6,7 +6,6 @@ Its layers follow from the names of the file's tensors, which are those of SB3's
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 
 import numpy as np
 from gymnasium import spaces
@@ -14,33 +13,13 @@ from gymnasium import spaces
 from rlctl.environments.dict_spaces import split_space
 from rlctl.errors import UsageError
 from rlctl.policy import layers
-from rlctl.policy.file import PolicyInfo
+from rlctl.policy.file import ACTOR_CRITIC, DETERMINISTIC, SQUASHED_GAUSSIAN, PolicyFile
 from rlctl.policy.layers import Activation, Array, Layer, Linear, apply
 
-Tensors = Mapping[str, Array]
-
 _BATCH_RENORM_EPSILON = 1e-3
-_SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq")
-DETERMINISTIC = ("td3", "ddpg")
-"""Algorithms whose policy has no distribution to sample from."""
-_ACTOR_CRITIC = (*_SQUASHED_GAUSSIAN, *DETERMINISTIC)
-_RELU_BY_DEFAULT = (*_ACTOR_CRITIC, "dqn")
+_RELU_BY_DEFAULT = (*ACTOR_CRITIC, "dqn")
 _NATURE_STRIDES = {"0": 4, "2": 2, "4": 1}
 """Strides of the convolutions of SB3's NatureCNN, the only one here, by their index."""
-
-
-def select_actor_tensors(info: PolicyInfo, tensors: Tensors) -> dict[str, Array]:
-    """Return the tensors of a policy file that acting needs: the actor's and the normalisation's."""
-    prefixes = ("normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(info.algo)))
-    return {name: value for name, value in tensors.items() if name.startswith(prefixes)}
-
-
-def _list_prefixes(algo: str) -> tuple[str, ...]:
-    if algo in _ACTOR_CRITIC:
-        return ("actor.",)
-    if algo == "dqn":
-        return ("q_net.",)
-    return ("pi_features_extractor.", "mlp_extractor.policy_net.", "action_net.", "log_std", "lstm_actor.")
 
 
 class Network:
@@ -49,9 +28,10 @@ class Network:
     Raises `UsageError` for a layer that is not known.
     """
 
-    def __init__(self, info: PolicyInfo, tensors: Tensors) -> None:
-        algo, read = info.algo, _Reader(info, tensors)
-        owner = "actor." if algo in _ACTOR_CRITIC else "q_net." if algo == "dqn" else "pi_"
+    def __init__(self, policy: PolicyFile) -> None:
+        info = policy.info
+        algo, read = info.algo, _Reader(policy)
+        owner = "actor." if algo in ACTOR_CRITIC else "q_net." if algo == "dqn" else "pi_"
         extractor = f"{owner}features_extractor"
         self.parts = {
             key: read.features(key, space, f"{extractor}.extractors.{key}" if key else extractor)
@@ -61,11 +41,11 @@ class Network:
         self.lstm = read.lstm("lstm_actor") if algo == "recurrent_ppo" else None
         self.trunk, self.head = _read_actor(algo, read)
         """The head's result is the mean of the action, the action of TD3 and DDPG, logits, or values."""
-        self.is_squashed = algo in _ACTOR_CRITIC or bool(info.policy_kwargs.get("squash_output"))
+        self.is_squashed = algo in ACTOR_CRITIC or bool(info.policy_kwargs.get("squash_output"))
         """Whether actions in a Box are in [-1, 1], and scaled to its bounds."""
         self.ends_with_tanh = self.is_squashed and algo not in DETERMINISTIC  # of these the head does
         """Whether tanh comes after the head, and after noise that is added to its result."""
-        name = "actor.log_std" if algo in _SQUASHED_GAUSSIAN else "log_std"
+        name = "actor.log_std" if algo in SQUASHED_GAUSSIAN else "log_std"
         self.log_std = read.tensors.get(name)
         """Parameter of PPO's and gSDE's noise; None where there is none, or a layer computes it."""
         self._log_std_layer = read.linear(name) if f"{name}.weight" in read.tensors else None
@@ -99,7 +79,7 @@ class Network:
 
 
 def _read_actor(algo: str, read: _Reader) -> tuple[list[Layer], list[Layer]]:
-    if algo in _SQUASHED_GAUSSIAN:
+    if algo in SQUASHED_GAUSSIAN:
         trunk = read.sequence("actor.latent_pi", end=read.activation)
         if "actor.mu.weight" in read.tensors:
             return trunk, [read.linear("actor.mu")]
@@ -115,9 +95,9 @@ def _read_actor(algo: str, read: _Reader) -> tuple[list[Layer], list[Layer]]:
 class _Reader:
     """Makes layers of the tensors of a policy file."""
 
-    def __init__(self, info: PolicyInfo, tensors: Tensors) -> None:
-        self.info = info
-        self.tensors = {name.removeprefix("policy/"): value for name, value in tensors.items()}
+    def __init__(self, policy: PolicyFile) -> None:
+        info = self.info = policy.info
+        self.tensors = {name.removeprefix("policy/"): values for name, values in policy.tensors.items()}
         name = info.policy_kwargs.get("activation_fn", "relu" if info.algo in _RELU_BY_DEFAULT else "tanh")
         if name not in layers.ACTIVATIONS:
             known = ", ".join(layers.ACTIVATIONS)
@@ -129,17 +109,17 @@ class _Reader:
         if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
             sizes = space.n if isinstance(space, spaces.Discrete) else space.nvec
             return [layers.OneHot(f"one_hot/{key}", np.asarray(sizes))]
-        found: list[Layer] = []
+        result: list[Layer] = []
         if key in self.info.normalized_keys:
             name, clip = f"normalize/{key}", float(self.info.clip_observation or np.inf)
-            found.append(layers.Normalize(name, self.tensors[f"{name}/mean"], self.tensors[f"{name}/var"], clip))
+            result.append(layers.Normalize(name, self.tensors[f"{name}/mean"], self.tensors[f"{name}/var"], clip))
         if not _is_image(space):
-            return [*found, layers.Flatten("flatten")]
+            return [*result, layers.Flatten("flatten")]
         shape, relu = space.shape or (), Activation("relu")
         # Channels last, as SB3 decides.
-        found.append(layers.ScaleImage(f"image/{key}", min(range(3), key=lambda axis: shape[axis]) != 0))
-        found += self.sequence(f"{extractor}.cnn", end=relu, activation=relu)
-        return [*found, layers.Flatten("flatten"), *self.sequence(f"{extractor}.linear", end=relu, activation=relu)]
+        result.append(layers.ScaleImage(f"image/{key}", min(range(3), key=lambda axis: shape[axis]) != 0))
+        result += self.sequence(f"{extractor}.cnn", end=relu, activation=relu)
+        return [*result, layers.Flatten("flatten"), *self.sequence(f"{extractor}.linear", end=relu, activation=relu)]
 
     def sequence(self, prefix: str, end: Layer | None = None, activation: Layer | None = None) -> list[Layer]:
         """Return the layers of a `torch.nn.Sequential`; `end` follows its last linear layer.
@@ -147,7 +127,7 @@ class _Reader:
         Layers without tensors have no names: between two that have some there is an activation.
         """
         pattern = re.compile(rf"{re.escape(prefix)}\.(\d+)\.")
-        indices = sorted({int(found[1]) for name in self.tensors if (found := pattern.match(name))})
+        indices = sorted({int(match[1]) for name in self.tensors if (match := pattern.match(name))})
         result: list[Layer] = []
         before = -1
         for index in indices:
@@ -181,14 +161,13 @@ class _Reader:
         """Return an LSTM."""
         if f"{name}.weight_ih_l0_reverse" in self.tensors or f"{name}.weight_hr_l0" in self.tensors:
             raise UsageError("an LSTM with two directions or a projection cannot be played")
-        found: list[layers.LstmLayer] = []
-        while f"{name}.weight_ih_l{len(found)}" in self.tensors:
-            of_input, of_hidden = (self.tensors[f"{name}.{kind}_l{len(found)}"] for kind in ("weight_ih", "weight_hh"))
-            names = [f"{name}.{kind}_l{len(found)}" for kind in ("bias_ih", "bias_hh")]
-            found.append(
-                layers.LstmLayer(of_input, of_hidden, [self.tensors[each] for each in names if each in self.tensors])
-            )
-        return layers.Lstm(name, found)
+        lstm_layers: list[layers.LstmLayer] = []
+        while f"{name}.weight_ih_l{(index := len(lstm_layers))}" in self.tensors:
+            of_input, of_hidden = (self.tensors[f"{name}.{kind}_l{index}"] for kind in ("weight_ih", "weight_hh"))
+            names = [f"{name}.{kind}_l{index}" for kind in ("bias_ih", "bias_hh")]
+            biases = [self.tensors[bias] for bias in names if bias in self.tensors]
+            lstm_layers.append(layers.LstmLayer(of_input, of_hidden, biases))
+        return layers.Lstm(name, lstm_layers)
 
 
 def _is_image(space: spaces.Space[object]) -> bool:

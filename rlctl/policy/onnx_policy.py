@@ -14,8 +14,9 @@ from rlctl.environments.dict_spaces import Observations, split
 from rlctl.environments.spec import LARGEST_SPACE
 from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.policy import onnx_file
-from rlctl.policy.file import Policy, PolicyInfo, parse_info
+from rlctl.policy.file import PolicyInfo, parse_info
 from rlctl.policy.onnx_file import METADATA_KEY
+from rlctl.policy.policy import Policy
 from rlctl.storage import untrusted
 
 SINGLE_INPUT = "obs"

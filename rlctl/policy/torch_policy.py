@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,9 @@ from threadpoolctl import threadpool_limits
 
 from rlctl.environments.dict_spaces import Observations, join, split
 from rlctl.errors import ArtifactError, short_repr
-from rlctl.policy.file import Policy, PolicyInfo, read_policy
+from rlctl.policy.file import PolicyFile, PolicyInfo, list_actor_tensors
 from rlctl.policy.layers import Normalize
-from rlctl.policy.network import select_actor_tensors
+from rlctl.policy.policy import Policy
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": stable_baselines3.PPO,
@@ -140,15 +139,14 @@ class _NoOptimizer:
         del parameters, settings
 
 
-_NOTHING = np.zeros(0)
-
-
 class TorchPolicy(Policy):
     """A policy file on the network it was trained with. Deterministic."""
 
-    def __init__(self, info: PolicyInfo, network: BasePolicy, tensors: Mapping[str, NDArray[Any]]) -> None:
-        super().__init__(info)
+    def __init__(self, policy: PolicyFile, network: BasePolicy) -> None:
+        super().__init__(policy.info)
+        self.file = policy
         self.network = network
+        info, tensors = policy.info, policy.tensors
         clip = float(info.clip_observation or np.inf)
         self._normalize = {
             key: Normalize("", tensors[f"normalize/{key}/mean"], tensors[f"normalize/{key}/var"], clip)
@@ -161,9 +159,9 @@ class TorchPolicy(Policy):
     @classmethod
     def load(cls, path: Path) -> TorchPolicy:
         """Read a policy file; raises `ArtifactError` if it is not one or does not fit together."""
-        info, tensors = read_policy(path)
+        policy = PolicyFile.read(path)
         try:
-            return cls._build(info, tensors)
+            return cls._build(policy)
         except ArtifactError as error:
             raise ArtifactError(f"{path}: {error}") from None
         except Exception as error:  # whatever torch and SB3 raise for a description that nobody has checked
@@ -172,23 +170,18 @@ class TorchPolicy(Policy):
             ) from None
 
     @classmethod
-    def _build(cls, info: PolicyInfo, tensors: dict[str, NDArray[Any]]) -> TorchPolicy:
+    def _build(cls, policy: PolicyFile) -> TorchPolicy:
         """Build the network that a description asks for, and try it."""
-        network = build_network(info)
-        prefix = "policy/"
-        state = {
-            name[len(prefix) :]: torch.from_numpy(value.copy())
-            for name, value in tensors.items()
-            if name.startswith(prefix)
-        }
+        network = build_network(policy.info)
+        state = {name: torch.from_numpy(value.copy()) for name, value in policy.weights.items()}
         mismatch = network.load_state_dict(state, strict=False)
         # A shipped policy has no critic, and to act takes none.
-        missing = select_actor_tensors(info, dict.fromkeys((prefix + name for name in mismatch.missing_keys), _NOTHING))
+        missing = list_actor_tensors(policy.info.algo, [f"policy/{name}" for name in mismatch.missing_keys])
         if missing or mismatch.unexpected_keys:
-            raise ValueError(f"tensors missing: {list(missing)}, unknown: {mismatch.unexpected_keys}")
-        policy = cls(info, network, tensors)
-        policy.try_once()
-        return policy
+            raise ValueError(f"tensors missing: {missing}, unknown: {mismatch.unexpected_keys}")
+        torch_policy = cls(policy, network)
+        torch_policy.try_once()
+        return torch_policy
 
     def normalize(self, observations: Observations) -> Observations:
         """Return observations, one or several, as the network gets them."""

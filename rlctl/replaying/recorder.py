@@ -17,9 +17,9 @@ from rlctl.environments import dict_spaces, registry
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
-from rlctl.policy.file import collect_versions
 from rlctl.replaying.scene import Env, Scene, Warn, make_reader
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
+from rlctl.version import collect_versions
 
 Choose = Callable[[Any, int], Any]
 """From an observation and the number of steps done to an action; None ends the episode."""

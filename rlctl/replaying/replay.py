@@ -14,7 +14,7 @@ from rlctl.environments.info import describe
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.evaluate import LoadedPolicy, load_player
-from rlctl.policy.file import load_policy
+from rlctl.policy.numpy_policy import load_policy
 from rlctl.replaying.film import check_file, film_episodes, make_filmable
 from rlctl.replaying.recorder import Choose, Rollout, make_drawable, play_episode, recorded_actions
 from rlctl.replaying.report import ReplayedEpisode, ReplayResult

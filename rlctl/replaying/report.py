@@ -11,8 +11,8 @@ from typing import Any
 from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.errors import AnswerIsNo
-from rlctl.policy.file import collect_versions
 from rlctl.replaying.difference import Difference
+from rlctl.version import collect_versions
 
 
 @dataclasses.dataclass(frozen=True)

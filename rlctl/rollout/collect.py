@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import Observations, join, split
 from rlctl.errors import EpisodeFailed, TaskError
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.players.player import Exploration
 from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.workers import Workers
 

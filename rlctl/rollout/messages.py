@@ -14,7 +14,7 @@ import pydantic
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.policy.file import PolicyInfo
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.players.player import Exploration
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ class LoadPolicy:
     layout: list[tuple[str, list[int], str]] = dataclasses.field(default_factory=list)
     """Name, shape and dtype of each array of numbers."""
     other: str = ""
-    """An exported file, or a baseline; see `baselines.make_player`."""
+    """An exported file, or a baseline; see `players.named.make_player`."""
 
 
 @dataclasses.dataclass(frozen=True)

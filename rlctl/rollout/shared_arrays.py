@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import split_space
 from rlctl.environments.info import EnvInfo
-from rlctl.policy.file import PolicyInfo
-from rlctl.policy.network import select_actor_tensors
+from rlctl.policy.file import PolicyFile
 from rlctl.rollout.messages import EpisodeResult
 
 Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
@@ -154,12 +153,12 @@ class PolicyNumbers:
         """The workers do not act with them any more."""
         self._arrays, self._structure = {}, ()
 
-    def write(self, info: PolicyInfo, tensors: Mapping[str, NDArray[Any]]) -> list[tuple[str, list[int], str]]:
+    def write(self, policy: PolicyFile) -> list[tuple[str, list[int], str]]:
         """Write a policy's numbers; return name, shape and dtype of each if workers have to load it, else nothing.
 
         They do not for other numbers of the same policy; the state stays as it is then.
         """
-        numbers = select_actor_tensors(info, tensors)
+        info, numbers = policy.info, dict(policy.actor_only().tensors)
         if (hidden := numbers.get("policy/lstm_actor.weight_hh_l0")) is not None:
             layers = sum("weight_hh" in name for name in numbers)
             numbers["state"] = np.zeros((self._n_envs, 2, layers, hidden.shape[1]), np.float32)

@@ -24,8 +24,10 @@ from rlctl.environments.dict_spaces import SINGLE
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec, make_several
 from rlctl.errors import describe_exception
-from rlctl.policy.players.baselines import make_player
-from rlctl.policy.players.policy_player import Player, PolicyPlayer
+from rlctl.policy.file import PolicyFile
+from rlctl.policy.players.named import SERVER, make_player
+from rlctl.policy.players.player import Player
+from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.processes.child_process import write_stderr
 from rlctl.rollout import messages
 from rlctl.rollout.failures import FailedInEpisode, describe_failure
@@ -107,12 +109,12 @@ class Worker:
         self._close_player()
         if message.info is None:
             env = self._episodes[0].env
-            self._player = make_player(message.other, env.action_space, env.observation_space)
+            self._player = _make_player(message.other, env.action_space, env.observation_space)
         else:
             layout = {name: (tuple(shape), np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self._job.numbers, layout)
             self._states = tensors.pop("state", None)
-            self._player = PolicyPlayer(message.info, tensors)
+            self._player = PolicyPlayer(PolicyFile(message.info, tensors))
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
         """Let the policy act within limits from now on."""
@@ -258,6 +260,14 @@ def _training_seeds(run_seed: int, env: int, episode: int) -> Iterator[int]:
     """Yield the seeds of an environment's training episodes, from a number on."""
     for number in itertools.count(episode):
         yield episode_seed(run_seed, Stream.TRAIN, env, number)
+
+
+def _make_player(name: str, space: spaces.Space[Any], observation_space: spaces.Space[Any]) -> Player:
+    if name.startswith(SERVER):
+        from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp
+
+        return RemotePlayer(name, observation_space, space)
+    return make_player(name, space)
 
 
 def main(connection: Connection, job: dict[str, Any]) -> None:

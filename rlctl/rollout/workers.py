@@ -20,7 +20,7 @@ from rlctl.environments.dict_spaces import Observations, join
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
-from rlctl.policy.file import PolicyInfo
+from rlctl.policy.file import PolicyFile
 from rlctl.processes.child_process import anonymous_file, write_stderr
 from rlctl.rollout import messages
 from rlctl.rollout.failures import format_hint, make_error
@@ -161,11 +161,11 @@ class Workers:
             self._send(worker, messages.BeginEpisodes(begun, may_fail))
         return {env for answer in self._wait(doing).values() for env in answer.left}
 
-    def set_policy(self, info: PolicyInfo, tensors: Mapping[str, NDArray[Any]]) -> None:
-        """Act with the present numbers of a policy, of a policy file's names, from the next segment on."""
+    def set_policy(self, policy: PolicyFile) -> None:
+        """Act with the present numbers of a policy from the next segment on."""
         self._wait_until_built()
-        if layout := self._numbers.write(info, tensors):
-            self._ask_all(messages.LoadPolicy(info, layout), "loading the policy")
+        if layout := self._numbers.write(policy):
+            self._ask_all(messages.LoadPolicy(policy.info, layout), "loading the policy")
 
     def set_other_policy(self, name: str) -> None:
         """Act with an exported file, by its whole path, or a baseline: `zero`, `random`, `file.py:function`."""

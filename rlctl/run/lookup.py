@@ -16,7 +16,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.environments.task_version import describe_task_changes
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 from rlctl.output import format_duration
-from rlctl.policy.file import PolicyInfo, read_info
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import PRETRAINED, find_shipped_policy
 from rlctl.run.directory import ROOT, TUNE_FILE, RunDirectory, is_group
 
@@ -137,7 +137,7 @@ def _find_policy(text: str | None, which: str, root: Path) -> FoundPolicy:
 
 def _find_shipped(task: str | None) -> FoundPolicy:
     file = find_shipped_policy(task)
-    info = read_info(file)
+    info = PolicyFile.read_info(file)
     notes = [f"shipped policy {file}: step {info.training_steps:,}"]
     if info.provenance is not None:
         digest = info.provenance.source_sha256
@@ -179,7 +179,7 @@ def _describe_choice(
     file: Path, run: RunDirectory, passed_over: Sequence[RunDirectory], older: Sequence[RunDirectory]
 ) -> tuple[str, ...]:
     try:
-        info = read_info(file)
+        info = PolicyFile.read_info(file)
     except ArtifactError:  # loading it reports the same
         return ()
     age = format_duration(max(time.time() - file.stat().st_mtime, 0.0))
@@ -198,7 +198,7 @@ def _find_better(info: PolicyInfo, older: Sequence[RunDirectory]) -> str | None:
     found: list[tuple[float, RunDirectory, str]] = []
     for run in older[:_MOST_COMPARED]:
         with contextlib.suppress(ArtifactError):
-            other = read_info(run.policy_file("best"))
+            other = PolicyFile.read_info(run.policy_file("best"))
             same = all(getattr(other.spec, key) == getattr(info.spec, key) for key in ("parameters", "reward_weights"))
             if not same or info.evaluation is None or other.evaluation is None:
                 continue

@@ -18,7 +18,7 @@ from rlctl.checking.leaves import Leaf, find_leaves
 from rlctl.environments import registry
 from rlctl.environments.plugin_code import call_plugin
 from rlctl.errors import TaskError
-from rlctl.policy.file import PolicyInfo, read_info
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
 
@@ -60,7 +60,7 @@ def describe(task: str) -> Description:
     call_plugin(task, lambda: env.close())
     recipe_file, entry = registry.find_recipe_file(task), registry.find(task)
     policy_file = entry.policy_file if entry else None
-    policy = read_info(policy_file) if policy_file else None
+    policy = PolicyFile.read_info(policy_file) if policy_file else None
     content = {
         **about,
         "recipe": recipe.model_dump(by_alias=True),

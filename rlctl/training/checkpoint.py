@@ -24,7 +24,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from rlctl.errors import ArtifactError
-from rlctl.policy.file import PolicyInfo, collect_versions, encode_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
 from rlctl.training import replay_segments, snapshot
@@ -33,6 +33,7 @@ from rlctl.training.progress import Progress
 from rlctl.training.replay_segments import ReplaySegments, Segment
 from rlctl.training.snapshot import Tensors
 from rlctl.training.vec_env import WorkerVecEnv
+from rlctl.version import collect_versions
 
 FORMAT = 1
 _POLICY, _STATE, _TENSORS = "policy.safetensors", "state.json", "state.safetensors"
@@ -84,7 +85,7 @@ class Checkpoints:
         """How many transitions the replay buffer has been given: one for each step of all environments."""
         return self._model.num_timesteps // self._env.num_envs
 
-    def save(self, packed: tuple[PolicyInfo, Tensors], progress: Progress) -> None:
+    def save(self, policy: PolicyFile, progress: Progress) -> None:
         """Write a checkpoint of the present boundary; raises `OSError` if the disk does not take it."""
         tensors, plain = snapshot.take(self._model)
         tensors |= _environment_tensors(self._env)
@@ -93,7 +94,7 @@ class Checkpoints:
             segments = self._replay.save(self._added)
             tensors |= replay_segments.hindsight_tensors(self._replay.buffer)
         contents = {
-            _POLICY: encode_policy(*packed),
+            _POLICY: policy.encode(),
             _TENSORS: save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()}),
         }
         state = State(

@@ -12,8 +12,8 @@ import numpy as np
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, EpisodeFailed, RlctlError
-from rlctl.policy.file import PolicyInfo, collect_versions
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.file import PolicyFile
+from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Recipe
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
@@ -21,7 +21,7 @@ from rlctl.rollout.workers import Workers
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.storage import files
-from rlctl.training.snapshot import Tensors
+from rlctl.version import collect_versions
 
 if TYPE_CHECKING:
     from rlctl.training.saving import Saver
@@ -47,9 +47,7 @@ class Evaluator:
         self._spec = self._workers.spec
         self._latest: list[RecordedEpisode] = []
 
-    def run(
-        self, info: PolicyInfo, tensors: Tensors, check: Callable[[], None], *, unseen: int | None = None
-    ) -> list[Episode]:
+    def run(self, policy: PolicyFile, check: Callable[[], None], *, unseen: int | None = None) -> list[Episode]:
         """Return the episodes of a policy: those of every evaluation, or a number that no evaluation has played.
 
         `check` is called several times a second and may raise to leave. Raises `TaskError` if an environment fails;
@@ -61,7 +59,7 @@ class Evaluator:
         seeds = episode_seeds(self._recipe.seed, Stream.EVAL_IN_TRAINING, usual + (unseen or 0))
         seeds = seeds[:usual] if unseen is None else seeds[usual:]
         try:
-            workers.set_policy(info, tensors)
+            workers.set_policy(policy)
             exploration = Exploration(stochastic=not settings.deterministic)
             return play_episodes(workers, seeds, exploration, record=True, watch=lambda _: check())
         except Exception:

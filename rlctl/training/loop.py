@@ -14,7 +14,7 @@ from typing import Any
 
 from rlctl.errors import ArtifactError, Interrupted, RlctlError, TaskError, UsageError
 from rlctl.evaluation.episode_statistics import mean_return, success_rate
-from rlctl.policy.file import Score
+from rlctl.policy.file import PolicyFile, Score
 from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.rollout.collect import Episode
 from rlctl.runs.diagnosis import Grade, diagnose
@@ -25,7 +25,7 @@ from rlctl.training.display import Display, format_score
 from rlctl.training.evaluation import Evaluator
 from rlctl.training.progress import Progress
 from rlctl.training.rollouts import Rollouts
-from rlctl.training.saving import Packed, Saver
+from rlctl.training.saving import Saver
 from rlctl.training.snapshot import check_finite, pack
 
 _FINAL_EPISODES = 30
@@ -196,15 +196,15 @@ class TrainingLoop:
         An environment that fails costs this evaluation, not the training.
         """
         steps, began = self.steps, time.monotonic()
-        packed = self._pack()
+        policy = self._pack()
         self._display.phase("evaluating")
         try:
             # They may take minutes, too long to wait after a signal; the resumed run repeats them.
-            episodes = self._evaluator.run(*packed, self._stop_if_requested)
+            episodes = self._evaluator.run(policy, self._stop_if_requested)
         except (TaskError, UsageError, ArtifactError) as error:  # the last two where files were removed meanwhile
             self._note_failed_evaluation(error)
         else:
-            self._note_evaluation(episodes, packed)
+            self._note_evaluation(episodes, policy)
         self.progress.last_eval = steps
         if steps < self.recipe.total_timesteps:  # at the end all of it is said
             self._report_findings()
@@ -227,13 +227,13 @@ class TrainingLoop:
         error = self._evaluator.keep_failed(error, self.curriculum.goal_spec, steps)
         self._display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
 
-    def _note_evaluation(self, episodes: list[Episode], packed: Packed) -> None:
+    def _note_evaluation(self, episodes: list[Episode], policy: PolicyFile) -> None:
         progress, steps, logger = self.progress, self.steps, self._model.logger
         results = [episode.result for episode in episodes]
         success, mean = success_rate(results), mean_return(results)
         better = progress.is_better(success, mean)
         if better:
-            self._keep_as_best(packed, success, mean)
+            self._keep_as_best(policy, success, mean)
         threshold = self.recipe.stop_success
         good = threshold is not None and success is not None and success >= threshold
         progress.good_in_a_row = progress.good_in_a_row + 1 if good else 0
@@ -277,21 +277,20 @@ class TrainingLoop:
         if last_is_better:
             self._keep_as_best(last, rows[-1]["success"], rows[-1]["return"] or 0.0)
 
-    def _score_anew(self, packed: Packed, episodes: int) -> tuple[float | None, float]:
+    def _score_anew(self, policy: PolicyFile, episodes: int) -> tuple[float | None, float]:
         """Return the success rate and the mean return of a policy in new episodes."""
-        played = self._evaluator.run(*packed, self._stop_if_requested, unseen=episodes)
+        played = self._evaluator.run(policy, self._stop_if_requested, unseen=episodes)
         results = [episode.result for episode in played]
         return success_rate(results), mean_return(results)
 
-    def _keep_as_best(self, packed: Packed, success: float | None, mean: float) -> None:
-        info = packed[0].model_copy(update={"evaluation": Score(success=success, mean_return=mean)})
-        self.saver.save_best((info, packed[1]))
+    def _keep_as_best(self, policy: PolicyFile, success: float | None, mean: float) -> None:
+        self.saver.save_best(policy.with_info(evaluation=Score(success=success, mean_return=mean)))
         progress = self.progress
         progress.best_success, progress.best_return, progress.best_step = success, mean, self.steps
 
-    def _pack(self) -> Packed:
-        info, tensors = pack(self._model, self.recipe.algo, self.curriculum.goal_spec, self.curriculum.goal)
-        return info.model_copy(update={"stages": self.curriculum.specs()}), tensors
+    def _pack(self) -> PolicyFile:
+        policy = pack(self._model, self.recipe.algo, self.curriculum.goal_spec, self.curriculum.goal)
+        return policy.with_info(stages=self.curriculum.specs())
 
     def save_checkpoint(self) -> bool:
         """Write a checkpoint of the present boundary; False, with a warning, if the disk does not take it."""

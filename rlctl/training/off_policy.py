@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from rlctl.environments.dict_spaces import join, split_space
-from rlctl.policy.network import DETERMINISTIC
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.file import DETERMINISTIC
+from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Recipe
 from rlctl.training.hindsight import has_whole_episode
 from rlctl.training.progress import Progress

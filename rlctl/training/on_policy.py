@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 
 from rlctl.environments.dict_spaces import join, split, split_space
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.players.player import Exploration
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.training.rollouts import Check, Rollouts, Statistics, to_network_layout
 

@@ -18,7 +18,7 @@ from rlctl.environments.named_task import RUN
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.output import format_count
-from rlctl.policy.file import read_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.recipe.recipe import ON_POLICY
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
@@ -151,7 +151,7 @@ def _restore(start: Start, checkpoints: Checkpoints, learner: Learner) -> str:
 
     assert start.checkpoint is not None
     file = start.checkpoint.folder / "policy.safetensors"
-    read_policy(file)[0].check_fits(learner.curriculum.goal, file)
+    PolicyFile.read(file).info.check_fits(learner.curriculum.goal, file)
     mismatch = checkpoints.restore(start.checkpoint)
     inexact = [*start.inexact, *find_differences(start.checkpoint.state.computed_with, checkpoints.computed_with())]
     inexact += [mismatch] if mismatch else []

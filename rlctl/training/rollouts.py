@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.policy.file import PolicyInfo
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.recipe.recipe import Recipe
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.training.progress import Progress
@@ -82,11 +82,11 @@ class Rollouts(abc.ABC):
         """Give the workers the present numbers of the model's policy."""
         model, workers = self.model, self.env.workers
         if self._policy_info is None:
-            self._policy_info = pack(model, self._algo, workers.spec, workers.info)[0]
+            self._policy_info = pack(model, self._algo, workers.spec, workers.info).info
         tensors = {f"policy/{name}": value.cpu().numpy() for name, value in model.policy.state_dict().items()}
         for key, (mean, var) in statistics.items():
             tensors |= {f"normalize/{key}/mean": mean, f"normalize/{key}/var": var}
-        workers.set_policy(self._policy_info, tensors)
+        workers.set_policy(PolicyFile(self._policy_info, tensors))
         if (state := workers.recurrent_state) is not None:
             last = model._last_lstm_states.pi
             state[:, 0], state[:, 1] = (part.cpu().numpy().transpose(1, 0, 2) for part in last)

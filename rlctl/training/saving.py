@@ -7,16 +7,13 @@ from collections.abc import Callable
 from typing import Any
 
 from rlctl.errors import ArtifactError
-from rlctl.policy.file import PolicyInfo, read_policy, save_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
 from rlctl.storage.table import Table
 from rlctl.training.checkpoint import Checkpoints
 from rlctl.training.evaluation import remove_after
 from rlctl.training.progress import Progress
-from rlctl.training.snapshot import Tensors
-
-Packed = tuple[PolicyInfo, Tensors]
 
 CHECKPOINT_TIME_SHARE = 0.02
 """Part of the training's time that checkpoints may take."""
@@ -40,7 +37,7 @@ class Saver:
         """Checkpoints that come whether they are due or not: the last one."""
         self._reported: set[str] = set()
         """Problems that were reported since everything was saved."""
-        self._unsaved_best: Packed | None = None
+        self._unsaved_best: PolicyFile | None = None
         """The best policy, until the disk takes it."""
 
     def attempt(self, what: str, write: Callable[[], object]) -> bool:
@@ -68,29 +65,29 @@ class Saver:
         table.add(row)
         self.attempt(table.path.name, table.flush)
 
-    def save_best(self, packed: Packed) -> None:
+    def save_best(self, policy: PolicyFile) -> None:
         """Write the best policy; one that the disk does not take now is written before the next checkpoint."""
-        self._unsaved_best = packed
+        self._unsaved_best = policy
         self.attempt("best policy", self._write_best)
 
-    def read_best(self) -> Packed:
+    def read_best(self) -> PolicyFile:
         """Return the best policy. Raises `ArtifactError` if its file is gone or damaged."""
-        return self._unsaved_best or read_policy(self.run.best_policy)
+        return self._unsaved_best or PolicyFile.read(self.run.best_policy)
 
     def _write_best(self) -> None:
         if self._unsaved_best is not None:
-            save_policy(self.run.best_policy, *self._unsaved_best)
+            self._unsaved_best.write(self.run.best_policy)
         self._unsaved_best = None
 
     def checkpoint_is_due(self) -> bool:
         """Whether the time that checkpoints may take allows one."""
         return time.monotonic() >= self._next_checkpoint
 
-    def checkpoint(self, pack: Callable[[], Packed], progress: Progress) -> bool:
+    def checkpoint(self, pack: Callable[[], PolicyFile], progress: Progress) -> bool:
         """Write the last policy and a checkpoint; False, with a warning, if the disk does not take it."""
         began = time.monotonic()
-        packed = pack()
-        saved = self.attempt("checkpoint", lambda: self._write_checkpoint(packed, progress))
+        policy = pack()
+        saved = self.attempt("checkpoint", lambda: self._write_checkpoint(policy, progress))
         if saved:
             self._report_saved_again()
             self.attempt("old checkpoints", self._checkpoints.remove_old)
@@ -104,16 +101,16 @@ class Saver:
             self._warn(f"saved again, at step {self.saved_step:,}")
         self._reported.clear()
 
-    def _write_checkpoint(self, packed: Packed, progress: Progress) -> None:
+    def _write_checkpoint(self, policy: PolicyFile, progress: Progress) -> None:
         # Whoever goes on from a checkpoint will not come by here again: everything before it must be on the disk.
         self.metrics.flush(sync=True)
         self.evals.flush(sync=True)
         progress.metrics_bytes, progress.evals_bytes = self.metrics.size, self.evals.size
         progress.metrics_sha256, progress.evals_sha256 = self.metrics.digest(), self.evals.digest()
         self._write_best()
-        save_policy(self.run.last_policy, *packed)
-        self._checkpoints.save(packed, progress)
-        self.saved_step = packed[0].training_steps
+        policy.write(self.run.last_policy)
+        self._checkpoints.save(policy, progress)
+        self.saved_step = policy.info.training_steps
 
 
 def cut_back(run: RunDirectory, step: int, progress: Progress) -> list[str]:
@@ -151,7 +148,7 @@ def _read_best_score(run: RunDirectory, progress: Progress) -> list[str]:
     score = (progress.best_success or 0.0, progress.best_return or 0.0)
     progress.best_success = progress.best_return = progress.best_step = None
     try:
-        info, _ = read_policy(run.best_policy)
+        info = PolicyFile.read(run.best_policy).info
     except ArtifactError as error:
         problem = str(error)
     else:

@@ -20,8 +20,9 @@ from rlctl.environments.dict_spaces import split
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, DivergedError
-from rlctl.policy.file import PolicyInfo, collect_versions
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.torch_policy import describe_network, policy_name
+from rlctl.version import collect_versions
 
 Tensors = dict[str, NDArray[Any]]
 
@@ -32,8 +33,8 @@ _COUNTERS = (
 _MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", "actor_loss", "critic_loss")
 
 
-def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> tuple[PolicyInfo, Tensors]:
-    """Return description and tensors of a model's policy, with the normalisation it has now.
+def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> PolicyFile:
+    """Return a model's policy, with the normalisation it has now.
 
     The arrays are copies: training may go on.
     """
@@ -54,7 +55,7 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> tuple[
         training_steps=model.num_timesteps,
         versions=collect_versions(),
     )
-    return info, tensors
+    return PolicyFile(info, tensors)
 
 
 def observation_statistics(normalizer: VecNormalize | None) -> dict[str, RunningMeanStd]:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl.environments.task_version import find_git_commit, identify_task
 from rlctl.errors import DivergedError, Interrupted, RlctlError
-from rlctl.policy.file import collect_versions
 from rlctl.recipe.recipe import Recipe, find_difference
 from rlctl.recipe.sources import resolve_packaged
 from rlctl.run.directory import RunDirectory
+from rlctl.version import collect_versions
 
 if TYPE_CHECKING:
     from rlctl.training.progress import Progress

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from rlctl.environments.dict_spaces import split_space
 from rlctl.errors import EpisodeFailed
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.players.player import Exploration
 from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SegmentArrays

@@ -9,8 +9,7 @@ from typing import Any
 from rlctl.environments import registry
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import UsageError
-from rlctl.policy.file import PolicyInfo, read_info, read_policy
-from rlctl.policy.network import select_actor_tensors
+from rlctl.policy.file import PolicyFile, PolicyInfo, list_actor_tensors
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.recipe.recipe import Recipe
 from rlctl.run.lookup import find_policy
@@ -30,7 +29,7 @@ def find_source(text: str, recipe: Recipe) -> dict[str, Any]:
         raise UsageError(f"--from {text}: an ONNX file cannot be trained on; give the run or its .safetensors file")
     ships = registry.find(text) is not None and not (Path(text) / "run.json").is_file()
     file = find_policy(text, PRETRAINED if ships else "best").file
-    info = read_info(file)
+    info = PolicyFile.read_info(file)
     if info.algo != recipe.algo:
         raise UsageError(
             f"--from {file}: a policy of {info.algo}, and the recipe trains {recipe.algo}; add --algo {info.algo}, or "
@@ -51,13 +50,13 @@ def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
     differs.
     """
     file = Path(source["policy"])
-    info, tensors = read_policy(file)
+    policy = PolicyFile.read(file)
+    info, weights = policy.info, policy.weights
     info.check_fits(env, file)
-    weights = {name.removeprefix("policy/"): each for name, each in tensors.items() if name.startswith("policy/")}
     _check_network(file, info, model, weights)
-    whole = len(select_actor_tensors(info, tensors)) < len(tensors)
+    whole = len(policy.actor_only().tensors) < len(policy.tensors)
     _load_weights(info, model, weights)
-    _load_normalization(file, info, model, tensors)
+    _load_normalization(file, info, model, policy.tensors)
     text = f"begins with {file} ({info.algo}, {info.training_steps:,} steps on {info.spec.task})"
     if whole:
         return f"{text}: its actor, critic and normalisation"
@@ -73,7 +72,7 @@ def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[st
     ours = describe_network(model.policy)
     network = {name: tuple(each.shape) for name, each in model.policy.state_dict().items()}
     wrong = [name for name, each in weights.items() if network.get(name) != each.shape]
-    needed = select_actor_tensors(info, dict.fromkeys(f"policy/{name}" for name in network))  # type: ignore[arg-type]
+    needed = list_actor_tensors(info.algo, [f"policy/{name}" for name in network])
     wrong += [name for name in (each.removeprefix("policy/") for each in needed) if name not in weights]
     keys = dict.fromkeys([*info.policy_kwargs, *ours]) if wrong else _SAME_FUNCTION
     different = [key for key in keys if _as_plain(info.policy_kwargs.get(key)) != _as_plain(ours.get(key))]

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.file import PolicyInfo
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.policy.players.player import Exploration
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import Play
 from rlctl.rollout.seeds import Stream, episode_seed
@@ -47,7 +47,7 @@ def half_cheetah(repeat: int) -> Row:
 def evaluation(repeat: int) -> Row:
     """Count environment steps of 100 whole episodes of `reach`, as `rlctl eval` plays them."""
     workers = Workers(EnvSpec("reach"), available_cores())
-    workers.set_policy(*make_policy(workers))
+    workers.set_policy(make_policy(workers))
     turns = _Turns("reach")
 
     def play() -> float:
@@ -120,7 +120,7 @@ class _Player:
         self._play(seeds)
 
     def _play(self, begin: dict[int, int]) -> None:
-        self.workers.set_policy(*self._policy)
+        self.workers.set_policy(self._policy)
         self.workers.start_playing(Play(STEPS, begin, dict(enumerate(self._started)), exploration=SAMPLES))
         for result in self.workers.finish_playing():
             self._started[result.env] += 1
@@ -171,7 +171,7 @@ class _Turns:
 _LAYERS = ("mlp_extractor.policy_net.0", "mlp_extractor.policy_net.2", "action_net")
 
 
-def make_policy(workers: Workers) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
+def make_policy(workers: Workers) -> PolicyFile:
     """Return a policy of random numbers."""
     rng = np.random.default_rng(0)
     observations, actions = (int(np.prod(space.shape or ())) for space in workers.info.spaces())
@@ -189,4 +189,4 @@ def make_policy(workers: Workers) -> tuple[PolicyInfo, dict[str, NDArray[Any]]]:
         normalized_keys=[""],
         clip_observation=10.0,
     )
-    return info, tensors
+    return PolicyFile(info, tensors)

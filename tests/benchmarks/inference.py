@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import rlctl
+from rlctl.policy.file import PolicyFile
 from tests.benchmarks.row import Row, side_by_side
 from tests.benchmarks.shipped import rlctl_command, short_run
 
@@ -50,15 +51,15 @@ def c_function(repeat: int) -> Row:
     """Time C for one observation, called through ctypes, beside onnxruntime's own `session.run`; both from Python."""
     from rlctl.exporting.c_source import build_library, find_compiler, write_c
     from rlctl.policy.c_policy import CPolicy
-    from rlctl.policy.file import read_policy
 
     run = short_run()
     rlctl_command("export", str(run), "--onnx")
     exported: Any = rlctl.load_policy(run / "exports" / "policy.onnx")
-    info, tensors = read_policy(run / "policies" / "best.safetensors")
+    policy = PolicyFile.read(run / "policies" / "best.safetensors")
+    info = policy.info
     compiler = find_compiler()
     assert compiler is not None, "no C compiler"
-    code = write_c(info, tensors, "policy")
+    code = write_c(policy, "policy")
     with tempfile.TemporaryDirectory() as folder:
         policy = CPolicy.load(build_library(code, info, Path(folder), compiler))
     observation = np.zeros(exported.observation_space.shape, np.float32)

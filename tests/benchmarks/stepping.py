@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import rlctl
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.players.player import Exploration
 from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.task.bullet import pybullet, pybullet_data
@@ -160,7 +160,7 @@ def many_environments(repeat: int) -> Row:
     """Count environment steps, resets included, of `Workers` and of SB3's `SubprocVecEnv`."""
     workers = Workers(EnvSpec(TASK), MANY)
     workers.reset({env: env for env in range(MANY)})
-    workers.set_policy(*make_policy(workers))
+    workers.set_policy(make_policy(workers))
     processes = SubprocVecEnv([lambda: rlctl.make(TASK)] * FEW)
     processes.reset()
     rounds = 120  # steps of all environments

@@ -47,7 +47,7 @@ def policy(tmp_path_factory):
 
     from rlctl.environments.info import EnvInfo, space_to_json
     from rlctl.environments.spec import EnvSpec
-    from rlctl.policy.file import PolicyInfo, save_policy
+    from rlctl.policy.file import PolicyFile, PolicyInfo
     from rlctl.policy.torch_policy import build_network
 
     env = EnvInfo(
@@ -56,7 +56,7 @@ def policy(tmp_path_factory):
     )
     info = PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec("printing.py:Printing"))
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
-    save_policy(path, info, {f"policy/{k}": v.numpy() for k, v in build_network(info).state_dict().items()})
+    PolicyFile(info, {f"policy/{k}": v.numpy() for k, v in build_network(info).state_dict().items()}).write(path)
     return path
 
 

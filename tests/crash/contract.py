@@ -3,7 +3,7 @@
 import csv
 from pathlib import Path
 
-from rlctl.policy.file import read_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.run.directory import RunDirectory
 from tests.crash.trials import Ended, Trials, only_run, resume
 from tests.training.comparing import assert_same_run
@@ -34,11 +34,11 @@ def assert_same_end(run: RunDirectory, whole: RunDirectory) -> None:
     """Hold that a run has ended as another one: bit by bit, and tidily."""
     assert run.status()["status"] == "finished"
     assert_same_run(whole, run)
-    ours, theirs = read_policy(run.last_policy)[1], read_policy(whole.last_policy)[1]
+    ours, theirs = PolicyFile.read(run.last_policy).tensors, PolicyFile.read(whole.last_policy).tensors
     assert {name: values.tobytes() for name, values in ours.items()} == {
         name: values.tobytes() for name, values in theirs.items()
     }
-    assert read_policy(run.best_policy)[0] == read_policy(whole.best_policy)[0]
+    assert PolicyFile.read(run.best_policy).info == PolicyFile.read(whole.best_policy).info
 
 
 def assert_quiet(ended: Ended) -> None:
@@ -52,7 +52,7 @@ def assert_best_is_best(run: RunDirectory) -> None:
     """Hold that the best policy is at least as good as each evaluation there is a row of."""
     if not (evals := whole_rows(run.evals_file)):
         return
-    score = read_policy(run.best_policy)[0].evaluation
+    score = PolicyFile.read(run.best_policy).info.evaluation
     best = max((float(row["success"]), float(row["return"])) for row in evals)
     assert (score.success, score.mean_return) >= best
 

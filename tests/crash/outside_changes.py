@@ -21,7 +21,7 @@ def begin(what, after=0, until=None):
 
     @functools.wraps(original)
     def checkpoint(saver, pack, progress, **options):
-        step = pack()[0].training_steps
+        step = pack().info.training_steps
         if until is not None and step >= until:
             _broken.clear()
         saved = original(saver, pack, progress, **options)

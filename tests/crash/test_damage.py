@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import ArtifactError
-from rlctl.policy.file import read_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from tests.crash.conftest import PARTS, parts
@@ -69,14 +69,14 @@ def assert_as_told(run: RunDirectory, whole: RunDirectory, damage: Damage, notic
         assert_same_end(run, whole)
         return
     # What was lost is lost; the training itself goes on as it would have.
-    ours, theirs = (read_policy(each.last_policy)[1] for each in (run, whole))
+    ours, theirs = (PolicyFile.read(each.last_policy).tensors for each in (run, whole))
     assert ours.keys() == theirs.keys()
     for key, values in ours.items():
         np.testing.assert_array_equal(values, theirs[key], err_msg=str(damage))
     for table in ("metrics.csv", "evals.csv"):
         if table not in damage.files:
             assert rows(run.path / table) == rows(whole.path / table)
-    read_policy(run.best_policy)
+    PolicyFile.read(run.best_policy)
 
 
 def unless_refused(read, file):
@@ -96,13 +96,12 @@ def assert_policies_tell(run: RunDirectory, undamaged: RunDirectory, damage: Dam
     for file in damage.files:
         if not file.endswith(("best.safetensors", "last.safetensors", "policy.safetensors")):
             continue
-        if (read := unless_refused(read_policy, run.path / file)) is None:
+        if (read := unless_refused(PolicyFile.read, run.path / file)) is None:
             continue
-        info, tensors = read
-        before_info, before = read_policy(undamaged.path / file)
-        assert info == before_info
-        assert {name: values.tobytes() for name, values in tensors.items()} == {
-            name: values.tobytes() for name, values in before.items()
+        before = PolicyFile.read(undamaged.path / file)
+        assert read.info == before.info
+        assert {name: values.tobytes() for name, values in read.tensors.items()} == {
+            name: values.tobytes() for name, values in before.tensors.items()
         }
 
 

@@ -11,7 +11,7 @@ from rlctl.environments import named_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
-from rlctl.policy.file import compute_digest, read_policy
+from rlctl.policy.file import PolicyFile, compute_digest
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
@@ -97,7 +97,7 @@ def run(tmp_path_factory):
 
 
 def test_a_policy_that_names_a_function_runs_nothing(run, tmp_path):
-    info, _ = read_policy(run.best_policy)
+    info = PolicyFile.read(run.best_policy).info
     mark = tmp_path / "ran"
     spec = {"task": "os:system", "parameters": {"command": f"touch {mark}"}, "named_by": ""}
     evil = {**json.loads(info.model_dump_json()), "spec": spec}

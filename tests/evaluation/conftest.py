@@ -8,7 +8,6 @@ import pytest
 
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.file import save_policy
 from rlctl.run.directory import RunDirectory
 from tests.rollout.policies import linear
 
@@ -20,15 +19,13 @@ def write_run(folder: Path, task: str) -> RunDirectory:
     spec = EnvSpec(task)
     env = spec.make()
     try:
-        info, tensors = linear(
-            describe(env), np.zeros((env.action_space.shape[0], env.observation_space.shape[0])), 0.0
-        )
+        policy = linear(describe(env), np.zeros((env.action_space.shape[0], env.observation_space.shape[0])), 0.0)
     finally:
         env.close()
     run = RunDirectory(folder)
     run.best_policy.parent.mkdir(parents=True)
     run.status_file.write_text(json.dumps({"task": task, "status": "finished", "algo": "ppo", "seed": 0}))
-    save_policy(run.best_policy, info.model_copy(update={"spec": spec}), tensors)
+    policy.with_info(spec=spec).write(run.best_policy)
     return run
 
 

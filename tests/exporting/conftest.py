@@ -9,7 +9,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.file import save_policy
 from rlctl.policy.torch_policy import ALGORITHMS, policy_name
 from rlctl.recipe.recipe import Normalize
 from rlctl.training.algorithms import keep_compiler_out, wrap_normalize
@@ -68,7 +67,7 @@ def write(tmp_path):
 
     def written(model, algo, spec, name="policy"):
         path = tmp_path / f"{name}.safetensors"
-        save_policy(path, *pack(model, algo, spec, describe(spec.make())))
+        pack(model, algo, spec, describe(spec.make())).write(path)
         return path
 
     return written

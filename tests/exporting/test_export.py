@@ -12,7 +12,6 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.report import format_closed_loop, show
 from rlctl.exporting.verify import Comparison, compare_episodes, verify
-from rlctl.policy.file import read_policy
 from rlctl.policy.onnx_policy import OnnxPolicy
 from rlctl.policy.torch_policy import TorchPolicy
 from rlctl.rollout.collect import Episode
@@ -124,8 +123,7 @@ def test_other_weights_are_noticed(small, train, write, tmp_path):
     model.policy.action_net.bias.data[0] += 0.001
     exported = export(write(model, "ppo", small(), name="other")).path
     with Workers(small(), 10) as workers:
-        tensors = read_policy(original)[1]
-        agreement, _ = verify(TorchPolicy.load(original), OnnxPolicy.load(exported), tensors, exported, workers)
+        agreement, _ = verify(TorchPolicy.load(original), OnnxPolicy.load(exported), exported, workers)
     assert not agreement.agrees
     assert agreement.max_difference == pytest.approx(0.001, rel=0.01)
     assert agreement.beyond_limit > 1000

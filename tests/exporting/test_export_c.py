@@ -12,7 +12,7 @@ from rlctl.errors import UsageError
 from rlctl.exporting.c_source import FLAGS, build_library, find_compiler, write_c
 from rlctl.exporting.export import export_policy
 from rlctl.policy.c_policy import CPolicy
-from rlctl.policy.file import read_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy
 from tests.exporting.test_export_graph import random_observations
 
@@ -21,8 +21,8 @@ STEPS = 30
 
 
 def write_source(path, name="policy"):
-    info, tensors = read_policy(path)
-    return info, write_c(info, tensors, name)
+    policy = PolicyFile.read(path)
+    return policy.info, write_c(policy, name)
 
 
 @pytest.fixture
@@ -156,11 +156,12 @@ def test_name_of_the_output(small, train, write, tmp_path):
 def test_names_of_a_stranger_stay_in_their_comments(small, train, write, tmp_path):
     model = train("ppo", small(), steps=0)
     path = write(model, "ppo", small())
-    info, tensors = read_policy(path)
+    policy = PolicyFile.read(path)
+    info = policy.info
     evil = '*/ #error "out"\n#error "line" /* \\'
     env = info.env.model_copy(update={"action_meaning": evil, "robot": evil, "observation_sizes": {evil: 3}})
     info = info.model_copy(update={"env": env})
-    code = write_c(info, tensors, "int")
+    code = write_c(policy, "int")
     assert code.name == "int"
     build_library(code, info, tmp_path, [*find_compiler(), "-Werror"])
 

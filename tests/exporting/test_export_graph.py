@@ -11,7 +11,7 @@ from rlctl.environments.info import describe
 from rlctl.errors import UsageError
 from rlctl.exporting.actor import build
 from rlctl.policy import onnx_file
-from rlctl.policy.file import read_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.policy.onnx_policy import OnnxPolicy
 from rlctl.policy.torch_policy import ACTIVATIONS
 
@@ -20,8 +20,8 @@ ROWS = 50
 
 
 def session_of(path):
-    info, tensors = read_policy(path)
-    model = build(info, tensors)
+    policy = PolicyFile.read(path)
+    model = build(policy)
     return onnxruntime.InferenceSession(model.SerializeToString())
 
 
@@ -191,8 +191,9 @@ def test_file_says_what_it_is(train, tmp_path):
 
     spec = EnvSpec("reach", {"tolerance": 0.02})
     model = train("ppo", spec, steps=0)
-    info, tensors = pack(model, "ppo", spec, describe(spec.make()))
-    proto = build(info, tensors)
+    policy = pack(model, "ppo", spec, describe(spec.make()))
+    info = policy.info
+    proto = build(policy)
     assert proto.ir_version == 8
     assert [(each.domain, each.version) for each in proto.opset_import] == [("", 17)]
     metadata = {each.key: each.value for each in proto.metadata_props}
@@ -243,7 +244,7 @@ def test_what_has_no_translation_is_named(observation, action, algo, policy_kwar
 
     spec = small(observation, action)
     model = train(algo, spec, steps=0, policy_kwargs=policy_kwargs)
-    info, tensors = pack(model, algo, spec, describe(spec.make()))
+    policy = pack(model, algo, spec, describe(spec.make()))
     with pytest.raises(UsageError, match=message) as raised:
-        build(info, tensors)
+        build(policy)
     assert raised.value.exit_code == 2

@@ -13,7 +13,7 @@ from rlctl import load_policy
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError
-from rlctl.policy.file import PolicyInfo, compute_digest, save_policy
+from rlctl.policy.file import PolicyFile, PolicyInfo, compute_digest
 from rlctl.policy.torch_policy import TorchPolicy, build_network
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
@@ -28,7 +28,7 @@ def good(tmp_path_factory):
     )  # fmt: skip
     tensors = {f"policy/{key}": value.numpy() for key, value in build_network(info).state_dict().items()}
     path = tmp_path_factory.mktemp("good") / "policy.safetensors"
-    save_policy(path, info, {**tensors, "normalize//mean": np.zeros(5), "normalize//var": np.ones(5)})
+    PolicyFile(info, {**tensors, "normalize//mean": np.zeros(5), "normalize//var": np.ones(5)}).write(path)
     return path
 
 

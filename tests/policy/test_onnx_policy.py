@@ -28,8 +28,8 @@ def exported(path, algo="ppo", **kwargs):
     env.obs_rms.update(np.array([[0.0, 0.1, -3.0], [0.5, 0.2, 2.0]]))
     model = ALGORITHMS[algo](policy_name(algo, env.observation_space), env, device="cpu", seed=0, **kwargs)
     model.policy.action_net.weight.data.mul_(100.0)  # SB3 begins with actions near zero
-    info, tensors = pack(model, algo, PENDULUM, describe(PENDULUM.make()))
-    path.write_bytes(onnx_file.encode(build(info, tensors)))
+    policy = pack(model, algo, PENDULUM, describe(PENDULUM.make()))
+    path.write_bytes(onnx_file.encode(build(policy)))
     return path
 
 

@@ -14,8 +14,8 @@ from rlctl import load_policy
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.policy.file import PolicyInfo, compute_digest, read_policy, save_policy
-from rlctl.policy.network import Network, select_actor_tensors
+from rlctl.policy.file import PolicyFile, PolicyInfo, compute_digest
+from rlctl.policy.network import Network
 from rlctl.policy.torch_policy import TorchPolicy, build_network, pin_threads
 from rlctl.run.directory import RunDirectory
 
@@ -53,7 +53,7 @@ def saved(tmp_path):
     def save(**options):
         info = describe(**options)
         path = tmp_path / "policy.safetensors"
-        save_policy(path, info, tensors_of(info))
+        PolicyFile(info, tensors_of(info)).write(path)
         return path
 
     return save
@@ -69,8 +69,9 @@ def test_round_trip(tmp_path):
     tensors = tensors_of(info)
     tensors["policy/transposed"] = np.arange(6.0).reshape(2, 3).T
     path = tmp_path / "policies" / "best.safetensors"
-    save_policy(path, info, tensors)
-    read, arrays = read_policy(path)
+    PolicyFile(info, tensors).write(path)
+    policy = PolicyFile.read(path)
+    read, arrays = policy.info, policy.tensors
     assert read == info
     assert arrays.keys() == tensors.keys()
     for name, value in tensors.items():
@@ -80,14 +81,15 @@ def test_round_trip(tmp_path):
 
 def test_no_bit_of_a_policy_changes_unnoticed(path):
     content = path.read_bytes()
-    info, tensors = read_policy(path)
+    policy = PolicyFile.read(path)
+    info, tensors = policy.info, policy.tensors
     chance, accepted = np.random.default_rng(0), []
     for bit in chance.integers(8 * len(content), size=400).tolist():
         flipped = bytearray(content)
         flipped[bit // 8] ^= 1 << bit % 8
         path.write_bytes(flipped)
         with contextlib.suppress(ArtifactError):
-            accepted.append(read_policy(path))
+            accepted.append(PolicyFile.read(path))
     # What is left are bits of the format's own, such as the name of the digest.
     assert len(accepted) < 8
     for now, arrays in accepted:
@@ -98,12 +100,12 @@ def test_no_bit_of_a_policy_changes_unnoticed(path):
 
 
 def test_normalisation_by_hand(path):
-    _, tensors = read_policy(path)
+    tensors = PolicyFile.read(path).tensors
     observation = np.array([3.0, -2.0, 0.0, 1.0, 90.0], np.float32)
     mean, var = tensors["normalize//mean"], tensors["normalize//var"]
     expected = np.clip((observation - mean) / np.sqrt(var + 1e-8), -10.0, 10.0)
     assert expected[4] == 10.0
-    (normalize, _) = Network(*read_policy(path)).parts[""]
+    (normalize, _) = Network(PolicyFile.read(path)).parts[""]
     np.testing.assert_array_equal(normalize(observation), expected.astype(np.float32))
     np.testing.assert_array_equal(TorchPolicy.load(path).normalize(observation), expected.astype(np.float32))
 
@@ -146,7 +148,8 @@ def test_damaged_metadata(path, text):
 
 
 def test_a_policy_without_a_digest(path):
-    info, tensors = read_policy(path)
+    policy = PolicyFile.read(path)
+    info, tensors = policy.info, policy.tensors
     path.write_bytes(save(tensors, metadata={"rlctl": info.model_dump_json()}))
     with pytest.raises(ArtifactError, match=r"damaged: its metadata has no sha256, which every policy of rlctl has$"):
         rlctl.load_policy(path)
@@ -169,7 +172,7 @@ def test_a_missing_file(tmp_path):
     ],
 )
 def test_a_description_that_does_not_fit(path, changes, message):
-    info, _ = read_policy(path)
+    info = PolicyFile.read(path).info
     rewrite(path, {"rlctl": info.model_copy(update=changes).model_dump_json()})
     with pytest.raises(ArtifactError) as caught:
         TorchPolicy.load(path)
@@ -211,7 +214,7 @@ def test_predict_with_a_wrong_shape(path, saved):
 def test_a_wrong_shape_names_what_the_recipe_adds(tmp_path):
     info = describe()
     info = info.model_copy(update={"spec": dataclasses.replace(info.spec, frame_stack=4, time_feature=True)})
-    save_policy(tmp_path / "policy.safetensors", info, tensors_of(info))
+    PolicyFile(info, tensors_of(info)).write(tmp_path / "policy.safetensors")
     with pytest.raises(ValueError, match=r"expects \(5,\), with the part of the episode that is left and 4 frames, as"):
         rlctl.load_policy(tmp_path / "policy.safetensors").predict(np.zeros(4))
 
@@ -226,15 +229,15 @@ def test_predict_with_a_picture_from_0_to_1(saved):
 def test_an_actor_alone_acts_as_the_whole_policy(tmp_path, algo):
     info = describe(algo, "MlpLstmPolicy" if algo == "recurrent_ppo" else "MlpPolicy", policy_kwargs={"net_arch": [8]})
     tensors = tensors_of(info)
-    actor = select_actor_tensors(info, tensors)
+    actor = dict(PolicyFile(info, tensors).actor_only().tensors)
     assert 0 < len(actor) < len(tensors)
     actions = []
     for name, content in (("whole", tensors), ("actor", actor)):
-        save_policy(tmp_path / f"{name}.safetensors", info, content)
+        PolicyFile(info, content).write(tmp_path / f"{name}.safetensors")
         actions.append(rlctl.load_policy(tmp_path / f"{name}.safetensors").predict(np.linspace(-1, 1, 5, dtype="f4")))
     np.testing.assert_array_equal(*actions)
     del actor[min(name for name in actor if name.endswith(".weight"))]
-    save_policy(tmp_path / "part.safetensors", info, actor)
+    PolicyFile(info, actor).write(tmp_path / "part.safetensors")
     with pytest.raises(ArtifactError, match="its tensors do not fit its description: tensors missing: "):
         TorchPolicy.load(tmp_path / "part.safetensors")
 

@@ -5,7 +5,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import DivergedError, EpisodeFailed, TaskError
-from rlctl.policy.players.policy_player import Exploration
+from rlctl.policy.players.player import Exploration
 from rlctl.rollout import collect
 from rlctl.rollout.collect import play_episodes
 from tests.rollout.policies import linear
@@ -19,7 +19,7 @@ TOWARDS_ZERO = -0.5 * np.eye(2)
 
 
 def play(workers, **options):
-    workers.set_policy(*linear(workers.info, TOWARDS_ZERO))
+    workers.set_policy(linear(workers.info, TOWARDS_ZERO))
     return play_episodes(workers, SEEDS, **options)
 
 
@@ -73,7 +73,7 @@ def test_no_episodes(spec, start):
 
 def test_terms_are_recorded(spec, start):
     workers = start(EnvSpec(spec("Counting").task), 2)
-    workers.set_policy(*linear(workers.info, [[0.0]]))
+    workers.set_policy(linear(workers.info, [[0.0]]))
     (episode,) = play_episodes(workers, [4], record=True)
     trajectory = episode.trajectory
     count = float(trajectory.observations[0, 0])
@@ -84,7 +84,7 @@ def test_terms_are_recorded(spec, start):
 
 def test_overlapping_bodies_are_measured_in_the_first_episodes(spec, start):
     workers = start(EnvSpec(spec("Sunk").task), 2)
-    workers.set_policy(*linear(workers.info, np.zeros((1, 3))))
+    workers.set_policy(linear(workers.info, np.zeros((1, 3))))
     episodes = play_episodes(workers, range(11), record=True)
     # The cube begins 2 cm inside the floor, and each step lets it out a little.
     assert all(0.01 < each.result.deepest_contact < 0.02 for each in episodes[:10])
@@ -94,7 +94,7 @@ def test_overlapping_bodies_are_measured_in_the_first_episodes(spec, start):
 
 def test_dict_observations_are_recorded_by_key(spec, start):
     workers = start(spec("Spaces", kind="dict"), 2)
-    workers.set_policy(*linear(workers.info, np.zeros((4, 7))))  # two numbers and five alternatives
+    workers.set_policy(linear(workers.info, np.zeros((4, 7))))  # two numbers and five alternatives
     (episode,) = play_episodes(workers, [0], record=True)
     assert episode.trajectory.observations["a"].tolist() == [0, 1, 2, 3]
     assert episode.trajectory.observations["z"].shape == (4, 2)
@@ -104,7 +104,7 @@ def test_dict_observations_are_recorded_by_key(spec, start):
 def test_an_episode_longer_than_a_segment_is_recorded_whole(spec, start):
     """Without a time limit an environment is played in segments, and they are joined."""
     workers = start(spec("Long", length=2345), 2)
-    workers.set_policy(*linear(workers.info, TOWARDS_ZERO))
+    workers.set_policy(linear(workers.info, TOWARDS_ZERO))
     (episode,) = play_episodes(workers, [4], record=True)
     assert episode.result.length == len(episode.trajectory.actions) == 2345
     assert episode.trajectory.observations[:, 0].tolist() == list(range(2346))
@@ -113,7 +113,7 @@ def test_an_episode_longer_than_a_segment_is_recorded_whole(spec, start):
 def test_an_episode_that_never_ends(spec, start, monkeypatch):
     monkeypatch.setattr(collect, "MOST_STEPS", 2000)
     workers = start(spec("Long", length=0), 1)
-    workers.set_policy(*linear(workers.info, TOWARDS_ZERO))
+    workers.set_policy(linear(workers.info, TOWARDS_ZERO))
     with pytest.raises(TaskError, match=r"the episode of seed 4 has not ended within 2,000 steps, and no time limit"):
         play_episodes(workers, [4])
 
@@ -124,7 +124,7 @@ def test_samples_follow_from_the_episode_and_the_step(spec, start):
     actions = []
     for n_envs in (1, 3):
         workers = start(spec("Walk"), n_envs, n_workers=n_envs)
-        workers.set_policy(*linear(workers.info, 0.01 * TOWARDS_ZERO, log_std=-3.0))
+        workers.set_policy(linear(workers.info, 0.01 * TOWARDS_ZERO, log_std=-3.0))
         episodes = play_episodes(workers, SEEDS, explore, record=True)
         actions.append([episode.trajectory.actions for episode in episodes])
     for one, three in zip(*actions, strict=True):
@@ -139,7 +139,7 @@ def test_leaving_while_episodes_are_played(spec, start):
         raise InterruptedError
 
     workers = start(spec("Walk"), 2)
-    workers.set_policy(*linear(workers.info, TOWARDS_ZERO))
+    workers.set_policy(linear(workers.info, TOWARDS_ZERO))
     with pytest.raises(InterruptedError):
         play_episodes(workers, SEEDS, watch=leave)
 
@@ -148,7 +148,7 @@ def test_the_actions_of_an_episode_that_fails_are_known(spec, start):
     """Also where the worker dies: actions are in shared memory before the step is taken."""
     for fault in ("raise", "segfault"):
         workers = start(spec("Walk", fault=fault), 2)
-        workers.set_policy(*linear(workers.info, TOWARDS_ZERO))
+        workers.set_policy(linear(workers.info, TOWARDS_ZERO))
         with pytest.raises(EpisodeFailed) as caught:
             play_episodes(workers, [7], record=True)
         assert (caught.value.seed, caught.value.step, caught.value.actions.shape) == (7, 3, (3, 2))
@@ -156,7 +156,7 @@ def test_the_actions_of_an_episode_that_fails_are_known(spec, start):
 
 def test_a_policy_that_overflows_is_named_with_its_episode(spec, start):
     workers = start(spec("Walk"), 2)
-    workers.set_policy(*linear(workers.info, 3e38 * np.ones((2, 2))))
+    workers.set_policy(linear(workers.info, 3e38 * np.ones((2, 2))))
     with pytest.raises(
         DivergedError, match=r"the policy's action is not finite: \[.*\]\nin environment 0, episode seed 3"
     ):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from rlctl.errors import EpisodeFailed
-from rlctl.policy.players.policy_player import Exploration, PolicyPlayer
+from rlctl.policy.players.player import Exploration
+from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.rollout.messages import Play
 from rlctl.rollout.seeds import Stream, episode_seed
 from tests.rollout.policies import linear
@@ -21,7 +22,7 @@ def seed(env: int, episode: int) -> int:
 
 def play(workers, segments, steps):
     """Return copies of the arrays of some segments, joined, and the episodes that ended."""
-    workers.set_policy(*linear(workers.info, WEIGHT, log_std=-1.0))
+    workers.set_policy(linear(workers.info, WEIGHT, log_std=-1.0))
     started, results, parts = [1] * workers.n_envs, [], []
     for number in range(segments):
         begin = {env: -1 if number else seed(env, 0) for env in range(workers.n_envs)}
@@ -52,7 +53,7 @@ def test_equal_however_environments_and_steps_are_spread(spec, start, n_workers)
 def test_workers_play_as_this_process_does(spec, start):
     workers = start(spec("Walk"), 2)
     played, ended = play(workers, 1, 30)
-    env, player = spec("Walk").make(), PolicyPlayer(*linear(workers.info, WEIGHT, log_std=-1.0))
+    env, player = spec("Walk").make(), PolicyPlayer(linear(workers.info, WEIGHT, log_std=-1.0))
     player.exploration = SAMPLES
     results = [(row, each) for row, each in ended if each.env == 1]
     episode, step, total = 0, 0, 0.0
@@ -88,7 +89,7 @@ def test_episodes_of_one_step(spec, start):
 
 def test_an_environment_stops_where_its_episode_ends_without_a_next_one(spec, start):
     workers = start(spec("Walk"), 2, n_workers=1)
-    workers.set_policy(*linear(workers.info, WEIGHT))
+    workers.set_policy(linear(workers.info, WEIGHT))
     workers.start_playing(Play(60, {0: 1, 1: 2}, {1: 5}, run_seed=3))
     ended = workers.finish_playing()
     assert [each.seed for each in ended if each.env == 0] == [1]
@@ -99,7 +100,7 @@ def test_an_environment_stops_where_its_episode_ends_without_a_next_one(spec, st
 
 def test_uniform_actions_of_a_warm_up(spec, start):
     workers = start(spec("Spaces", kind="discrete"), 2)
-    workers.set_policy(*linear(workers.info, np.zeros((2, 7))))
+    workers.set_policy(linear(workers.info, np.zeros((2, 7))))
     workers.start_playing(Play(40, {0: 1, 1: 2}, {0: 1, 1: 1}, run_seed=3, exploration=Exploration(warmup=True)))
     workers.finish_playing()
     assert set(workers.arrays.segment.action[:, :40].ravel().tolist()) == {0, 1}
@@ -107,7 +108,7 @@ def test_uniform_actions_of_a_warm_up(spec, start):
 
 def test_the_step_of_a_segment_that_fails_is_named(spec, start):
     workers = start(spec("Walk", fault="raise"), 3, n_workers=2)
-    workers.set_policy(*linear(workers.info, WEIGHT))
+    workers.set_policy(linear(workers.info, WEIGHT))
     workers.start_playing(Play(20, {0: 5, 1: 6, 2: 7}, {0: 1, 1: 1, 2: 1}, run_seed=3))
     with pytest.raises(EpisodeFailed) as caught:
         workers.finish_playing()

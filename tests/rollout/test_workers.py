@@ -45,7 +45,7 @@ def test_reach_does_not_depend_on_the_number_of_environments(start):
 
 def test_terms_of_a_task(spec, start):
     workers = start(spec("Counting"), 1)
-    workers.set_policy(*linear(workers.info, [[0.0]], bias=0.25))
+    workers.set_policy(linear(workers.info, [[0.0]], bias=0.25))
     workers.start_playing(Play(4, {0: 1}, {0: 1}, record=True))
     (result,) = workers.finish_playing()
     segment = workers.arrays.segment
@@ -61,7 +61,7 @@ def test_terms_of_a_task(spec, start):
 
 def test_a_term_of_weight_0_is_a_metric(spec, start):
     workers = start(dataclasses.replace(spec("Counting"), reward_weights={"fixed": 0.0}), 1)
-    workers.set_policy(*linear(workers.info, [[0.0]], bias=0.25))
+    workers.set_policy(linear(workers.info, [[0.0]], bias=0.25))
     workers.start_playing(Play(4, {0: 1}, {0: 1}))
     (result,) = workers.finish_playing()
     assert result.metrics == {"fixed": 2.0}  # as the task returns it, at every step

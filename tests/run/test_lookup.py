@@ -11,7 +11,7 @@ from rlctl.environments import registry
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.policy.file import PolicyInfo, Score, save_policy
+from rlctl.policy.file import PolicyFile, PolicyInfo, Score
 from rlctl.run import directory, lookup
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import find_policy, find_run
@@ -108,7 +108,7 @@ def give_policy(run, success=None, mean_return=0.0, steps=1000, parameters=None)
         training_steps=steps,
         evaluation=Score(success=success, mean_return=mean_return),
     )
-    save_policy(run.best_policy, info, {"policy/x": np.zeros(1)})
+    PolicyFile(info, {"policy/x": np.zeros(1)}).write(run.best_policy)
     os.utime(run.best_policy, (1e9, 1e9))
 
 

@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.file import PolicyInfo, save_policy
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.runs.diagnosis import Grade, diagnose, format_end
@@ -67,7 +67,9 @@ def write_training(tmp_path):
             )
         )
         run.status_file.write_text(json.dumps({"status": "finished", "task": "reach", **status}))
-        save_policy(run.last_policy, PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec("reach")), {})
+        PolicyFile(PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec("reach")), {}).write(
+            run.last_policy
+        )
         for number, episode in enumerate(episodes):
             save_episode(run.episode_file(number), episode)
         return run

@@ -9,7 +9,7 @@ from rich.console import Console
 from rlctl import load_policy
 from rlctl.errors import RecipeError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
-from rlctl.policy.file import read_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.rollout.workers import available_cores
 from rlctl.run.episode import load_episode
@@ -135,7 +135,7 @@ def test_live_display_shows_the_stage():
 def test_promotion_does_not_depend_on_time_or_on_the_number_of_workers(staged, train, small_ppo, use_cores):
     with use_cores(1 if available_cores() > 1 else None):
         again = train("Staged", {**small_ppo, "stages": BY_SUCCESS})
-    one, two = (read_policy(result.run.last_policy)[1] for result in (staged, again))
+    one, two = (PolicyFile.read(result.run.last_policy).tensors for result in (staged, again))
     assert all((one[key] == two[key]).all() for key in one)
     kept = ("steps", "stage", "return", "success", "loss")
     assert [[row[key] for key in kept] for row in rows(staged.run.metrics_file)] == [

@@ -8,7 +8,7 @@ import pytest
 
 from rlctl import load_policy
 from rlctl.errors import ArtifactError, DivergedError, TaskError, UsageError
-from rlctl.policy.file import read_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
@@ -198,7 +198,9 @@ def test_stop_success_takes_two_evaluations_in_a_row(train, small_ppo):
 
 
 def test_same_seed_gives_the_same_weights(train, small_ppo):
-    weights = [read_policy(train("Line", {**small_ppo, "seed": seed}).run.last_policy)[1] for seed in (3, 3, 4)]
+    weights = [
+        PolicyFile.read(train("Line", {**small_ppo, "seed": seed}).run.last_policy).tensors for seed in (3, 3, 4)
+    ]
     assert all((weights[0][key] == weights[1][key]).all() for key in weights[0])
     assert any((weights[0][key] != weights[2][key]).any() for key in weights[0])
 
@@ -256,7 +258,7 @@ def test_live_policy_and_saved_policy_act_the_same(finished):
         pytest.fail(f"the newest episode is of {episode.info.policy}")
     actions = np.stack([policy.predict(observation) for observation in episode.observations[:-1]])
     np.testing.assert_allclose(actions, episode.actions, atol=1e-6)
-    player = PolicyPlayer(*read_policy(finished.run.last_policy))
+    player = PolicyPlayer(PolicyFile.read(finished.run.last_policy))
     played = [player.act(observation, 0, 0)[1] for observation in episode.observations[:-1]]
     np.testing.assert_array_equal(played, episode.actions)
 

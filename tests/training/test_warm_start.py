@@ -5,7 +5,7 @@ import pytest
 
 from rlctl.environments.spec import merge
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.policy.file import read_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.policy.shipped import find_shipped_policy
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.request import run_training
@@ -30,11 +30,12 @@ def assert_same_but_for_first_observations(begun, before):
 
 def test_begins_where_a_policy_ended(source, train, capfd):
     run = train("Line", {**TINY, "seed": 5}, initial_policy=str(source.path)).run
-    info, before = read_policy(source.best_policy)
-    _, begun = read_policy(run.policy_file("0"))
+    policy = PolicyFile.read(source.best_policy)
+    info, before = policy.info, policy.tensors
+    begun = PolicyFile.read(run.policy_file("0")).tensors
     assert before.keys() == begun.keys()
     assert_same_but_for_first_observations(begun, before)
-    _, after = read_policy(run.last_policy)
+    after = PolicyFile.read(run.last_policy).tensors
     assert any((after[name] != values).any() for name, values in before.items())
     # 128 observations more, to those of the source: the statistics move, and not far.
     moved = np.abs(after["normalize//mean"] - before["normalize//mean"])
@@ -52,8 +53,8 @@ def test_a_shipped_actor_gets_a_fresh_critic(train, capfd):
     kwargs = {"algo_kwargs": {"n_steps": 16, "batch_size": 32, "n_epochs": 1}}
     result = train("reach", {**network, **kwargs}, initial_policy="reach")
     assert rows(result.run.evals_file)[0]["success"] == "1.0"  # at step 0
-    _, shipped = read_policy(find_shipped_policy("reach"))
-    _, begun = read_policy(result.run.policy_file("0"))
+    shipped = PolicyFile.read(find_shipped_policy("reach")).tensors
+    begun = PolicyFile.read(result.run.policy_file("0")).tensors
     assert_same_but_for_first_observations({name: begun[name] for name in shipped}, shipped)
     assert "it has no critic, so that a fresh one is learnt, and the first updates" in capfd.readouterr().err
 

@@ -8,7 +8,7 @@ from typing import Any
 from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.safety_filter import SafetyFilter
 from rlctl.environments.info import EnvInfo
-from rlctl.policy.players.policy_player import Exploration, Player
+from rlctl.policy.players.player import Exploration, Player
 
 
 class LimitedPlayer(Player):

@@ -16,7 +16,7 @@ from rlctl.deploy.server import messages
 from rlctl.deploy.server.serve import KEY_VARIABLE
 from rlctl.environments.info import space_from_json
 from rlctl.errors import PolicyError, UsageError, describe_exception, short_repr
-from rlctl.policy.players.policy_player import Player
+from rlctl.policy.players.player import Player
 
 _TIMEOUT_S = 10.0
 _LARGEST = 16 * 2**20  # [bytes] of an answer

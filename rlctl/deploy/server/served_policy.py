@@ -11,9 +11,10 @@ import numpy as np
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError
-from rlctl.policy.file import Policy, PolicyInfo, read_policy
-from rlctl.policy.network import DETERMINISTIC, Network, select_actor_tensors
-from rlctl.policy.players.policy_player import NumpyPolicy, check_playable
+from rlctl.policy.file import DETERMINISTIC, PolicyFile, PolicyInfo
+from rlctl.policy.network import Network
+from rlctl.policy.numpy_policy import NumpyPolicy, check_playable
+from rlctl.policy.policy import Policy
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,7 +58,5 @@ def load_served_policy(file: Path) -> ServedPolicy:
 
         policy = OnnxPolicy.load(file)
         return ServedPolicy(file, policy.info, lambda: OnnxPolicy(policy.info, policy.session))
-    info, tensors = read_policy(file)
-    check_playable(info, tensors, file)
-    tensors = select_actor_tensors(info, tensors)
-    return ServedPolicy(file, info, lambda: NumpyPolicy(info, tensors), Network(info, tensors))
+    actor = check_playable(PolicyFile.read(file)).actor_only()
+    return ServedPolicy(file, actor.info, lambda: NumpyPolicy(actor), Network(actor))

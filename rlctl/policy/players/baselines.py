@@ -21,24 +21,9 @@ from rlctl.errors import (
     format_plugin_traceback,
     short_repr,
 )
-from rlctl.policy.players.policy_player import ExportedPlayer, Player, make_generator
+from rlctl.policy.players.player import Player, make_generator
 
 BASELINES = ("zero", "random")
-SERVER = ("ws://", "wss://")
-"""How the address of a policy server begins."""
-
-
-def make_player(name: str, space: spaces.Space[Any], observation_space: spaces.Space[Any]) -> Player:
-    """Return what plays `zero`, `random`, an exported file, a server (`ws://`), or a function for `load_function`."""
-    if name.startswith(SERVER):
-        from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp
-
-        return RemotePlayer(name, observation_space, space)
-    if name == "zero":
-        return ZeroPlayer(space)
-    if name == "random":
-        return RandomPlayer(space)
-    return FunctionPlayer(name, space) if ":" in Path(name).name else ExportedPlayer(name)
 
 
 def load_function(text: str) -> Callable[..., Any]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RlctlError
-from rlctl.policy.file import read_policy
+from rlctl.policy.file import PolicyFile
 from rlctl.recipe import sources
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.run.directory import RunDirectory
@@ -148,7 +148,7 @@ class History:
         """What the policy was trained in."""
         for file in (self.run.last_policy, self.run.best_policy):
             try:
-                return read_policy(file)[0].env
+                return PolicyFile.read(file).info.env
             except (RlctlError, OSError):
                 continue
         return None

@@ -14,7 +14,7 @@ from rlctl.deploy.server.client import PolicyClient
 from rlctl.deploy.server.serve import ServerSettings, make_loop, make_server, serve_until
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
-from rlctl.policy.file import PolicyInfo, save_policy
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from tests.rollout.policies import linear
 
 OBSERVATION = {"positions": [0.1, 0.2], "goal": [1.0, 2.0, 3.0]}
@@ -33,7 +33,7 @@ def describe_env(control_dt=0.1, low=-10.0, high=10.0, sizes=None):
 def write_policy(file, factor=1.0, env=None, log_std=-1.0):
     """A policy whose action is the sum and the first of the goal, times a factor."""
     weight = factor * np.array([[0, 0, 1, 1, 1], [0, 0, 1, 0, 0]], np.float32)
-    save_policy(file, *linear(env or describe_env(), weight, log_std))
+    linear(env or describe_env(), weight, log_std).write(file)
     return file
 
 
@@ -47,7 +47,7 @@ def write_recurrent_policy(file, env=None):
     tensors = {f"policy/{name}": chance.normal(0, 1, shape).astype(np.float32) for name, shape in shapes.items()}
     env = env or describe_env()
     info = PolicyInfo(algo="recurrent_ppo", policy="MlpLstmPolicy", env=env, spec=EnvSpec("test"))
-    save_policy(file, info, tensors)
+    PolicyFile(info, tensors).write(file)
     return file
 
 

@@ -7,10 +7,10 @@ from gymnasium import spaces
 from rlctl.errors import PolicyError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.evaluation.report import as_json
-from rlctl.policy.players.baselines import load_function, make_player
+from rlctl.policy.players.baselines import load_function
+from rlctl.policy.players.named import make_player
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
-OBSERVATIONS = spaces.Box(-1.0, 1.0, (3,))
 FUNCTIONS = """
     import numpy as np
     def to_goal(observation): return [3.0, -0.5]
@@ -29,7 +29,7 @@ def functions(write_module):
 
 
 def act(name, space, observation=None):
-    return make_player(str(name), space, OBSERVATIONS).act(np.zeros(3) if observation is None else observation, 1, 0)[1]
+    return make_player(str(name), space).act(np.zeros(3) if observation is None else observation, 1, 0)[1]
 
 
 def test_zero():
@@ -40,7 +40,7 @@ def test_zero():
 
 
 def test_random_follows_from_the_seed_and_the_step():
-    player = make_player("random", spaces.Discrete(1000), OBSERVATIONS)
+    player = make_player("random", spaces.Discrete(1000))
     assert player.act(None, 1, 0) == player.act(None, 1, 0) != player.act(None, 1, 1)
 
 

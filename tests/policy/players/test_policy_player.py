@@ -1,5 +1,7 @@
 """Every network that can be trained acts in numpy as it does in torch."""
 
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,9 +12,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.policy.file import PolicyInfo
-from rlctl.policy.network import select_actor_tensors
-from rlctl.policy.players.policy_player import Exploration, PolicyPlayer, check_playable
+from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.policy.numpy_policy import check_playable
+from rlctl.policy.players.player import Exploration
+from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.policy.torch_policy import ALGORITHMS, TorchPolicy, describe_network, policy_name
 
 FLAT, BOX = spaces.Box(-np.inf, np.inf, (6,)), spaces.Box(-2, 3, (2,))
@@ -78,15 +81,16 @@ def policy():
             env=EnvInfo(observation_space=space_to_json(observation), action_space=space_to_json(action)),
             spec=EnvSpec("test"),
         )
-        return info, tensors, TorchPolicy(info, network, tensors)
+        policy = PolicyFile(info, tensors)
+        return policy, TorchPolicy(policy, network)
 
     return make
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_it_acts_as_torch_does(policy, case):
-    info, tensors, torch_policy = policy(case)
-    player = PolicyPlayer(info, select_actor_tensors(info, tensors))
+    file, torch_policy = policy(case)
+    player = PolicyPlayer(file.actor_only())
     space = torch_policy.observation_space
     space.seed(0)
     for step in range(8):
@@ -97,8 +101,8 @@ def test_it_acts_as_torch_does(policy, case):
 
 @pytest.mark.parametrize("case", [case for case in CASES if "dict" not in case and "image" not in case])
 def test_samples_stay_in_the_space(policy, case):
-    info, tensors, torch_policy = policy(case)
-    player = PolicyPlayer(info, tensors)
+    file, torch_policy = policy(case)
+    player = PolicyPlayer(file)
     observation = torch_policy.observation_space.sample()
     for exploration in (
         Exploration(stochastic=True, sde_every=2),
@@ -116,9 +120,9 @@ def test_samples_stay_in_the_space(policy, case):
 
 
 def test_a_gaussian_has_the_mean_and_deviation_of_its_numbers(policy):
-    info, tensors, _ = policy("ppo")
-    tensors["policy/log_std"][:] = np.log(0.25)
-    player = PolicyPlayer(info, tensors)
+    file, _ = policy("ppo")
+    file.tensors["policy/log_std"][:] = np.log(0.25)
+    player = PolicyPlayer(file)
     observation = np.zeros(6, np.float32)
     mean, _ = player.act(observation, 0, 0)
     player.exploration = Exploration(stochastic=True)
@@ -128,8 +132,8 @@ def test_a_gaussian_has_the_mean_and_deviation_of_its_numbers(policy):
     np.testing.assert_allclose(stored.std(axis=0), 0.25, atol=0.015)
 
 
-def test_tensors_that_do_not_fit(policy, tmp_path):
-    info, tensors, _ = policy("ppo")
-    tensors["policy/action_net.weight"] = np.zeros((2, 3), np.float32)
+def test_tensors_that_do_not_fit(policy):
+    file, _ = policy("ppo")
+    tensors = {**file.tensors, "policy/action_net.weight": np.zeros((2, 3), np.float32)}
     with pytest.raises(ArtifactError, match=r"x.safetensors: its tensors do not fit its description: "):
-        check_playable(info, tensors, tmp_path / "x.safetensors")
+        check_playable(PolicyFile(file.info, tensors, Path("x.safetensors")))

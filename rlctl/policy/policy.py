@@ -1,0 +1,77 @@
+"""A policy to run: an observation in, an action out, both as NumPy arrays."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.environments.dict_spaces import join, map_parts, split, split_space
+from rlctl.environments.spec import EnvSpec
+from rlctl.policy.file import PolicyInfo
+
+
+class Policy(abc.ABC):
+    """A policy that can be run, one observation after the other."""
+
+    def __init__(self, info: PolicyInfo) -> None:
+        self.info = info
+        self.observation_space, self.action_space = info.env.spaces()
+        self._parts = {
+            key: (space.shape or (), space.dtype) for key, space in split_space(self.observation_space).items()
+        }
+
+    @abc.abstractmethod
+    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
+        """Return the action for one observation, as the environment takes it.
+
+        A recurrent policy remembers; call `reset` when an episode begins. Raises `ValueError` for an observation of
+        another shape.
+        """
+
+    @abc.abstractmethod
+    def reset(self) -> None:
+        """Begin an episode: forget what is remembered."""
+
+    def read_observation(self, observation: Any) -> dict[str, NDArray[Any]]:
+        """Return the parts of an observation by key, in their dtypes; raises `ValueError` for another shape."""
+        given = split(observation)
+        parts = {}
+        for key, (shape, dtype) in self._parts.items():
+            value = np.asarray(given[key], dtype) if key in given else None
+            if value is not None and value.dtype.kind == "u" and (odd := value != given[key]).any():
+                raise ValueError(f"observation has {np.asarray(given[key])[odd][0]:g}, the policy expects {dtype}")
+            if value is None or value.shape != shape:
+                expected = join({key: shape for key, (shape, _) in self._parts.items()})
+                raise ValueError(
+                    f"observation of shape {map_parts(np.shape, observation)}, the policy expects {expected}"
+                    + _describe_additions(self.info.spec)
+                )
+            parts[key] = value
+        return parts
+
+    def try_once(self, *, deterministic: bool = True) -> None:
+        """Act once, on a made-up observation; raises `ValueError` for an action that the action space cannot have.
+
+        Whatever else is wrong with a file that somebody has written by hand raises here too.
+        """
+        spaces = split_space(self.observation_space).items()
+        zeros = {key: np.full(space.shape or (), getattr(space, "start", 0), space.dtype) for key, space in spaces}
+        action = self.predict(join(zeros), deterministic=deterministic)
+        self.reset()
+        if action.shape != (self.action_space.shape or ()):
+            raise ValueError(
+                f"its actions have shape {action.shape}, those of its action space {self.action_space.shape}"
+            )
+        if not np.isfinite(action).all():
+            raise ValueError("its actions are not finite")
+
+
+def _describe_additions(spec: EnvSpec) -> str:
+    """Say what a policy observes beyond what its task returns, and where that comes from."""
+    added = ["the part of the episode that is left"] if spec.time_feature else []
+    if spec.frame_stack > 1:
+        added.append(f"{spec.frame_stack} frames")
+    return f", with {' and '.join(added)}, as policy.info.spec.make() returns it" if added else ""
