@@ -26,12 +26,13 @@ class Batch:
     """What the value of the next observation counts: 0 where the episode ended."""
 
 
-def sample_batches(model: Any, count: int, size: int) -> list[Batch]:
-    """Return `count` minibatches of `size` transitions, the same that SB3 would draw one after the other."""
+def sample_batches(model: Any, network: Any, count: int, size: int) -> list[Batch]:
+    """Return `count` minibatches of `size` transitions, the same that SB3 would draw one after the other.
+
+    Features are what `network`, an actor or a Q-network of SB3, extracts from observations.
+    """
     parts = _gather(model, count, size)
-    extractor = getattr(model, "actor", model.policy)
-    extractor = extractor if hasattr(extractor, "extract_features") else model.policy.q_net
-    features, next_features = (_extract(extractor, parts[name]) for name in ("observations", "next_observations"))
+    features, next_features = (_extract(network, parts[name]) for name in ("observations", "next_observations"))
     batches = []
     for index in range(count):
         rows = slice(index * size, (index + 1) * size)

@@ -160,6 +160,15 @@ def share_joined(linears: Sequence[nn.Linear], joined: nn.Linear) -> None:
         first = rows.stop
 
 
+def clip_norm(gradients: Iterable[Floats], limit: float) -> None:
+    """Scale gradients, in place, to a Euclidean norm of all together of at most `limit`, as torch does."""
+    gradients = list(gradients)
+    norm = math.sqrt(sum(float(np.vdot(gradient, gradient)) for gradient in gradients))
+    if not norm <= limit:
+        for gradient in gradients:
+            gradient *= limit / (norm + 1e-6)
+
+
 def allocate_gradient(parameter: Tensor) -> Floats:
     """Give a parameter a gradient, and return it as an array."""
     gradient: Floats = _share_gradients([parameter])[0]

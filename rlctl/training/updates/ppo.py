@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import collections
 import functools
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,7 +19,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Sta
 from stable_baselines3.common.utils import explained_variance
 
 from rlctl.environments.dict_spaces import join, split
-from rlctl.training.updates.mlp import LOG_SQRT_TAU, Floats, MlpStack, allocate_gradient, is_mlp
+from rlctl.training.updates.mlp import LOG_SQRT_TAU, Floats, MlpStack, allocate_gradient, clip_norm, is_mlp
 from rlctl.training.updates.side_by_side import SideBySide
 
 _FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
@@ -175,11 +174,7 @@ class PpoUpdate:
         np.multiply(of_variance, np.exp(2 * self._policy.log_std.numpy()), out=self._log_std_gradient)
 
     def _step(self) -> None:
-        limit = self._model.max_grad_norm
-        norm = math.sqrt(sum(float(np.vdot(gradient, gradient)) for gradient in self._gradients))
-        if not norm <= limit:
-            for gradient in self._gradients:
-                gradient *= limit / (norm + 1e-6)
+        clip_norm(self._gradients, self._model.max_grad_norm)
         self._policy.optimizer.step()
 
     def _log(self, logged: dict[str, list[float]], clip_range: float, clip_range_vf: float | None) -> None:

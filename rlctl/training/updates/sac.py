@@ -58,7 +58,7 @@ class SacUpdate:
             optimizers.append(model.ent_coef_optimizer)
         model._update_learning_rate(optimizers)
         logged: dict[str, list[float]] = collections.defaultdict(list)
-        for step, batch in enumerate(sample_batches(model, gradient_steps, batch_size)):
+        for step, batch in enumerate(sample_batches(model, model.actor, gradient_steps, batch_size)):
             self._update(batch, logged, with_loss=step % _LOSS_EVERY == 0)
             if step % model.target_update_interval == 0:
                 torch._foreach_lerp_(self._following, self._followed, model.tau)

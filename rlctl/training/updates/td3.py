@@ -1,0 +1,101 @@
+"""TD3's and DDPG's updates with gradients computed without autograd: what SB3's `TD3.train` computes, but for rounding.
+
+S. Fujimoto et al., Addressing Function Approximation Error in Actor-Critic Methods, 2018,
+https://arxiv.org/abs/1802.09477.
+"""
+
+from __future__ import annotations
+
+import collections
+import functools
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import DDPG, TD3
+
+from rlctl.training.updates.batches import Batch, sample_batches
+from rlctl.training.updates.mlp import Floats, MlpStack, is_mlp
+from rlctl.training.updates.side_by_side import SideBySide
+
+
+class Td3Update:
+    """Updates a TD3 or DDPG model whose networks are multi-layer perceptrons on the CPU."""
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        # The last module of an actor is the tanh that squashes its actions.
+        self._actor, self._actor_target = (MlpStack([actor.mu[:-1]]) for actor in (model.actor, model.actor_target))
+        self._side_by_side = SideBySide(list(model.critic.q_networks), model.batch_size)
+        self._critics = self._side_by_side.make_stacks(model.critic.q_networks)
+        self._targets = self._side_by_side.make_stacks(model.critic_target.q_networks)
+        self._followed = [values for stack in (*self._critics, self._actor) for values in stack.parameters]
+        self._following = [values for stack in (*self._targets, self._actor_target) for values in stack.parameters]
+
+    @classmethod
+    def supports(cls, model: Any) -> bool:
+        """Return whether a model can be updated so; otherwise SB3 does it."""
+        if type(model) not in (TD3, DDPG):
+            return False
+        actor, critic = model.actor, model.critic
+        extractors = (actor.features_extractor, critic.features_extractor)
+        return (
+            isinstance(actor.mu[-1], torch.nn.Tanh)
+            and all(is_mlp(network) for network in (actor.mu[:-1], *critic.q_networks))
+            and not any(list(extractor.parameters()) for extractor in extractors)
+        )
+
+    @torch.no_grad()
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """Do a number of updates with batches of the replay buffer, and log what SB3 logs."""
+        model = self._model
+        model._update_learning_rate([model.actor.optimizer, model.critic.optimizer])
+        logged: dict[str, list[float]] = collections.defaultdict(list)
+        for batch in sample_batches(model, model.actor, gradient_steps, batch_size):
+            model._n_updates += 1
+            logged["critic_loss"].append(self._update_critics(batch, self._compute_target(batch)))
+            if model._n_updates % model.policy_delay == 0:
+                logged["actor_loss"].append(self._update_actor(batch.features))
+                torch._foreach_lerp_(self._following, self._followed, model.tau)
+        for name, values in logged.items():
+            model.logger.record(f"train/{name}", np.mean(values))
+        model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
+
+    def _compute_target(self, batch: Batch) -> Floats:
+        """Return what the critics are to expect, shape (batch, 1)."""
+        model = self._model
+        noise = np.empty(batch.actions.shape, np.float32)
+        torch.from_numpy(noise).normal_(0, model.target_policy_noise)  # torch's generator, as in SB3
+        noise = noise.clip(-model.target_noise_clip, model.target_noise_clip)
+        action = np.tanh(self._actor_target.run(batch.next_features[None], "target")[-1][0])
+        inputs = np.concatenate([batch.next_features, (action + noise).clip(-1, 1)], 1)[None]
+        passes = self._side_by_side.run([functools.partial(stack.run, inputs, "target") for stack in self._targets])
+        target: Floats = batch.rewards + batch.discounts * np.concatenate([values[-1] for values in passes]).min(0)
+        return target
+
+    def _update_critics(self, batch: Batch, target: Floats) -> float:
+        """Return the critics' loss before the update."""
+        inputs = np.concatenate([batch.features, batch.actions], 1)[None]
+
+        def learn(critics: MlpStack) -> float:
+            values = critics.run(inputs, "learning")
+            errors = values[-1] - target
+            critics.backpropagate(values, errors * np.float32(2 / len(target)))
+            return float(np.square(errors).mean((1, 2)).sum())
+
+        losses = self._side_by_side.run([functools.partial(learn, critics) for critics in self._critics])
+        self._model.critic.optimizer.step()
+        return sum(losses)
+
+    def _update_actor(self, features: Floats) -> float:
+        """Return the actor's loss."""
+        passed = self._actor.run(features[None], "learning")
+        action = np.tanh(passed[-1])
+        first = self._critics[0]  # its first network judges the actor
+        values = first.run(np.concatenate([features[None], action], 2), "actor")
+        to_value = np.zeros_like(values[-1])
+        to_value[0] = -1 / len(features)
+        to_action = first.input_gradient(values, to_value, features.shape[1])[:1]
+        self._actor.backpropagate(passed, to_action * (1 - np.square(action)))
+        self._model.actor.optimizer.step()
+        return -float(values[-1][0].mean())
