@@ -144,6 +144,8 @@ class Sac(_MaximumEntropy):
     """Share of the online network in each update of the target network."""
     target_update_interval: _Count = 1
     """Gradient steps between updates of the target network."""
+    policy_delay: _Count = 1
+    """Critic updates per update of the actor and the entropy coefficient; not of Stable-Baselines3."""
 
 
 class Tqc(Sac):

@@ -25,6 +25,8 @@ from rlctl.training.vec_env import WorkerVecEnv
 # numpy reserves a replay buffer without touching it: one of a terabyte is made at once, and fills up step by step.
 _FLOAT32 = 4  # [bytes]
 _USABLE_SHARE = 0.9  # of the memory that is free; the environments need some as well
+_DELAYED_BY_US = frozenset({"sac", "tqc"})
+"""Whose `policy_delay` Stable-Baselines3 does not have."""
 _CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
 
 
@@ -51,6 +53,8 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
             device=device,
             **kwargs,
         )
+        if recipe.algo in _DELAYED_BY_US:
+            model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
         _use_fused_adam(model)
         return model
     except (AssertionError, ValueError, TypeError, RuntimeError) as error:
@@ -117,8 +121,10 @@ def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: 
 
 
 def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:
-    given = recipe.algo_kwargs.items()
-    return {name: _make_schedule(value) for name, value in given if name != "action_noise"}  # which workers add
+    ours = {"action_noise"}  # which workers add
+    if recipe.algo in _DELAYED_BY_US:
+        ours.add("policy_delay")
+    return {name: _make_schedule(value) for name, value in recipe.algo_kwargs.items() if name not in ours}
 
 
 def _make_schedule(value: Any) -> Any:

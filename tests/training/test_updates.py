@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rlctl.environments.dict_spaces import split
+from rlctl.errors import RecipeError
 from rlctl.training.updates import choose_learner
 from rlctl.training.updates.dqn import DqnUpdate
 from rlctl.training.updates.ppo import PpoUpdate
@@ -204,3 +205,24 @@ def test_what_sb3_updates_itself():
     sac += [make_off_policy(use_sde=True, network={"use_expln": True})]
     assert [PpoUpdate.supports(model) for model in ppo] == [False] * 3
     assert [SacUpdate.supports(model) for model in sac] == [False] * 5
+
+
+def test_a_delayed_actor_learns_at_every_other_update():
+    model = make_off_policy()
+    model.policy_delay = 2
+    learner = choose_learner(model)
+    actors = []
+    for _ in range(4):
+        before = weights(model)
+        learner.train(gradient_steps=1, batch_size=16)
+        after = weights(model)
+        assert not torch.equal(before["critic.qf0.0.weight"], after["critic.qf0.0.weight"])
+        actors.append(not torch.equal(before["actor.mu.weight"], after["actor.mu.weight"]))
+    assert actors == [True, False, True, False]
+
+
+def test_sb3_cannot_delay_the_actor():
+    model = make_off_policy(network={"activation_fn": torch.nn.ELU})
+    model.policy_delay = 2
+    with pytest.raises(RecipeError, match="policy_delay: only for multi-layer perceptrons"):
+        choose_learner(model)

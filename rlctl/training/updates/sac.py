@@ -29,6 +29,7 @@ class SacUpdate:
 
     def __init__(self, model: Any) -> None:
         self._model = model
+        self._policy_delay = getattr(model, "policy_delay", 1)  # models of SB3 alone have none
         self._actor = SquashedActor(model.actor)
         self._side_by_side = SideBySide(list(model.critic.q_networks), model.batch_size)
         self._critics = self._side_by_side.make_stacks(model.critic.q_networks)
@@ -59,7 +60,8 @@ class SacUpdate:
         model._update_learning_rate(optimizers)
         logged: dict[str, list[float]] = collections.defaultdict(list)
         for step, batch in enumerate(sample_batches(model, model.actor, gradient_steps, batch_size)):
-            self._update(batch, logged, with_loss=step % _LOSS_EVERY == 0)
+            learns_actor = (model._n_updates + step) % self._policy_delay == 0
+            self._update(batch, logged, learns_actor=learns_actor, with_loss=step % _LOSS_EVERY == 0)
             if step % model.target_update_interval == 0:
                 torch._foreach_lerp_(self._following, self._followed, model.tau)
         model._n_updates += gradient_steps
@@ -67,30 +69,37 @@ class SacUpdate:
             model.logger.record(f"train/{name}", np.mean(values))
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
-    def _update(self, batch: Batch, logged: dict[str, list[float]], *, with_loss: bool) -> None:
+    def _update(self, batch: Batch, logged: dict[str, list[float]], *, learns_actor: bool, with_loss: bool) -> None:
         if self._model.use_sde:
             self._model.actor.reset_noise()
-        sample = self._actor.sample(batch.features, "learning")
-        coefficient = self._update_coefficient(sample, logged)
+        coefficient = self._read_coefficient()
+        sample = None
+        if learns_actor:
+            sample = self._actor.sample(batch.features, "learning")
+            self._update_coefficient(sample, logged)
+            logged["ent_coef"].append(coefficient)
         target = self._compute_target(batch, coefficient)
         outputs = self._update_critics(np.concatenate([batch.features, batch.actions], 1), target)
         if with_loss:
             logged["critic_loss"].append(self._compute_loss(outputs, target))
-        logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
+        if sample is not None:
+            logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
 
-    def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> float:
-        """Return the entropy coefficient, and learn it if it is to be learnt."""
+    def _read_coefficient(self) -> float:
+        """Return the weight of the entropy."""
+        model = self._model
+        tensor = model.ent_coef_tensor if model.ent_coef_optimizer is None else model.log_ent_coef.exp()
+        return float(tensor.item())
+
+    def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> None:
+        """Learn the weight of the entropy, if it is to be learnt."""
         model = self._model
         if model.ent_coef_optimizer is None:
-            coefficient: float = model.ent_coef_tensor.item()
-        else:
-            coefficient = model.log_ent_coef.exp().item()
-            missing = -(float(sample.log_prob.mean()) + float(model.target_entropy))
-            logged["ent_coef_loss"].append(model.log_ent_coef.item() * missing)
-            model.log_ent_coef.grad = torch.full_like(model.log_ent_coef, missing)
-            model.ent_coef_optimizer.step()
-        logged["ent_coef"].append(coefficient)
-        return coefficient
+            return
+        missing = -(float(sample.log_prob.mean()) + float(model.target_entropy))
+        logged["ent_coef_loss"].append(model.log_ent_coef.item() * missing)
+        model.log_ent_coef.grad = torch.full_like(model.log_ent_coef, missing)
+        model.ent_coef_optimizer.step()
 
     def _compute_target(self, batch: Batch, coefficient: float) -> Floats:
         """Return what the critics are to expect, shape (batch, estimates)."""
