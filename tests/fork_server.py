@@ -24,7 +24,6 @@ import tempfile
 import threading
 from pathlib import Path
 
-from rlctl.environments.spec import EnvSpec
 from rlctl.processes.child_process import set_start
 from tests.forked_process import SIGNALS, become
 
@@ -272,16 +271,6 @@ def _use_huge_pages():
             madvise(first, max(0, last // _HUGE * _HUGE - first), _MADV_COLLAPSE)  # without effect before Linux 6.1
 
 
-def _read_messages():
-    """Read a message of each kind: the first one takes as long as a worker's start otherwise."""
-    from rlctl.rollout import messages
-
-    asked = messages.Build(EnvSpec("reach")), messages.Attach(1), messages.LoadPolicy(), messages.BeginEpisodes({})
-    for each in (*asked, messages.Play(1, {}), messages.ComputeRewards(b"")):
-        messages.decode(messages.encode(each))
-    messages.decode(messages.encode(messages.Answer()))
-
-
 def main(descriptor, commands):
     """Import what the processes need, and serve."""
     for name in FOR_WORKERS + (FOR_COMMANDS if commands else ()):
@@ -291,7 +280,6 @@ def main(descriptor, commands):
 
         for module in pkgutil.iter_modules(rlctl.training.__path__, "rlctl.training."):
             importlib.import_module(module.name)
-    _read_messages()
     gc.collect()
     gc.freeze()
     _use_huge_pages()

@@ -7,7 +7,6 @@ import time
 import traceback
 from collections.abc import Collection, Iterator, Sequence
 from multiprocessing.connection import Connection
-from typing import Any
 
 from rlctl.checking import families
 from rlctl.checking.clock import read_clock
@@ -15,19 +14,20 @@ from rlctl.checking.experiments import Experiment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.instance import Budget, Context
-from rlctl.checking.messages import CallFailure, ChildMessage, End, Finished, Mistake, Skipped, encode
+from rlctl.checking.messages import CallFailure, ChildMessage, End, Finished, Mistake, Skipped
 from rlctl.checking.progress import CallProgress
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.processes.messages import send
 
 
 def main(
-    connection: Connection, process: str, spec: dict[str, Any], experiments: list[str], seconds: float, memory: int
+    connection: Connection, process: str, spec: EnvSpec, experiments: list[str], seconds: float, memory: int
 ) -> None:
     """Run some experiments of one process and send what they yield. `memory`: the descriptor of the progress."""
-    for message in run(process, EnvSpec(**spec), experiments, seconds, CallProgress(memory)):
-        connection.send_bytes(encode(message))
-    connection.send_bytes(encode(End()))
+    for message in run(process, spec, experiments, seconds, CallProgress(memory)):
+        send(connection, message)
+    send(connection, End())
 
 
 def run(

@@ -1,16 +1,10 @@
-"""What the experiments of a child process send: recorded episodes, failures, findings, and what could not be judged.
-
-Dataclasses are sent as JSON, arrays as bytes behind it; nothing is pickled.
-"""
+"""What the experiments of a child process send: recorded episodes, failures, findings, and what could not be judged."""
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import itertools
-import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -24,7 +18,6 @@ SECOND_SEED = 1001
 
 MOST_INFOS = 100
 """So many numbers of info are recorded per episode, by name."""
-_PACKAGE = __name__.rpartition(".")[0]
 ENDS = ("terminated", "truncated", "both")
 
 
@@ -182,7 +175,7 @@ class Fact:
 
     experiment: str
     value: Any
-    """What JSON can hold, or a dataclass of this package."""
+    """Plain data."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,64 +212,3 @@ class End:
 
 
 ChildMessage = Built | RecordedEpisode | CallFailure | RuleFinding | Fact | Skipped | Finished | Mistake | End
-
-
-def encode(message: Any) -> bytes:
-    """Return a dataclass of this package as bytes; it may hold others, arrays, and what JSON can hold."""
-    arrays: list[NDArray[Any]] = []
-    plain = _to_plain(message, arrays)
-    header = json.dumps([plain, [[array.dtype.str, array.shape] for array in arrays]]).encode()
-    return b"\n".join([header, b"".join(array.tobytes() for array in arrays)])
-
-
-def decode(content: bytes) -> Any:
-    """Return the dataclass that `encode` was given."""
-    start = content.index(b"\n") + 1  # JSON has none
-    plain, forms = json.loads(content[:start])
-    arrays = []
-    for kind, shape in forms:
-        array = np.frombuffer(content, kind, math.prod(shape), start).reshape(shape)
-        arrays.append(array.copy())  # its own memory, which can be written
-        start += array.nbytes
-    return _from_plain(plain, arrays)
-
-
-def _to_plain(value: Any, arrays: list[NDArray[Any]]) -> Any:
-    if isinstance(value, np.ndarray):
-        if value.dtype.hasobject:
-            raise TypeError(f"an array of {value.dtype} cannot be sent")
-        arrays.append(value)
-        return {"array": len(arrays) - 1}
-    if dataclasses.is_dataclass(value):
-        fields = {field.name: _to_plain(getattr(value, field.name), arrays) for field in dataclasses.fields(value)}
-        return {"class": f"{type(value).__module__}:{type(value).__name__}", "fields": fields}
-    if isinstance(value, dict):  # its keys may be numbers
-        return {"dict": [[key, _to_plain(item, arrays)] for key, item in value.items()]}
-    if isinstance(value, tuple):
-        return {"tuple": [_to_plain(item, arrays) for item in value]}
-    if isinstance(value, list):
-        return [_to_plain(item, arrays) for item in value]
-    return value.item() if isinstance(value, np.generic) else value
-
-
-def _from_plain(value: Any, arrays: Sequence[NDArray[Any]]) -> Any:
-    if isinstance(value, list):
-        return [_from_plain(item, arrays) for item in value]
-    if not isinstance(value, dict):
-        return value
-    if "array" in value:
-        return arrays[value["array"]]
-    if "dict" in value:
-        return {key: _from_plain(item, arrays) for key, item in value["dict"]}
-    if "tuple" in value:
-        return tuple(_from_plain(item, arrays) for item in value["tuple"])
-    return _class(value["class"])(**{name: _from_plain(item, arrays) for name, item in value["fields"].items()})
-
-
-def _class(name: str) -> type:
-    """Return a dataclass of this package: what a child process names is not trusted further than that."""
-    module, _, name = name.partition(":")
-    cls = getattr(importlib.import_module(module), name, None) if module.startswith(f"{_PACKAGE}.") else None
-    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
-        raise ValueError(f"{module}:{name} is not a dataclass of {_PACKAGE}")
-    return cls

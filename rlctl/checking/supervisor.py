@@ -5,7 +5,6 @@ What a process had left to do when it died or hung is done in another one, so th
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -13,10 +12,11 @@ from multiprocessing.connection import Connection, wait
 
 from rlctl.checking import families
 from rlctl.checking.clock import read_clock_of
-from rlctl.checking.messages import Built, CallFailure, ChildMessage, End, Finished, Mistake, decode
+from rlctl.checking.messages import Built, CallFailure, ChildMessage, End, Finished, Mistake
 from rlctl.checking.progress import CallProgress, Position
 from rlctl.environments.spec import EnvSpec
-from rlctl.processes.child_process import ChildProcess, LineReader, anonymous_file
+from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill, anonymous_file
+from rlctl.processes.printed_lines import LineReader
 
 AT_ONCE = 2
 BUILD_TIMEOUT_S = 60.0
@@ -46,16 +46,10 @@ class Child:
         self._memory = anonymous_file()
         self._progress = CallProgress(self._memory)
         self._readers = LineReader(self._count), LineReader(self._keep)
-        arguments = {
-            "process": name,
-            "spec": dataclasses.asdict(spec),
-            "experiments": self.experiments,
-            "seconds": seconds,
-            "memory": self._memory,
-        }
+        arguments = {"process": name, "spec": spec, "seconds": seconds, "memory": self._memory}
         self.process = ChildProcess(
             "rlctl.checking.child:main",
-            arguments,
+            {**arguments, "experiments": self.experiments},
             stdout=self._readers[0].descriptor,
             stderr=self._readers[1].descriptor,
             pass_fds=[self._memory],
@@ -63,7 +57,9 @@ class Child:
         )
         for reader in self._readers:
             reader.close_descriptor()
-        self._changed = (-1, self._clock)
+        self._standstill = Standstill(
+            lambda: self.position.counter, clock=lambda: read_clock_of(self.process.process.pid)
+        )
 
     def _count(self, line: str) -> None:
         if line and not line.startswith(_PYBULLETS):
@@ -82,31 +78,19 @@ class Child:
 
     def hangs(self, env_timeout_s: float) -> str | None:
         """Say so if the call that the child is in takes longer than it may."""
-        position = self.position
-        if position.counter != self._changed[0]:
-            self._changed = (position.counter, self._clock)
-        limit_s = _limit_s(position, env_timeout_s)
-        return f"did not come back in {limit_s:g} s" if self._clock - self._changed[1] > limit_s else None
-
-    @property
-    def _clock(self) -> float:
-        return read_clock_of(self.process.process.pid)
+        limit_s = _limit_s(self.position, env_timeout_s)  # first: if the call ends now, nothing stands still
+        return f"did not come back in {limit_s:g} s" if self._standstill.seconds() > limit_s else None
 
     def fail(self, kind: str, error: str) -> CallFailure:
-        """Return the failure that ends it."""
+        """Return the failure that ends it, with the last lines that it has printed."""
         at, details = self.position, "\n".join(self.last_lines)
         call = at.call or "between calls"
         return CallFailure(
             kind, call, at.phase, at.episode, at.seed, at.step, error, details or None, process=self.name
         )
 
-    def describe_end(self) -> str:
-        """Wait for its end, after its connection closed, and for the last it has printed; return how it ended."""
-        how = self.process.describe_end()
-        self._wait_for_lines()
-        return how
-
-    def _wait_for_lines(self) -> None:
+    def wait_for_lines(self) -> None:
+        """Wait until all that an ended process has printed was read."""
         for reader in self._readers:
             reader.wait()
 
@@ -115,7 +99,7 @@ class Child:
         if self._memory < 0:
             return
         self.process.close(grace_s)
-        self._wait_for_lines()
+        self.wait_for_lines()
         os.close(self._memory)
         self._memory = -1
 
@@ -174,9 +158,10 @@ class Supervisor:
 
     def _read(self, child: Child) -> None:
         try:
-            message = decode(child.process.connection.recv_bytes())
-        except (EOFError, OSError):
-            self._end(child, child.fail("died", child.describe_end()))
+            message = child.process.receive()
+        except ChildEndedError as end:
+            child.wait_for_lines()
+            self._end(child, child.fail("died", str(end)))
             return
         if isinstance(message, End):
             self._end(child, grace_s=1.0)

@@ -22,6 +22,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
+from rlctl.processes import messages
+
 # Started this way a child finds the modules that its parent finds, and the caller's script is not run again.
 # Ctrl-C and `kill` may reach a child too, but its parent decides: ignored before anything slow is imported, and held
 # back until then. A handler, not SIG_IGN, because that would be inherited by what an environment starts.
@@ -60,19 +62,13 @@ class ChildProcess:
     """
 
     def __init__(self, main: str, arguments: Mapping[str, Any], *, one_thread: bool = True, **options: Any) -> None:
-        """`main` is "package.module:function"; `arguments` are what JSON can hold; `options` are those of
+        """`main` is "package.module:function"; `arguments` are sent as a message; `options` are those of
         `subprocess.Popen`, of which `pass_fds` and `env` are added to what every child gets.
         """
         ours, theirs = socket.socketpair()
         # A pipe that nobody writes to: its end shows the child that this process is gone.
         lifeline, self._lifeline = os.pipe()
-        job = {
-            "main": main,
-            "arguments": dict(arguments),
-            "sys_path": sys.path,
-            "connection": theirs.fileno(),
-            "lifeline": lifeline,
-        }
+        job = {"main": main, "sys_path": sys.path, "connection": theirs.fileno(), "lifeline": lifeline}
         options["pass_fds"] = (theirs.fileno(), lifeline, *options.get("pass_fds", ()))
         options["env"] = {**os.environ, **(_ONE_THREAD if one_thread else {}), **options.get("env", {})}
         try:
@@ -88,6 +84,24 @@ class ChildProcess:
             os.close(self._lifeline)
             raise
         self.connection = Connection(ours.detach())
+        with contextlib.suppress(ChildEndedError):  # who waits for its first message will see it
+            self.send(dict(arguments))
+
+    def send(self, message: Any) -> None:
+        """Send a message; raises `ChildEndedError` if the child cannot receive it any more."""
+        try:
+            messages.send(self.connection, message)
+        except OSError:
+            raise ChildEndedError(self.describe_end()) from None
+
+    def receive(self) -> Any:
+        """Wait for a message; raises `ChildEndedError` if the child ends first, or writes what is no message."""
+        try:
+            return messages.receive(self.connection)
+        except messages.UnreadableMessageError as error:
+            raise ChildEndedError(f"wrote to its connection what is {error}") from None
+        except (EOFError, OSError):
+            raise ChildEndedError(self.describe_end()) from None
 
     def describe_end(self) -> str:
         """Wait for the end of a child whose connection has closed, and return how it ended."""
@@ -112,11 +126,31 @@ class ChildProcess:
         self._lifeline = -1
 
 
+class ChildEndedError(Exception):
+    """A child process can neither receive nor send messages any more; the text says how it ended."""
+
+
+class Standstill:
+    """Measures for how long a value that shows a child's progress has not changed."""
+
+    def __init__(self, read_progress: Callable[[], Any], clock: Callable[[], float] = time.monotonic) -> None:
+        self._read_progress, self._clock = read_progress, clock
+        self._progress, self._since = read_progress(), clock()
+
+    def seconds(self) -> float:
+        """Return how many seconds of the clock ago a change was last noticed."""
+        progress, now = self._read_progress(), self._clock()
+        if progress != self._progress:
+            self._progress, self._since = progress, now
+        return now - self._since
+
+
 def run_main(job: dict[str, Any]) -> None:
     """In the child: call what the parent asked for."""
     _end_with_parent(job["lifeline"])
     module, _, name = job["main"].partition(":")
-    getattr(importlib.import_module(module), name)(Connection(job["connection"]), **job["arguments"])
+    main, connection = getattr(importlib.import_module(module), name), Connection(job["connection"])
+    main(connection, **messages.receive(connection))
 
 
 @contextlib.contextmanager
@@ -158,103 +192,3 @@ def anonymous_file() -> int:
 
     with tempfile.TemporaryFile() as file:
         return os.dup(file.fileno())
-
-
-class LineReader:
-    """Hands each line that is written to `descriptor` to a function, in a thread of its own.
-
-    Close `descriptor` (`close_descriptor`) once the children that write to it have been started. A line of more than
-    `max_bytes` comes in parts.
-    """
-
-    def __init__(self, receive: Callable[[str], None], max_bytes: int = -1) -> None:
-        read_end, self.descriptor = os.pipe()
-        self._receive = receive
-        self._max_bytes = max_bytes
-        self._thread = threading.Thread(target=self._read, args=(read_end,), daemon=True)
-        self._thread.start()
-
-    def _read(self, read_end: int) -> None:
-        with os.fdopen(read_end, "rb") as pipe:
-            while line := pipe.readline(self._max_bytes):
-                self._receive(line.decode(errors="replace").rstrip("\r\n"))
-
-    def close_descriptor(self) -> None:
-        """Close this process's end of the pipe: the thread ends with the last child that holds it."""
-        os.close(self.descriptor)
-
-    def wait(self, timeout_s: float = 1.0) -> None:
-        """Wait until everything that was written has been read, if that is soon."""
-        self._thread.join(timeout=timeout_s)
-
-
-MAX_LINE_BYTES = 1000  # bytes
-MAX_LINES_PER_S = 100
-
-
-class LineFilter:
-    """Hands lines that environments print to `receive`, at a rate that can be read.
-
-    A process that prints blocks while nobody reads, so lines that come too fast are counted and dropped, and if
-    `receive` raises `OSError`, as a closed stderr does, all that follow.
-    """
-
-    def __init__(self, receive: Callable[[str], None]) -> None:
-        self._receive = receive
-        self._closed = False
-        self._last = ""
-        self._second = 0
-        self._lines = 0  # in this second
-        self._left_out = 0
-        self._bullet_head = ""
-        self._bullet_warnings: set[str] = set()
-
-    def line(self, text: str) -> None:
-        """Take a line."""
-        # Many environments print the same line; once is enough.
-        if text == self._last or text.startswith("pybullet build time"):
-            return
-        # PyBullet's warnings have two lines, the second of which says what is wrong.
-        if text.startswith(("b3Warning[", "b3Error[")):
-            self._bullet_head = text
-            return
-        if self._bullet_head:
-            text, self._bullet_head = f"{self._bullet_head} {text}", ""
-            if text in self._bullet_warnings:
-                return
-            self._bullet_warnings.add(text)
-        self._last = text
-        second = int(time.monotonic())
-        if second != self._second:
-            self.end()
-            self._second, self._lines = second, 0
-        self._lines += 1
-        if self._lines > MAX_LINES_PER_S:
-            self._left_out += 1
-        else:
-            self._report(replace_control_characters(text))
-
-    def end(self) -> None:
-        """Report how many lines were left out, if any."""
-        if self._left_out:
-            self._report(f"({self._left_out:,} more lines of what environments print are left out)")
-        self._left_out = 0
-
-    def _report(self, text: str) -> None:
-        try:
-            if not self._closed:
-                self._receive(text)
-        except OSError:
-            self._closed = True
-
-
-def replace_control_characters(text: str) -> str:
-    """Return a line without what would move a terminal's cursor, or worse."""
-    return "".join(each if each.isprintable() or each == "\t" else "\ufffd" for each in text)
-
-
-def write_stderr(text: str) -> None:
-    """Write a line beside what environments print."""
-    # Not by print: an environment may have closed or replaced what that writes to.
-    with contextlib.suppress(OSError):
-        os.write(2, f"{text}\n".encode(errors="replace"))

@@ -12,7 +12,7 @@ from rlctl.errors import (
     describe_exception,
     format_plugin_traceback,
 )
-from rlctl.rollout.messages import Failure
+from rlctl.processes.pool import WorkerException
 from rlctl.rollout.returned_values import InvalidReturn
 
 
@@ -28,18 +28,18 @@ class FailedInEpisode(Exception):
         return "{}in environment {}, episode seed {}, step {},".format(cause, *self.where)
 
 
-def describe_failure(error: BaseException) -> Failure:
+def describe_failure(error: BaseException) -> WorkerException:
     """Return what was raised, and where, as plain data."""
     where: tuple[int, int, int] | None = None
     if isinstance(error, FailedInEpisode):
         where, error = error.where, error.__cause__ or error
     if isinstance(error, RlctlError):
-        return Failure(str(error), type(error).__name__, error.details, where)
+        return WorkerException(str(error), type(error).__name__, error.details, where)
     text = f"ValueError: {error}" if isinstance(error, InvalidReturn) else describe_exception(error)
-    return Failure(text, "", format_plugin_traceback(error) or None, where)
+    return WorkerException(text, "", format_plugin_traceback(error) or None, where)
 
 
-def make_error(failure: Failure, task: str) -> RlctlError:
+def make_error(failure: WorkerException, task: str) -> RlctlError:
     """Return the error of a failure, which names the task, and the episode if it was raised in one."""
     message, details = failure.message, failure.details
     kind = getattr(errors, failure.kind) if failure.kind else TaskError

@@ -1,15 +1,12 @@
-"""What the main process asks of a worker, each request a named message, and what it answers; sent as JSON."""
+"""What the main process asks of a worker, each request a named message, and what it answers."""
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import functools
-import json
-from collections.abc import Mapping
-from typing import Any, get_args
+from typing import Any
 
-import pydantic
+import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
@@ -57,8 +54,8 @@ class Attach:
 class BeginEpisodes:
     """Begin episodes, and take the steps of some actions."""
 
-    episodes: dict[int, tuple[int, pydantic.Base64Bytes]]
-    """Per environment the seed, and the actions as the bytes of an array."""
+    episodes: dict[int, tuple[int, NDArray[Any]]]
+    """Per environment the seed, and the actions so far, shape (steps, ...)."""
     may_fail: bool = False
     """Whether an episode that fails is only reported, as one that ended."""
 
@@ -68,7 +65,7 @@ class LoadPolicy:
     """Act with a policy from now on: one whose numbers are in shared memory, or another one by its name."""
 
     info: PolicyInfo | None = None
-    layout: list[tuple[str, list[int], str]] = dataclasses.field(default_factory=list)
+    layout: list[tuple[str, tuple[int, ...], str]] = dataclasses.field(default_factory=list)
     """Name, shape and dtype of each array of numbers."""
     other: str = ""
     """An exported file, or a baseline; see `players.named.make_player`."""
@@ -104,8 +101,9 @@ class Play:
 class ComputeRewards:
     """Compute the rewards of goals."""
 
-    goals: pydantic.Base64Bytes
-    """Arrays `achieved` and `desired`, shape (n, *goal), as safetensors."""
+    achieved: NDArray[Any]
+    desired: NDArray[Any]
+    """Both of shape (n, *goal)."""
 
 
 Message = Build | SetEvents | Attach | BeginEpisodes | LoadPolicy | LimitActions | Play | ComputeRewards
@@ -135,19 +133,6 @@ class EpisodeResult:
 
 
 @dataclasses.dataclass(frozen=True)
-class Failure:
-    """An exception in a worker."""
-
-    message: str
-    kind: str = ""
-    """Name of its class, if it is one of `rlctl.errors`."""
-    details: str | None = None
-    """The traceback of somebody else's code."""
-    where: tuple[int, int, int] | None = None
-    """Environment, episode seed and step, where it was raised in an episode."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Answer:
     """What a worker answers to a message; each fills in what is asked."""
 
@@ -157,32 +142,5 @@ class Answer:
     """Environments that are not in the episode that they were to begin: it ended, or failed, on the way."""
     info: EnvInfo | None = None
     """What the environments are, where that has changed."""
-    rewards: list[float] = dataclasses.field(default_factory=list)
-    failure: Failure | None = None
-
-
-def encode(message: Message | Answer) -> bytes:
-    """Return a message as JSON."""
-    return json.dumps({"message": type(message).__name__, **vars(message)}, default=_to_plain).encode()
-
-
-def _to_plain(value: Any) -> Any:
-    if isinstance(value, pydantic.BaseModel):
-        return value.model_dump()  # not in its JSON mode, which has no infinite numbers
-    if isinstance(value, bytes):
-        return base64.b64encode(value).decode()
-    return dict(value) if isinstance(value, Mapping) else vars(value)
-
-
-_KINDS: dict[str, Any] = {each.__name__: each for each in (*get_args(Message), Answer)}
-
-
-def decode(content: bytes) -> Any:
-    """Return the message, or answer, of some JSON."""
-    fields = json.loads(content)
-    return _reader(_KINDS[fields.pop("message")]).validate_python(fields)
-
-
-@functools.cache
-def _reader(kind: Any) -> pydantic.TypeAdapter[Any]:
-    return pydantic.TypeAdapter(kind)
+    rewards: NDArray[np.float64] | None = None
+    """Those of `ComputeRewards`, shape (n,)."""

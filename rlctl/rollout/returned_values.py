@@ -109,12 +109,12 @@ def _category_bounds(space: spaces.Space[Any]) -> NDArray[Any] | None:
     return None
 
 
-def compute_rewards(env: Any, goals: Mapping[str, NDArray[Any]]) -> list[float]:
-    """Return the rewards that an environment computes for n achieved and n desired goals; else `TaskError`."""
-    count = len(goals["achieved"])
+def compute_rewards(env: Any, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the rewards, shape (n,), that an environment computes for goals of shape (n, *goal); else `TaskError`."""
+    count = len(achieved)
     infos: list[dict[str, Any]] = [{} for _ in range(count)]
     try:
-        rewards = np.asarray(env.unwrapped.compute_reward(goals["achieved"], goals["desired"], infos))
+        rewards = np.asarray(env.unwrapped.compute_reward(achieved, desired, infos))
     except BaseException as error:  # a plugin may raise anything, SystemExit too
         raise TaskError(
             f"compute_reward raised {describe_exception(error)}", details=format_plugin_traceback(error)
@@ -125,8 +125,5 @@ def compute_rewards(env: Any, goals: Mapping[str, NDArray[Any]]) -> list[float]:
         raise TaskError(f"compute_reward returned shape {rewards.shape} for {count} goals at once, not ({count},)")
     if not np.isfinite(rewards).all():
         bad = int(np.flatnonzero(~np.isfinite(rewards))[0])
-        raise TaskError(
-            f"compute_reward is {rewards[bad]} for achieved {goals['achieved'][bad]}, desired {goals['desired'][bad]}"
-        )
-    result: list[float] = rewards.astype(np.float64).tolist()
-    return result
+        raise TaskError(f"compute_reward is {rewards[bad]} for achieved {achieved[bad]}, desired {desired[bad]}")
+    return rewards.astype(np.float64)

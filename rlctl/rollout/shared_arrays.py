@@ -153,7 +153,7 @@ class PolicyNumbers:
         """The workers do not act with them any more."""
         self._arrays, self._structure = {}, ()
 
-    def write(self, policy: PolicyFile) -> list[tuple[str, list[int], str]]:
+    def write(self, policy: PolicyFile) -> list[tuple[str, tuple[int, ...], str]]:
         """Write a policy's numbers; return name, shape and dtype of each if workers have to load it, else nothing.
 
         They do not for other numbers of the same policy; the state stays as it is then.
@@ -162,7 +162,7 @@ class PolicyNumbers:
         if (hidden := numbers.get("policy/lstm_actor.weight_hh_l0")) is not None:
             layers = sum("weight_hh" in name for name in numbers)
             numbers["state"] = np.zeros((self._n_envs, 2, layers, hidden.shape[1]), np.float32)
-        layout = [(name, list(values.shape), str(values.dtype)) for name, values in numbers.items()]
+        layout = [(name, values.shape, str(values.dtype)) for name, values in numbers.items()]
         structure = (info.algo, info.policy_kwargs, info.clip_observation, layout)
         is_new = structure != self._structure
         if is_new:

@@ -16,7 +16,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import safetensors.numpy
 from gymnasium import spaces
 from numpy.typing import NDArray
 
@@ -28,7 +27,8 @@ from rlctl.policy.file import PolicyFile
 from rlctl.policy.players.named import SERVER, make_player
 from rlctl.policy.players.player import Player
 from rlctl.policy.players.policy_player import PolicyPlayer
-from rlctl.processes.child_process import write_stderr
+from rlctl.processes.pool import answer_messages
+from rlctl.processes.printed_lines import write_stderr
 from rlctl.rollout import messages
 from rlctl.rollout.failures import FailedInEpisode, describe_failure
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
@@ -60,7 +60,7 @@ class Worker:
             case messages.BeginEpisodes():
                 return Answer(left=self._begin_episodes(message))
             case messages.ComputeRewards():
-                return Answer(rewards=compute_rewards(self._episodes[0].env, safetensors.numpy.load(message.goals)))
+                return Answer(rewards=compute_rewards(self._episodes[0].env, message.achieved, message.desired))
             case messages.Build():
                 self._build(message.spec)
                 return Answer(info=self._info)
@@ -111,7 +111,7 @@ class Worker:
             env = self._episodes[0].env
             self._player = _make_player(message.other, env.action_space, env.observation_space)
         else:
-            layout = {name: (tuple(shape), np.dtype(dtype)) for name, shape, dtype in message.layout}
+            layout = {name: (shape, np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self._job.numbers, layout)
             self._states = tensors.pop("state", None)
             self._player = PolicyPlayer(PolicyFile(message.info, tensors))
@@ -130,14 +130,13 @@ class Worker:
 
     def _begin_episodes(self, message: messages.BeginEpisodes) -> list[int]:
         """Begin episodes and take the steps that led to where they were; return the environments that left them."""
-        row = self._arrays.segment.action[0, 0]
         left = []
-        for env, (seed, data) in message.episodes.items():
+        for env, (seed, actions) in message.episodes.items():
             episode = self._episodes[env - self._job.first]
             try:
                 with self._within(episode):
                     self._begin(episode, seed)
-                    if self._repeat(episode, np.frombuffer(data, row.dtype).reshape(-1, *row.shape)):
+                    if self._repeat(episode, actions):
                         left.append(env)
             except FailedInEpisode as failure:
                 if not message.may_fail:
@@ -270,24 +269,9 @@ def _make_player(name: str, space: spaces.Space[Any], observation_space: spaces.
     return make_player(name, space)
 
 
-def main(connection: Connection, job: dict[str, Any]) -> None:
+def main(connection: Connection, job: messages.Job) -> None:
     """Answer messages until the connection closes."""
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # lines are forwarded at once
-    try:
-        _serve(connection, Worker(messages.Job(**job)))
-    except OSError:  # the main process needs no more answers, or an environment has closed the connection
-        sys.exit(1)
-
-
-def _serve(connection: Connection, worker: Worker) -> None:
-    while True:
-        try:
-            message = messages.decode(connection.recv_bytes())
-        except (EOFError, ConnectionResetError):
-            break
-        try:
-            answer = worker.answer(message)
-        except BaseException as error:
-            answer = messages.Answer(failure=describe_failure(error))
-        connection.send_bytes(messages.encode(answer))
+    worker = Worker(job)
+    answer_messages(connection, worker.answer, describe_failure)
     worker.close()

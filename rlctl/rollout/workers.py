@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NoReturn
 
 import numpy as np
-import safetensors.numpy
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import Observations, join
@@ -21,11 +20,12 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.policy.file import PolicyFile
-from rlctl.processes.child_process import anonymous_file, write_stderr
+from rlctl.processes.child_process import anonymous_file
+from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault
+from rlctl.processes.printed_lines import write_stderr
 from rlctl.rollout import messages
 from rlctl.rollout.failures import format_hint, make_error
 from rlctl.rollout.messages import Answer, EpisodeResult, Message
-from rlctl.rollout.process_pool import ProcessPool, WorkerFault
 from rlctl.rollout.shared_arrays import PolicyNumbers, SharedArrays
 
 BUILD_TIMEOUT_S = 300.0
@@ -65,9 +65,12 @@ class Workers:
         self._numbers = PolicyNumbers(self._numbers_memory, n_envs)
         self._steps = 1
         self._ready = False
-        jobs = [messages.Job(self._memory, self._numbers_memory, low, high - low, n_envs) for low, high in self._ranges]
+        memories = self._memory, self._numbers_memory
+        jobs = [{"job": messages.Job(*memories, low, high - low, n_envs)} for low, high in self._ranges]
         try:
-            self._pool = ProcessPool(jobs, on_output or write_stderr, self._read_progress)
+            self._pool = ProcessPool(
+                "rlctl.rollout.worker:main", jobs, on_output or write_stderr, self._read_progress, memories
+            )
         except BaseException as error:
             self._close_memory()
             if isinstance(error, OSError):
@@ -157,7 +160,7 @@ class Workers:
         """
         dtype = self.arrays.segment.action.dtype
         for worker, envs in self._by_worker(episodes).items():
-            begun = {env: (episodes[env][0], episodes[env][1].astype(dtype).tobytes()) for env in envs}
+            begun = {env: (episodes[env][0], episodes[env][1].astype(dtype)) for env in envs}
             self._send(worker, messages.BeginEpisodes(begun, may_fail))
         return {env for answer in self._wait(doing).values() for env in answer.left}
 
@@ -210,10 +213,12 @@ class Workers:
         does not return n finite numbers.
         """
         self._wait_until_built()
-        # safetensors writes the memory as it lies, so that columns would be taken for rows.
-        goals = {"achieved": np.ascontiguousarray(achieved), "desired": np.ascontiguousarray(desired)}
-        self._send(0, messages.ComputeRewards(safetensors.numpy.save(goals)))
-        return np.array(self._wait("in compute_reward")[0].rewards, np.float64)
+        # In rows, so that an environment which adds them up rounds as it does in its own process.
+        goals = np.ascontiguousarray(achieved), np.ascontiguousarray(desired)
+        self._send(0, messages.ComputeRewards(*goals))
+        rewards = self._wait("in compute_reward")[0].rewards
+        assert rewards is not None  # it is what was asked for
+        return rewards
 
     def _by_worker(self, envs: Iterable[int]) -> dict[int, list[int]]:
         groups: dict[int, list[int]] = {}
@@ -238,8 +243,8 @@ class Workers:
         except WorkerFault as fault:
             self._fail(self._name_episode(fault))
         for answer in answers.values():
-            if answer.failure is not None:
-                self._fail(make_error(answer.failure, self.spec.task))
+            if isinstance(answer, WorkerException):
+                self._fail(make_error(answer, self.spec.task))
         return answers
 
     def _read_progress(self) -> bytes:

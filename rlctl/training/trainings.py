@@ -14,7 +14,8 @@ from types import FrameType
 from typing import TypeVar
 
 from rlctl.errors import Interrupted
-from rlctl.processes.child_process import ChildProcess, LineReader
+from rlctl.processes.child_process import ChildProcess
+from rlctl.processes.printed_lines import LineReader
 from rlctl.rollout.workers import available_cores
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.signals import HandledSignals

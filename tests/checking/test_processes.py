@@ -6,14 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from rlctl.checking import families
 from rlctl.checking.check import check, judge
 from rlctl.checking.experiments import Check
 from rlctl.checking.finding import choose_rules
-from rlctl.checking.messages import Fact, Series, decode, encode
 from rlctl.checking.records import Records
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
@@ -108,21 +106,6 @@ def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=250, check=True)
     assert run.stdout == "[]\n"
-
-
-def test_messages_arrive_as_they_were_sent():
-    values = {0: Series(np.arange(3), np.zeros((3, 2), np.float32)), 1: Series(np.zeros(0, np.int64), np.array(True))}
-    sent = Fact("numbers", {"tuple": (1, "two"), "series": values, "numpy": np.float64(0.5)})
-    received = decode(encode(sent))
-    assert received.value["tuple"] == (1, "two")
-    assert received.value["numpy"] == 0.5
-    for key, series in values.items():
-        for name in ("steps", "values"):
-            one, other = getattr(series, name), getattr(received.value["series"][key], name)
-            assert (one.dtype, one.shape) == (other.dtype, other.shape)
-            np.testing.assert_array_equal(one, other)
-    with pytest.raises(TypeError, match="object cannot be sent"):
-        encode(Fact("objects", np.array([None])))
 
 
 def test_a_rule_that_crashes_is_no_pass(monkeypatch):

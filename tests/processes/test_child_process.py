@@ -1,15 +1,17 @@
 """Child processes: what they are given, what they print, how they end, and that nothing is left of them."""
 
-import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import time
 
 import pytest
 
-from rlctl.processes.child_process import ChildProcess, LineReader
+from rlctl.processes import messages
+from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill
+from rlctl.processes.printed_lines import LineReader
 
 HERE = "tests.processes.test_child_process"
 
@@ -19,13 +21,15 @@ def answer(connection, **arguments):
     print("out")
     print("err", file=sys.stderr, flush=True)
     given = {**arguments, "threads": os.environ["OMP_NUM_THREADS"], "hash": os.environ.get("PYTHONHASHSEED", "")}
-    connection.send_bytes(json.dumps(given).encode())
+    messages.send(connection, given)
     if arguments.get("exits"):
         os._exit(arguments["exits"])
     if arguments.get("starts"):
         child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-        connection.send_bytes(str(child.pid).encode())
-    connection.recv_bytes()
+        messages.send(connection, child.pid)
+    if arguments.get("prints"):
+        os.write(connection.fileno(), struct.pack("!i", 5) + b"hello")
+    messages.receive(connection)
 
 
 @pytest.fixture
@@ -68,8 +72,8 @@ def wait_until_dead(pid):
 
 def test_a_child_gets_its_arguments_and_its_lines_are_read(started):
     child, reader, lines = started(number=3)
-    assert json.loads(child.connection.recv_bytes()) == {"number": 3, "threads": "1", "hash": "7"}
-    child.connection.send_bytes(b"go on")
+    assert child.receive() == {"number": 3, "threads": "1", "hash": "7"}
+    child.send("go on")
     assert child.describe_end() == "ended with exit code 0"
     reader.wait()
     assert sorted(lines) == ["err", "out"]
@@ -79,15 +83,15 @@ def test_how_a_child_ended_is_reported(started):
     child, *_ = started(exits=9)
     assert child.describe_end() == "ended with exit code 9"
     child, *_ = started()
-    child.connection.recv_bytes()
+    child.receive()
     os.kill(child.process.pid, signal.SIGABRT)
     assert child.describe_end() == "was killed by SIGABRT"
 
 
 def test_closing_kills_what_the_child_has_started(started):
     child, *_ = started(starts=True)
-    child.connection.recv_bytes()
-    grandchild = int(child.connection.recv_bytes())
+    child.receive()
+    grandchild = child.receive()
     child.close()
     child.close()
     assert child.process.poll() == -signal.SIGKILL
@@ -97,7 +101,7 @@ def test_closing_kills_what_the_child_has_started(started):
 def test_a_child_ends_with_its_parent():
     script = (
         f"from rlctl.processes.child_process import ChildProcess; import os, sys; "
-        f"child = ChildProcess('{HERE}:answer', {{}}, stdout=2, stderr=2); child.connection.recv_bytes(); "
+        f"child = ChildProcess('{HERE}:answer', {{}}, stdout=2, stderr=2); child.receive(); "
         f"print(child.process.pid, flush=True); os._exit(0)"
     )
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=250, check=True)
@@ -106,7 +110,29 @@ def test_a_child_ends_with_its_parent():
 
 def test_a_child_does_not_end_by_ctrl_c(started):
     child, *_ = started()
-    child.connection.recv_bytes()
+    child.receive()
     os.kill(child.process.pid, signal.SIGINT)
-    child.connection.send_bytes(b"go on")
+    child.send("go on")
     assert child.describe_end() == "ended with exit code 0"
+
+
+def test_what_an_environment_writes_to_the_connection_is_no_message(started):
+    child, *_ = started(prints=True)
+    child.receive()
+    with pytest.raises(ChildEndedError, match="wrote to its connection what is not a message of rlctl"):
+        child.receive()
+
+
+def test_a_child_that_ended_neither_receives_nor_answers(started):
+    child, *_ = started(exits=9)
+    child.receive()
+    with pytest.raises(ChildEndedError, match="ended with exit code 9"):
+        child.receive()
+    with pytest.raises(ChildEndedError, match="ended with exit code 9"):
+        child.send("go on")
+
+
+def test_a_standstill_ends_with_every_change():
+    progress, clock = iter([0, 0, 1, 1]), iter([10.0, 12.5, 13.0, 20.0])
+    standstill = Standstill(lambda: next(progress), lambda: next(clock))
+    assert [standstill.seconds() for _ in range(3)] == [2.5, 0.0, 7.0]

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import json
-import queue
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 
-from rlctl import errors
 from rlctl.deploy.identify.follow import Follower, open_world
 from rlctl.deploy.identify.log import Array, Log
-from rlctl.deploy.identify.parameters import Parameter, Unknowns
+from rlctl.deploy.identify.parameters import Unknowns
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import RlctlError, TaskError
-from rlctl.processes.child_process import ChildProcess
+from rlctl.errors import TaskError
+from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault, answer_messages
+from rlctl.processes.printed_lines import write_stderr
+from rlctl.rollout.failures import describe_failure, make_error
 
 _TRIALS = 12  # per unknown, and as many again
 _STARTS = 3
@@ -45,54 +42,68 @@ class Fit:
     rows_per_window: float
 
 
-def encode(message: Any) -> bytes:
-    """Return a message between the search and its workers: JSON, in which arrays are lists."""
-    return json.dumps(message, default=np.ndarray.tolist).encode()
+@dataclasses.dataclass(frozen=True)
+class Follow:
+    """What a worker is asked first: to get ready to follow a log."""
+
+    spec: EnvSpec
+    log: Log
+    unknowns: Unknowns
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """A point of the search: positions of the values in their ranges, and a delay [steps]."""
+
+    at: list[float]
+    delay: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ComputeCosts:
+    """What a worker is asked: the cost of each trial."""
+
+    trials: list[Trial]
+    weights: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class FindFit:
+    """What a worker is asked: the best fit near a trial."""
+
+    start: Trial
+    weights: Array
+    evaluations: int
 
 
 class SearchWorkers:
     """Processes that follow a log. Answers come in the order of the questions; errors of the task are raised here."""
 
     def __init__(self, spec: EnvSpec, log: Log, unknowns: Unknowns, count: int) -> None:
-        first = encode({"log": dataclasses.asdict(log), "unknowns": dataclasses.asdict(unknowns)})
         self.count = count
-        self._children = contextlib.ExitStack()
-        self._free: queue.SimpleQueue[Connection] = queue.SimpleQueue()
-        self._threads = ThreadPoolExecutor(count)
+        self._task = spec.task
+        self._pool = ProcessPool("rlctl.deploy.identify.search:main", [{}] * count, write_stderr)
         try:
-            for _ in range(count):
-                spec_of_child = {"spec": dataclasses.asdict(spec)}
-                child = ChildProcess("rlctl.deploy.identify.search:main", spec_of_child, stdout=2, stderr=2)
-                self._children.callback(child.close)
-                child.connection.send_bytes(first)
-                self._free.put(child.connection)
+            self.ask([Follow(spec, log, unknowns)] * count)
         except BaseException:
-            self._children.close()
+            self._pool.close(grace_s=0.0)
             raise
 
-    def ask(self, questions: Sequence[dict[str, Any]]) -> list[Any]:
+    def ask(self, questions: Sequence[Follow | ComputeCosts | FindFit]) -> list[Any]:
         """Return the answers to questions, each given to the next worker that is free."""
-        return list(self._threads.map(self._ask_one, questions))
-
-    def _ask_one(self, question: dict[str, Any]) -> Any:
-        connection = self._free.get()
         try:
-            connection.send_bytes(encode(question))
-            answer = json.loads(connection.recv_bytes())
-        except (EOFError, OSError):
-            raise TaskError("a worker process ended while it followed the log; see what it printed") from None
-        finally:
-            self._free.put(connection)
-        if isinstance(answer, dict) and "error" in answer:
-            raise getattr(errors, answer["error"], TaskError)(answer["message"])
-        return answer
+            answers = self._pool.ask_each(questions, "following the log")
+        except WorkerFault as fault:
+            raise TaskError(f"task {self._task!r}: {fault}; see what it printed") from None
+        if isinstance(answers[-1], WorkerException):
+            raise make_error(answers[-1], self._task)
+        return answers
 
     def __enter__(self) -> SearchWorkers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._threads.shutdown(wait=False, cancel_futures=True)
-        self._children.close()
+        self._pool.close(grace_s=0.0)
 
 
 def search(
@@ -105,111 +116,89 @@ def search(
     """
     fits: dict[int, Fit] = {}
 
-    def follow_up(questions: list[dict[str, Any]]) -> None:
-        for answer in workers.ask(questions):
-            arrays = {key: np.array(answer[key], np.float64) for key in ("at", "information", "errors")}
-            fit = Fit(**{**answer, **arrays})
+    def follow_up(questions: list[FindFit]) -> None:
+        for fit in workers.ask(questions):
             if fit.delay not in fits or fit.cost < fits[fit.delay].cost:
                 fits[fit.delay] = fit
 
     trials = _make_trials(unknowns, seed)
     report(f"{len(trials)} trials")
     parts = [trials[index :: workers.count * 4] for index in range(workers.count * 4)]
-    costs = workers.ask([{"trials": part, "weights": weights} for part in parts if part])
-    ranked = sorted(
-        (
-            (cost, trial)
-            for part, found in zip(parts, costs, strict=False)
-            for cost, trial in zip(_take_costs(found), part, strict=True)
-        ),
-        key=lambda pair: pair[0],
-    )
-    starts = _choose_starts(trials[0], [trial for _, trial in ranked])
+    costs = workers.ask([ComputeCosts(part, weights) for part in parts if part])
+    by_cost = [pair for part, values in zip(parts, costs, strict=False) for pair in zip(values, part, strict=True)]
+    ranked = [trial for _, trial in sorted(by_cost, key=lambda pair: pair[0])]
+    starts = _choose_starts(trials[0], ranked)
     report(f"least squares from {len(starts)} starts")
-    follow_up([_ask_fit(trial["at"], trial["delay"], weights, _EVALUATIONS) for trial in starts])
+    follow_up([FindFit(start, weights, _EVALUATIONS) for start in starts])
     best = _best(fits)
     while beside := [d for d in (best.delay - 1, best.delay + 1) if 0 <= d <= _LONGEST_DELAY and d not in fits]:
-        follow_up([_ask_fit(best.at, delay, weights, _EVALUATIONS) for delay in beside])
+        follow_up([FindFit(Trial(best.at.tolist(), delay), weights, _EVALUATIONS) for delay in beside])
         if _best(fits).delay == best.delay:
             break
         best = _best(fits)
     best = _best(fits)
     report("intervals")
-    final = 1.0 / np.maximum(best.errors, 1e-4 / weights)
+    weights = 1.0 / np.maximum(best.errors, 1e-4 / weights)
     near = [d for d in (best.delay - 1, best.delay, best.delay + 1) if d in fits]
     fits = {}
-    follow_up(
-        [_ask_fit(best.at, delay, final, _LAST_EVALUATIONS if delay == best.delay else _EVALUATIONS) for delay in near]
-    )
+    evaluations = {delay: _LAST_EVALUATIONS if delay == best.delay else _EVALUATIONS for delay in near}
+    follow_up([FindFit(Trial(best.at.tolist(), delay), weights, evaluations[delay]) for delay in near])
     return fits
-
-
-def _take_costs(found: Any) -> list[float]:
-    # A simulation that diverged costs more than any other.
-    return [cost if np.isfinite(cost) else np.inf for cost in found]
 
 
 def _best(fits: dict[int, Fit]) -> Fit:
     return min(fits.values(), key=lambda fit: fit.cost)
 
 
-def _ask_fit(at: Array | list[float], delay: int, weights: Array, evaluations: int) -> dict[str, Any]:
-    return {"at": at, "delay": delay, "weights": weights, "evaluations": evaluations}
-
-
-def _make_trials(unknowns: Unknowns, seed: int) -> list[dict[str, Any]]:
+def _make_trials(unknowns: Unknowns, seed: int) -> list[Trial]:
     """Return the built world with every delay, then points all over the ranges, with every delay in turn."""
     from scipy.stats import qmc
 
     size = len(unknowns.parameters)
     delays = range(unknowns.longest_delay + 1)
-    built = [{"at": [each.first for each in unknowns.parameters], "delay": delay} for delay in delays]
+    built = [Trial([parameter.first for parameter in unknowns.parameters], delay) for delay in delays]
     if size == 0:
         return built
     count = max(len(delays), _TRIALS * (size + 1))
     points = qmc.Halton(size, seed=seed).random(count).tolist()
-    return built + [{"at": point, "delay": delays[index % len(delays)]} for index, point in enumerate(points)]
+    return built + [Trial(point, delays[index % len(delays)]) for index, point in enumerate(points)]
 
 
-def _choose_starts(built: dict[str, Any], ranked: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _choose_starts(built: Trial, ranked: list[Trial]) -> list[Trial]:
     """Return the best trial of each of the best delays, then the next best ones, and the built world."""
-    firsts = list({trial["delay"]: trial for trial in reversed(ranked)}.values())
+    firsts = list({trial.delay: trial for trial in reversed(ranked)}.values())
     firsts = [trial for trial in ranked if trial in firsts][:_STARTS]
     others = [trial for trial in ranked if trial not in firsts]
     starts = [*firsts, *others[: max(0, _STARTS - len(firsts))]]
     return starts if built in starts else [*starts, built]
 
 
-def main(connection: Connection, spec: dict[str, Any]) -> None:
-    """Build the world, then answer messages until the connection closes."""
-    try:
-        first = json.loads(connection.recv_bytes())
-        parameters = tuple(Parameter(**each) for each in first["unknowns"].pop("parameters"))
-        log = Log(tuple(first["log"].pop("joints")), **{key: np.array(each) for key, each in first["log"].items()})
-        follower = Follower(open_world(EnvSpec(**spec)), log, Unknowns(parameters, **first["unknowns"]))
-        while True:
-            message = json.loads(connection.recv_bytes())
-            connection.send_bytes(encode(_answer(follower, message)))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        return
+def main(connection: Connection) -> None:
+    """Answer questions until the connection closes; the first one is `Follow`."""
+    follower: Follower
+
+    def answer(question: Follow | ComputeCosts | FindFit) -> list[float] | Fit | None:
+        nonlocal follower
+        match question:
+            case Follow():
+                follower = Follower(open_world(question.spec), question.log, question.unknowns)
+                return None
+            case ComputeCosts():
+                return [_compute_cost(follower, trial, question.weights) for trial in question.trials]
+            case FindFit():
+                return _find_fit(follower, question)
+
+    answer_messages(connection, answer, describe_failure)
 
 
-def _answer(follower: Follower, message: dict[str, Any]) -> Any:
-    try:
-        weights = np.array(message["weights"])
-        if "trials" in message:
-            return [_compute_cost(follower, np.array(each["at"]), each["delay"], weights) for each in message["trials"]]
-        return _fit(follower, np.array(message["at"]), message["delay"], weights, message["evaluations"])
-    except RlctlError as error:
-        return {"error": type(error).__name__, "message": str(error)}
+def _compute_cost(follower: Follower, trial: Trial, weights: Array) -> float:
+    cost = float(np.square(follower.compare(np.array(trial.at), trial.delay) * weights).mean())
+    return cost if np.isfinite(cost) else np.inf  # a simulation that diverged costs more than any other
 
 
-def _compute_cost(follower: Follower, at: Array, delay: int, weights: Array) -> float:
-    return float(np.square(follower.compare(at, delay) * weights).mean())
-
-
-def _fit(follower: Follower, at: Array, delay: int, weights: Array, evaluations: int) -> dict[str, Any]:
-    """Return the best positions near `at`, with what intervals are made from."""
+def _find_fit(follower: Follower, question: FindFit) -> Fit:
+    """Return the best positions near a trial, with what intervals are made from."""
+    weights, delay, at = question.weights, question.start.delay, np.array(question.start.at)
 
     def residuals(positions: Array) -> Array:
         return (follower.compare(np.asarray(positions), delay) * weights).ravel()
@@ -228,24 +217,24 @@ def _fit(follower: Follower, at: Array, delay: int, weights: Array, evaluations:
     if len(at):
         from scipy.optimize import least_squares
 
-        found = least_squares(
+        solution = least_squares(
             residuals,
             np.clip(at, 1e-6, 1 - 1e-6),
             jacobian,
             bounds=(0.0, 1.0),
-            max_nfev=evaluations,
+            max_nfev=question.evaluations,
             xtol=_TOLERANCE,
             ftol=_TOLERANCE,
         )
-        at, errors, derivatives = found.x, found.fun, np.asarray(found.jac)
+        at, errors, derivatives = solution.x, solution.fun, np.asarray(solution.jac)
     else:  # only the delay is looked for
         errors, derivatives = residuals(at), np.zeros((0, 0))
     by_row = errors.reshape(-1, len(weights))
-    return {
-        "at": at,
-        "delay": delay,
-        "cost": float(np.square(errors).mean()),
-        "information": derivatives.T @ derivatives,
-        "errors": np.sqrt(np.square(by_row / weights).mean(axis=0)),
-        "rows_per_window": len(by_row) / len(follower.starts),
-    }
+    return Fit(
+        at=at,
+        delay=delay,
+        cost=float(np.square(errors).mean()),
+        information=derivatives.T @ derivatives,
+        errors=np.sqrt(np.square(by_row / weights).mean(axis=0)),
+        rows_per_window=len(by_row) / len(follower.starts),
+    )

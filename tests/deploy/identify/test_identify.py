@@ -12,7 +12,7 @@ from rlctl.deploy.identify.identify import _judge, identify
 from rlctl.deploy.identify.log import Expected, Log, read_log, write_log
 from rlctl.deploy.identify.parameters import Parameter, Unknowns
 from rlctl.deploy.identify.report import show, write_fragment
-from rlctl.deploy.identify.search import Fit, _choose_starts, _make_trials
+from rlctl.deploy.identify.search import Fit, Trial, _choose_starts, _make_trials
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
@@ -242,5 +242,5 @@ def test_the_built_world_is_tried_first():
     mass = Parameter("mass", "factor", 0.5, 2.0, 1.0)
     unknown = Parameter("friction", "friction", 0.1, 2.0)
     trials = _make_trials(Unknowns((mass, unknown), "late", 1), 0)
-    assert trials[:2] == [{"at": [pytest.approx(0.5), 0.5], "delay": delay} for delay in (0, 1)]
+    assert trials[:2] == [Trial([pytest.approx(0.5), 0.5], delay) for delay in (0, 1)]
     assert _choose_starts(trials[0], trials[1:])[-1] == trials[0]
