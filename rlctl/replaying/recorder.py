@@ -197,7 +197,13 @@ def frame_time(env: Env) -> float | None:
 
 
 def recorded_actions(episode: RecordedEpisode, env: Env, path: Path | None = None) -> Choose:
-    """Return what chooses the actions of a recorded episode; raises `ArtifactError` if they are for another space."""
+    """Return what chooses the actions of a recorded episode; raises `ArtifactError` if it cannot be reproduced."""
+    acting = [name for name, acts in describe(env).events.items() if acts]
+    if episode.info.format < 2 and acting:
+        raise ArtifactError(
+            f"{path or episode.info.spec.task}: recorded before events had random numbers of their own, and "
+            f"{', '.join(acting)} acted in it: it cannot be reproduced; record it again with rlctl replay RUN"
+        )
     check_actions(episode, env.action_space.shape or (), path)
     return lambda _, step: episode.actions[step] if step < len(episode.actions) else None
 

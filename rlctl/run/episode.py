@@ -16,7 +16,8 @@ from rlctl.environments.named_spec import EpisodeSpec
 from rlctl.errors import ArtifactError
 from rlctl.storage import files, untrusted
 
-FORMAT = 1
+FORMAT = 2
+"""2: events draw from random streams of their own; episodes of 1 can be reproduced where no event acts."""
 
 
 class EpisodeInfo(pydantic.BaseModel, extra="forbid"):

@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean, short_repr
 from rlctl.task.events import Event, EventSettings
-from rlctl.task.events.acting import ActingEvents, Signals
+from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
 from rlctl.task.joints import Joints
 from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.sim import Sim
@@ -65,6 +65,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         )
         self._step = 0
         self._running = False
+        self._streams: Streams = {}
         self._markers: dict[str, int] = {}
         try:
             self._build()
@@ -103,6 +104,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.events = events.apply({**self.task.events, **(added or {})})
         self._acting = ActingEvents(self.events, self.task.control_dt)
         self._signals = Signals(self.events, self._first, self.action_space, self.task.observation_bounds)
+        self._streams = {}
         self._running = False
 
     def _build(self) -> None:
@@ -129,10 +131,13 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             if self._markers:
                 self._add_markers(list(self._markers))
         self._episode_level = self.level
-        drawn = self._acting.run("reset", self.sim, self.np_random, self.level)
+        if self.events and (seed is not None or not self._streams):
+            base = int(self.np_random.integers(2**63)) if seed is None else seed
+            self._streams = seed_streams(self.events, base)
+        drawn = self._acting.run("reset", self.sim, self._streams, self.level)
         self.task.reset(self.np_random)
-        drawn |= self._acting.run("start", self.sim, self.np_random, self.level)
-        self._signals.begin(self.np_random, self.level)
+        drawn |= self._acting.run("start", self.sim, self._streams, self.level)
+        self._signals.begin(self._streams, self.level)
         self._step = 0
         self._running = True
         observation = self._observe()
@@ -171,7 +176,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise TaskError(f"{self.name}: reward term {bad!r} is {raw[bad]} at step {self._step}")
         info: dict[str, Any] = {"reward_terms": terms, "metrics": {name: raw[name] for name in weights}}
         if self._acting.has_intervals:
-            drawn = self._acting.run_due(self._step, self.sim, self.np_random, self._episode_level)
+            drawn = self._acting.run_due(self._step, self.sim, self._streams, self._episode_level)
             info.update({"events": drawn} if drawn else {})
         if self.has_success:
             info["is_success"] = self._read_flag("is_success")

@@ -102,6 +102,32 @@ def test_equal_seeds_draw_equally_whatever_came_before(make):
     np.testing.assert_array_equal(episode(5), first)
 
 
+def test_an_episode_starts_the_same_with_and_without_events(make):
+    nominal, randomized = make(Cart()), make(Cart(), randomize=True)
+    for seed in range(5):
+        observations = [env.reset(seed=seed)[0].tolist() for env in (nominal, randomized)]
+        assert observations[0] == observations[1]
+
+
+def test_a_change_to_one_event_leaves_the_draws_of_the_others(make):
+    drawn = []
+    for changes in ({}, {"mass": {"factor": (0.9, 1.1)}}):
+        env = make(Cart(), randomize=True, **changes)
+        mass = env.reset(seed=7)[1]["events"]["mass"]
+        frictions = [env.step([0.0])[4].get("events") for _ in range(60)]
+        drawn.append((mass, frictions))
+    assert drawn[0][0] != drawn[1][0]
+    assert drawn[0][1] == drawn[1][1] != [None] * 60
+
+
+def test_a_reset_without_a_seed_goes_on_with_the_streams(make):
+    one, other = make(Cart(), randomize=True), make(Cart(), randomize=True)
+    for env in (one, other):
+        env.reset(seed=1)
+    again = [env.reset()[1]["events"]["mass"] for env in (one, other)]
+    assert again[0] == again[1] != one.reset(seed=1)[1]["events"]["mass"]
+
+
 def test_a_recipe_changes_parameters(make):
     env = make(Cart(), mass={"factor": [1.25, 1.25]})
     assert list(env.events) == ["mass"]

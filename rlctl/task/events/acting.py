@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -14,6 +15,22 @@ from rlctl.task.sim import Sim
 
 _ACTION = "action"
 
+Streams = Mapping[str, np.random.Generator]
+"""A random generator for each event, by its name."""
+
+
+def seed_streams(events: Iterable[str], seed: int) -> Streams:
+    """Return the generators of an episode's events.
+
+    What an event draws follows from the seed and its name alone: an episode starts the same with and without events,
+    and a change to one event leaves the draws of the others as they are.
+    """
+    return {name: np.random.default_rng(np.random.SeedSequence(seed, spawn_key=_to_key(name))) for name in events}
+
+
+def _to_key(name: str) -> tuple[int, ...]:
+    return tuple(name.encode())
+
 
 class ActingEvents:
     """Changes of the world at `reset`, `start` and `interval`; `level` in [0, 1] is how wide their ranges are."""
@@ -24,14 +41,14 @@ class ActingEvents:
             self._events.get(event.event.when, []).append(event)
         self._periods = [max(1, round(event.event.every_s / control_dt)) for event in self._events["interval"]]
 
-    def run(self, when: When, sim: Sim, rng: np.random.Generator, level: float) -> dict[str, Drawn]:
+    def run(self, when: When, sim: Sim, streams: Streams, level: float) -> dict[str, Drawn]:
         """Call the events of `when`; returns what they drew, by name."""
-        return {event.name: event(sim, rng, level) for event in self._events[when]}
+        return {event.name: event(sim, streams[event.name], level) for event in self._events[when]}
 
-    def run_due(self, step: int, sim: Sim, rng: np.random.Generator, level: float) -> dict[str, Drawn]:
+    def run_due(self, step: int, sim: Sim, streams: Streams, level: float) -> dict[str, Drawn]:
         """Call the interval events whose period ends at `step`."""
         due = zip(self._events["interval"], self._periods, strict=True)
-        return {event.name: event(sim, rng, level) for event, period in due if step % period == 0}
+        return {event.name: event(sim, streams[event.name], level) for event, period in due if step % period == 0}
 
     @property
     def has_intervals(self) -> bool:
@@ -79,16 +96,16 @@ class Signals:
         self.drawn: dict[str, Drawn] = {}
         """What was drawn for this episode, by event."""
 
-    def begin(self, rng: np.random.Generator, level: float) -> None:
-        """Start an episode; all chance of it comes from `rng`."""
+    def begin(self, streams: Streams, level: float) -> None:
+        """Start an episode; each event's chance comes from its stream."""
         self.drawn = {}
-        self._rng, self._level = rng, level
+        self._streams, self._level = streams, level
         self._observation_signals = None  # begins with the first observation
         self._action_signals = [self._start(event, self._zero_action()) for event in self._on_action]
 
     def try_once(self) -> None:
         """Begin every signal once, to find mistakes."""
-        self.begin(np.random.default_rng(0), 1.0)
+        self.begin(defaultdict(lambda: np.random.default_rng(0)), 1.0)
         self.observe(self._first)
 
     def _zero_action(self) -> Parts:
@@ -96,7 +113,7 @@ class Signals:
         return {_ACTION: np.clip(np.zeros_like(low), low, high)}
 
     def _start(self, event: BoundEvent, first: Parts) -> Signal:
-        made = event(self._rng, first, self._level)
+        made = event(self._streams[event.name], first, self._level)
         if not (isinstance(made, tuple) and len(made) == 2 and callable(made[1])):
             raise TaskError(f"events.{event.name}: its function must return what it drew and a signal, not {made!r}")
         drawn, signal = made
