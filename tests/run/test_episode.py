@@ -71,7 +71,7 @@ def rewrite(path, info):
 def test_a_newer_format(path):
     rewrite(path, json.dumps({"format": 99, "who": "knows"}))
     with pytest.raises(
-        ArtifactError, match=r"000000.npz: episode format 99 is newer than this rlctl .* can read \(1\)"
+        ArtifactError, match=r"000000.npz: episode format 99 is newer than this rlctl .* can read \(2\)"
     ):
         load_episode(path)
 
