@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that are written atomically."""
 
 from __future__ import annotations
 
@@ -20,14 +20,26 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+@contextlib.contextmanager
+def name_in_errors(path: Path) -> Iterator[None]:
+    """Make an `OSError` name `path`: Python names nothing where a write or a sync fails, or a temporary file."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None:
+            error.filename = str(path)
+        raise
+
+
 def write_with(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` make a file beside its place, flush it to the disk, and rename it into place."""
+    """Let `write` make a file next to its place, flush it to the disk, and rename it into place."""
     os.makedirs(path.parent, exist_ok=True)
     beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # keeps the suffix: some writers look at it
     try:
-        write(beside)
-        sync(beside)
-        os.replace(beside, path)
+        with name_in_errors(path):
+            write(beside)
+            sync(beside)
+            os.replace(beside, path)
     except BaseException:
         with contextlib.suppress(OSError):  # the error that led here is the one to report
             os.unlink(beside)
@@ -36,7 +48,7 @@ def write_with(path: Path, write: Callable[[Path], None]) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file, whole or not at all."""
+    """Write a file, atomically."""
     write_with(path, lambda beside: append(beside, content, 0))
 
 
@@ -47,12 +59,12 @@ def write_new(path: Path, content: bytes) -> None:
 
 
 def write_text(path: Path, content: str) -> None:
-    """Write a UTF-8 file, whole or not at all."""
+    """Write a UTF-8 file, atomically."""
     write_bytes(path, content.encode())
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write indented JSON, whole or not at all."""
+    """Write indented JSON, atomically."""
     write_text(path, json.dumps(content, indent=2) + "\n")
 
 
@@ -65,7 +77,7 @@ def read_json(path: Path) -> Any:
 
 
 def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as `.npz`, whole or not at all; object arrays, which would need pickle, are refused."""
+    """Write arrays as `.npz`, atomically; raises `ValueError` for object arrays, which would need pickle."""
     import numpy as np
 
     buffer = io.BytesIO()
@@ -91,11 +103,12 @@ def whole_folder(path: Path) -> Iterator[Path]:
     """Give a folder to fill by `write_new`; it takes its place when the block ends well, and is removed if not."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     remove_tree(beside)
-    os.makedirs(beside)
     try:
-        yield beside
-        sync(beside)
-        _take_place(beside, path)
+        with name_in_errors(path):
+            os.makedirs(beside)
+            yield beside
+            sync(beside)
+            _take_place(beside, path)
     except BaseException:
         remove_tree(beside)
         raise
@@ -144,8 +157,9 @@ def append(path: Path, content: bytes, size: int) -> None:
     """Append to the first `size` bytes of a file, and cut it back to them if the disk does not take it all."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     try:
-        os.ftruncate(descriptor, size)
-        _write_all(descriptor, content)
+        with name_in_errors(path):
+            os.ftruncate(descriptor, size)
+            _write_all(descriptor, content)
     except OSError:
         with contextlib.suppress(OSError):  # the next one to append cuts it back again
             os.ftruncate(descriptor, size)
@@ -158,8 +172,9 @@ def truncate(path: Path, size: int) -> None:
     """Cut a file back to its first `size` bytes."""
     descriptor = os.open(path, os.O_WRONLY)
     try:
-        os.ftruncate(descriptor, size)
-        os.fsync(descriptor)
+        with name_in_errors(path):
+            os.ftruncate(descriptor, size)
+            os.fsync(descriptor)
     finally:
         os.close(descriptor)
 
@@ -188,7 +203,7 @@ _SEAL = "\n# sha256 of the above: "
 
 
 def write_sealed(path: Path, content: str) -> None:
-    """Write a UTF-8 file that ends in a comment with its sha256, whole or not at all."""
+    """Write a UTF-8 file that ends in a comment with its sha256, atomically."""
     content = content.removesuffix("\n")
     write_text(path, f"{content}{_SEAL}{digest(content.encode())}\n")
 
@@ -217,7 +232,8 @@ def sync(path: Path) -> None:
     """Flush a file or a folder to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        with name_in_errors(path):
+            os.fsync(descriptor)
     finally:
         os.close(descriptor)
 

@@ -11,8 +11,9 @@ import shutil
 import string
 from pathlib import Path
 
-from rlctl.environments import registry
+from rlctl.environments import installed
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.storage import files as storage_files
 
 TEMPLATE = Path(__file__).with_name("template")
 """The files of the plugin, with `$name`, `$package` and `$cls` to be filled in; `package/` takes the package's name."""
@@ -90,7 +91,7 @@ def _check(name: str, package: str) -> None:
             f"name {name!r}: use letters, digits, - and _, with a letter first and no sign last"
             f"{f', such as {near!r}' if _NAME.fullmatch(near) else ''}"
         )
-    if entry := registry.find(name):
+    if entry := installed.find(name):
         raise UsageError(
             f"a task {name!r} is installed already, by {entry.distribution} {entry.version}; choose another name"
         )
@@ -123,10 +124,11 @@ def write_files(folder: Path, content: dict[Path, str]) -> None:
     """Write files into a new folder, all or none; raise `OSError` if the folder exists or one cannot be written."""
     beside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     try:
-        for path, text in content.items():
-            file = beside / path
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(text, encoding="utf-8")
-        beside.rename(folder)  # fails, and removes nothing, if somebody has put files there meanwhile
+        with storage_files.name_in_errors(folder):
+            for path, text in content.items():
+                file = beside / path
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_text(text, encoding="utf-8")
+            beside.rename(folder)  # fails, and removes nothing, if somebody has put files there meanwhile
     finally:
         shutil.rmtree(beside, ignore_errors=True)

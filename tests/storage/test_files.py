@@ -25,6 +25,30 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_litter(tmp_path, monkeypa
     assert os.listdir(tmp_path) == ["policy.bin"]
 
 
+@pytest.mark.parametrize("operation", ["write", "fsync"])
+def test_errors_name_the_file_that_cannot_be_written(tmp_path, monkeypatch, operation):
+    def fill(path):
+        files.write_new(path / "state.npz", b"new")
+
+    def write_folder(path):
+        with files.whole_folder(path) as beside:
+            fill(beside)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    (tmp_path / "table.csv").write_bytes(b"old")
+    monkeypatch.setattr(os, operation, full)
+    for name, write in [
+        ("policy.bin", lambda path: files.write_bytes(path, b"new")),
+        ("checkpoint", write_folder),
+        ("table.csv", lambda path: files.append(path, b"new", 0) if operation == "write" else files.truncate(path, 0)),
+    ]:
+        with pytest.raises(OSError, match="No space") as caught:
+            write(tmp_path / name)
+        assert caught.value.filename == str(tmp_path / name)
+
+
 def test_a_writer_that_raises_leaves_the_old_file_and_no_litter(tmp_path):
     path = tmp_path / "recording.rrd"
     files.write_with(path, lambda beside: beside.write_bytes(b"old"))
