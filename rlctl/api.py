@@ -85,13 +85,13 @@ def load_policy(path: str | os.PathLike[str], /) -> Policy:
     `load_policy(path).predict(observation)` returns the action. The name of an installed task, `load_policy("ant")`,
     is the policy that ships with it, never that of a run. Raises `ArtifactError` for a file that is not one.
     """
-    from rlctl.environments import registry
+    from rlctl.environments import installed
     from rlctl.policy import numpy_policy
     from rlctl.policy.shipped import find_shipped_policy
     from rlctl.run.directory import RunDirectory
 
     name, file = os.fspath(path), Path(path)
-    if not file.suffix and registry.find(name) is not None:
+    if not file.suffix and installed.find(name) is not None:
         file = find_shipped_policy(name)
     if RunDirectory(file).status_file.is_file():
         file = RunDirectory(file).policy_file()

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import gymnasium
 
-from rlctl.environments import registry
+from rlctl.environments import installed
 
-for _entry in registry.list_installed():
+for _entry in installed.list_installed():
     if _entry.problem is None:
         gymnasium.register(
             id=f"rlctl/{_entry.name}-v0",

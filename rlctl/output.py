@@ -121,36 +121,77 @@ def print_notes(notes: Iterable[str]) -> None:
         err().print(note, style="dim")
 
 
-def print_table(
-    columns: Sequence[str], rows: Iterable[Sequence[str | Text]], *, left: Collection[str] = (), gap: str = "  "
-) -> None:
-    """Print a table of results, its columns aligned right but for those in `left`. What is in a cell is no markup.
+Cells = Sequence["str | Text"]
 
-    Where no column has a name there is no header.
-    Where the terminal is too narrow, cells are folded; if that suffices, only those of texts after the first column.
+
+def print_table(
+    columns: Sequence[str],
+    rows: Iterable[Cells],
+    *,
+    left: Collection[str] = (),
+    drop: Sequence[str] = (),
+    gap: str = "  ",
+) -> None:
+    """Print a table of results, its columns aligned right but for those in `left`. A cell is plain text, not markup.
+
+    A table without column names has no header. Where the terminal is too narrow for one line per row, the columns in
+    `drop` are left out one by one, in this order; if the table is still too wide, cells are folded: those of texts
+    after the first column, and all others only where that does not suffice.
     """
-    from rich.table import Table
     from rich.text import Text
 
     table = [[Text(name, style="bold") for name in columns]] if any(columns) else []
     table += [[cell if isinstance(cell, Text) else Text(cell) for cell in row] for row in rows]
-    widths = [max(cell.cell_len for cell in column) for column in itertools.zip_longest(*table, fillvalue=Text())]
-    if sum(widths) + len(gap) * len(widths) > out().width:
-        folded = Table(box=None, pad_edge=False, padding=(0, len(gap) // 2), show_header=False)
-        texts = [name in left and name != columns[0] for name in columns]
-        rigid = sum(width for width, text in zip(widths, texts, strict=True) if not text) + len(gap) * len(widths)
-        fits = rigid + 8 * sum(texts) <= out().width
-        for name, text in zip(columns, texts, strict=True):
-            justify: JustifyMethod = "left" if name in left else "right"
-            folded.add_column(justify=justify, overflow="fold", no_wrap=fits and not text)
-        for row in table:
-            folded.add_row(*row)
-        out().print(folded)
-        return
+    names, to_drop = list(columns), list(drop)
+    while to_drop and _measure_width(table, names, left, gap) > out().width:
+        number = names.index(to_drop.pop(0))
+        names.pop(number)
+        table = [row[:number] + row[number + 1 :] for row in table]
+    if sum(_measure_columns(table)) + len(gap) * (len(names) - 1) > out().width:
+        _print_folded(table, names, left, gap)
+    else:
+        _print_lines(table, names, left, gap)
+
+
+def _measure_columns(table: Sequence[Sequence[Text]]) -> list[int]:
+    return [max(cell.cell_len for cell in column if cell is not None) for column in itertools.zip_longest(*table)]
+
+
+_FOLDED_TEXT = 30
+"""Width to which texts may be folded before columns are dropped."""
+
+
+def _measure_width(table: Sequence[Sequence[Text]], names: Sequence[str], left: Collection[str], gap: str) -> int:
+    """Return the width of a table whose long texts are folded."""
+    widths = zip(names, _measure_columns(table), strict=True)
+    folded = [min(w, _FOLDED_TEXT) if name in left and name != names[0] else w for name, w in widths]
+    return sum(folded) + len(gap) * (len(names) - 1)
+
+
+def _print_folded(table: list[list[Text]], names: list[str], left: Collection[str], gap: str) -> None:
+    from rich.table import Table
+
+    folded = Table(box=None, pad_edge=False, padding=(0, len(gap) // 2), show_header=False)
+    texts = [name in left and name != names[0] for name in names]
+    widths = zip(_measure_columns(table), texts, strict=True)
+    rigid = sum(width for width, is_text in widths if not is_text) + len(gap) * len(names)
+    fits = rigid + 8 * sum(texts) <= out().width
+    for name, is_text in zip(names, texts, strict=True):
+        justify: JustifyMethod = "left" if name in left else "right"
+        folded.add_column(justify=justify, overflow="fold", no_wrap=fits and not is_text)
+    for row in table:
+        folded.add_row(*row)
+    out().print(folded)
+
+
+def _print_lines(table: list[list[Text]], names: list[str], left: Collection[str], gap: str) -> None:
+    from rich.text import Text
+
+    widths = _measure_columns(table)
     lines = Text()  # rich's own table takes half a second for a thousand rows
     for row in table:
         line = Text()
-        for name, width, cell in zip(columns, widths, row, strict=False):
+        for name, width, cell in zip(names, widths, row, strict=False):
             space = " " * (width - cell.cell_len)
             for part in (cell, space) if name in left else (space, cell):
                 line.append(part)

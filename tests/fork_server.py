@@ -203,7 +203,7 @@ def close():
 
 def start(command, **options):
     """Start a child process as `subprocess.Popen` does, by a server of this process."""
-    server = for_commands if list(command[1:3]) == ["-m", "rlctl"] else for_workers
+    server = for_commands if "-m" in command[1:3] and "rlctl" in command[2:4] else for_workers
     return server().start(command, **options)
 
 

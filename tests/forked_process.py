@@ -59,9 +59,10 @@ def _take_surroundings(request):
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in SIGNALS[1:]:
         signal.signal(number, signal.SIG_DFL)
-    first = os.getcwd() if request["command"][1] == "-m" else ""
-    given = [each for each in request["env"].get("PYTHONPATH", "").split(os.pathsep) if each]
-    sys.path[:] = [first, *given, *sys.path[1:]]
+    arguments = request["command"][1:]
+    first = [] if arguments[0] == "-P" else [os.getcwd() if arguments[0] == "-m" else ""]
+    given = [folder for folder in request["env"].get("PYTHONPATH", "").split(os.pathsep) if folder]
+    sys.path[:] = [*first, *given, *sys.path[1:]]
     importlib.invalidate_caches()
     import numpy as np
 
@@ -69,8 +70,8 @@ def _take_surroundings(request):
 
 
 def _run(arguments):
-    """Run `-c code ...` or `-m module ...`; return the exit code."""
-    kind, what, *rest = arguments
+    """Run `[-P] -c code ...` or `[-P] -m module ...`; return the exit code."""
+    kind, what, *rest = arguments[1:] if arguments[0] == "-P" else arguments
     sys.argv = [kind, *rest]
     try:
         if kind == "-m":

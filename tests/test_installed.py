@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from rlctl.environments import registry
+from rlctl.environments import installed
 from rlctl.tasks.listing import describe_entry
 
 GOOD = """
@@ -92,7 +92,7 @@ def test_the_table(rlctl, site):
 def test_check_shows_what_raises_in_a_line_each(importable, monkeypatch):
     monkeypatch.syspath_prepend(importable)
     monkeypatch.setenv("PYTHONPATH", str(importable))
-    entries = [entry for entry in registry.list_installed() if entry.distribution == "some-robots"]
+    entries = [entry for entry in installed.list_installed() if entry.distribution == "some-robots"]
     problems = {entry.name: describe_entry(entry, check=True).problem for entry in entries}
     del problems["reach"]  # as without a check
     assert problems.pop("raises").startswith(f"{importable / 'some_robots/raises.yaml'}:2: expected the node content")

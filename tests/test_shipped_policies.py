@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import rlctl as package
-from rlctl.environments import registry
+from rlctl.environments import installed
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest
@@ -16,7 +16,7 @@ from rlctl.recipe.sources import resolve_packaged
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import find_policy
 
-OURS = [name for name in list_shipped() if registry.find(name).distribution == "rlctl"]
+OURS = [name for name in list_shipped() if installed.find(name).distribution == "rlctl"]
 
 
 def overlap(one, two):

@@ -10,9 +10,9 @@ _MOST = 50
 
 def complete_task(incomplete: str) -> list[str]:
     """Return the installed tasks that begin so, and the Python files here."""
-    from rlctl.environments import registry  # only here: every command's help imports this module
+    from rlctl.environments import installed  # only here: every command's help imports this module
 
-    names = [entry.name for entry in registry.list_installed() if entry.problem is None]
+    names = [entry.name for entry in installed.list_installed() if entry.problem is None]
     return [each for each in (*dict.fromkeys(names), *_list_paths(incomplete, "*.py")) if each.startswith(incomplete)]
 
 

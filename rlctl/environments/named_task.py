@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rlctl.environments import registry
+from rlctl.environments import installed, registry
 from rlctl.errors import ArtifactError
 from rlctl.version import PACKAGE_FOLDER
 
@@ -31,7 +31,7 @@ def load(task: str, named_by: str) -> Callable[..., Any]:
     """Import a task that `named_by` names, as `registry.load` does; raises `ArtifactError` unless it is one."""
     if not task.isprintable():
         raise _make_error(task, named_by, "that is not a name")
-    if registry.find(task) is None and ":" in task:
+    if installed.find(task) is None and ":" in task:
         _look_before_import(task, named_by)
     constructor = registry.load(task)
     if not _may_be_called(task, constructor):
@@ -103,7 +103,7 @@ def _may_be_called(task: str, constructor: Any) -> bool:
     """Say whether calling it makes an environment: a class of one, or what a user's own module says makes one."""
     import gymnasium
 
-    if registry.find(task) is not None or hasattr(constructor, "gymnasium_id") or registry.is_task(constructor):
+    if installed.find(task) is not None or hasattr(constructor, "gymnasium_id") or registry.is_task(constructor):
         return True
     if inspect.isclass(constructor) and issubclass(constructor, gymnasium.Env):
         return True

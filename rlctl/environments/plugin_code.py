@@ -11,6 +11,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -37,26 +38,32 @@ def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
         ) from error
 
 
-def find_module_file(module: str) -> Path | None:
-    """Find a module's file; unlike `find_spec` on a dotted name this imports no parent package."""
+def find_module_file(module: str, *, in_current_folder: bool = False) -> Path | None:
+    """Find a module's file; unlike `find_spec` on a dotted name this imports no parent package.
+
+    `in_current_folder` looks there as well, after all folders of `sys.path`.
+    """
     head, *rest = module.split(".")
     try:
         spec = importlib.util.find_spec(head)
+        if spec is None and in_current_folder:
+            spec = PathFinder.find_spec(head, [os.getcwd()])
         for depth, _ in enumerate(rest, start=2):
             if spec is None:
                 return None
             name = ".".join(module.split(".")[:depth])
             path = spec.submodule_search_locations
-            found = (finder.find_spec(name, path) for finder in sys.meta_path if hasattr(finder, "find_spec"))
-            spec = next((each for each in found if each is not None), None)
+            specs = (finder.find_spec(name, path) for finder in sys.meta_path if hasattr(finder, "find_spec"))
+            spec = next((candidate for candidate in specs if candidate is not None), None)
     except (ImportError, ValueError):
         return None
     return Path(spec.origin) if spec and spec.origin and spec.has_location else None
 
 
 def import_module(task: str, name: str) -> Any:
-    """Import an installed module, or one below the current folder; raises `TaskError` for what it raises."""
-    if find_module_file(name) is None and name not in sys.modules:
+    """Import an installed module, or one below the current folder; raises `TaskError` for any exception in it."""
+    is_installed = name in sys.modules or find_module_file(name) is not None
+    if not is_installed and find_module_file(name, in_current_folder=True) is None:
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
     with _survive_import(task):
         return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
@@ -71,9 +78,7 @@ def import_file(task: str, file: Path) -> Any:
     for loaded, known in list(sys.modules.items()):
         if getattr(known, "__file__", None) == path and loaded != "__main__":
             return known
-    folder = str(file.parent)
-    if folder not in sys.path:
-        sys.path.append(folder)  # last: a neighbour called torch.py must not be taken for torch
+    append_to_path(str(file.parent))
     name = file.stem
     while name in sys.modules or name in sys.stdlib_module_names:
         name = f"rlctl_task_{name}"
@@ -90,6 +95,12 @@ def import_file(task: str, file: Path) -> Any:
         sys.modules.pop(name, None)
         raise
     return module
+
+
+def append_to_path(folder: str) -> None:
+    """Let modules of a folder be imported, after all others: a torch.py in it must not be taken for torch."""
+    if folder not in sys.path:
+        sys.path.append(folder)
 
 
 @contextlib.contextmanager

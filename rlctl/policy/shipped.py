@@ -10,7 +10,7 @@ from typing import Any
 
 import pydantic
 
-from rlctl.environments import registry
+from rlctl.environments import installed
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 
 PRETRAINED = "pretrained"
@@ -59,16 +59,16 @@ class Provenance(pydantic.BaseModel, extra="forbid"):
 
 def list_shipped() -> list[str]:
     """Return the installed tasks that ship a policy."""
-    return [each.name for each in registry.list_installed() if each.problem is None and each.policy_file is not None]
+    return [each.name for each in installed.list_installed() if each.problem is None and each.policy_file is not None]
 
 
 def find_shipped_policy(task: str | None) -> Path:
     """Return the file of a task's shipped policy; raises `UsageError` for no task, `ArtifactError` for no policy."""
     if task is None:
         raise UsageError(f"--pretrained: give a task that ships a policy: {', '.join(list_shipped()) or 'none does'}")
-    entry = registry.find(task)
+    entry = installed.find(task)
     if entry is None:
-        names = [each.name for each in registry.list_installed()]
+        names = [each.name for each in installed.list_installed()]
         raise UsageError(
             f"no task {task!r} is installed, and only installed tasks ship policies.{did_you_mean(task, names)}"
         )

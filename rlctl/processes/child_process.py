@@ -24,7 +24,8 @@ from typing import Any
 
 from rlctl.processes import messages
 
-# Started this way a child finds the modules that its parent finds, and the caller's script is not run again.
+# Started this way a child finds the modules that its parent finds and no others (-P: none of the current folder), and
+# the caller's script is not run again.
 # Ctrl-C and `kill` may reach a child too, but its parent decides: ignored before anything slow is imported, and held
 # back until then. A handler, not SIG_IGN, because that would be inherited by what an environment starts.
 _BOOTSTRAP = (
@@ -74,7 +75,7 @@ class ChildProcess:
         try:
             with theirs, open(lifeline, "rb"), _block_signals():
                 self.process = start_process(
-                    [sys.executable, "-c", _BOOTSTRAP, json.dumps(job)],
+                    [sys.executable, "-P", "-c", _BOOTSTRAP, json.dumps(job)],
                     stdin=subprocess.DEVNULL,
                     process_group=0,  # so that what an environment starts can be ended with it
                     **options,

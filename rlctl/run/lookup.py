@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rlctl.environments import registry
+from rlctl.environments import installed, registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.environments.task_version import describe_task_changes
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
@@ -65,10 +65,10 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
         )
     if tunings := sorted((root / registry.make_slug(text)).glob(f"*/{TUNE_FILE}")):
         raise ArtifactError(f"no run of {text!r} but the trials of rlctl tune; name one in {tunings[-1].parent}")
-    if entry := registry.find(text):
+    if entry := installed.find(text):
         shipped = "; for the policy that it ships: --pretrained" if entry.policy_file else ""
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
-    names = {each.name for each in root.glob("*/")} | {each.name for each in registry.list_installed()}
+    names = {each.name for each in root.glob("*/")} | {each.name for each in installed.list_installed()}
     hint = did_you_mean(text, sorted(names)) or " All runs: rlctl runs"
     raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{hint}")
 

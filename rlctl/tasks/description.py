@@ -15,7 +15,7 @@ import numpy as np
 from pydantic_core import to_jsonable_python
 
 from rlctl.checking.leaves import Leaf, find_leaves
-from rlctl.environments import registry
+from rlctl.environments import installed, registry
 from rlctl.environments.plugin_code import call_plugin
 from rlctl.errors import TaskError
 from rlctl.policy.file import PolicyFile, PolicyInfo
@@ -58,7 +58,7 @@ def describe(task: str) -> Description:
             call_plugin(task, lambda: env.close())
         raise
     call_plugin(task, lambda: env.close())
-    recipe_file, entry = registry.find_recipe_file(task), registry.find(task)
+    recipe_file, entry = registry.find_recipe_file(task), installed.find(task)
     policy_file = entry.policy_file if entry else None
     policy = PolicyFile.read_info(policy_file) if policy_file else None
     content = {
@@ -170,7 +170,7 @@ def _list_parameters(constructor: Callable[..., Any]) -> list[dict[str, Any]]:
 
 
 def _find_origin(task: str, target: str) -> tuple[str | None, str | None]:
-    entry = registry.find(task) or next((each for each in registry.list_installed() if each.target == target), None)
+    entry = installed.find(task) or next((each for each in installed.list_installed() if each.target == target), None)
     if entry is not None:
         return entry.distribution, entry.version
     if task.rpartition(":")[0].endswith(".py"):  # any package may have a module of that name

@@ -1,11 +1,18 @@
-"""`rlctl tasks`: what is installed, where it comes from, and what is broken."""
+"""`rlctl tasks`: what is installed, what it does, how well its policy does it, and what is broken."""
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import functools
+import json
+from pathlib import Path
+from typing import Any
 
-from rlctl.environments import registry
-from rlctl.errors import RecipeError
+from rlctl import output
+from rlctl.environments import installed
+from rlctl.errors import RlctlError
+from rlctl.storage import untrusted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,31 +23,65 @@ class ListedTask:
     target: str
     distribution: str
     version: str
+    summary: str
+    """First line of the task's docstring."""
     algo: str | None
+    success: float | None
+    """Success rate of the shipped policy, as it was measured when it was exported."""
+    mean_return: float | None
+    """Mean return of the shipped policy, measured on the same episodes."""
     problem: str | None
 
 
 def list_tasks(*, check: bool = False) -> list[ListedTask]:
     """List the installed tasks; `check` imports each in a child process."""
-    return [describe_entry(entry, check=check) for entry in registry.list_installed()]
+    return [describe_entry(entry, check=check) for entry in installed.list_installed()]
 
 
-def describe_entry(entry: registry.TaskEntry, *, check: bool) -> ListedTask:
+def describe_entry(entry: installed.TaskEntry, *, check: bool) -> ListedTask:
     """Return the row of an installed task; `check` imports it in a child process."""
     problem = entry.problem
-    algo = None
+    summary, algo = "", None
+    score: dict[str, Any] = {}
     try:
-        algo = _read_algorithm(entry)
-    except RecipeError as error:
-        problem = problem or str(error)
+        if problem is None:
+            summary, algo, score = _read_summary(entry), _read_algorithm(entry), _read_score(entry)
+    except RlctlError as error:
+        problem = str(error)
     except (OSError, UnicodeDecodeError) as error:
-        problem = problem or f"{entry.recipe_file}: {error}"
+        problem = f"{entry.recipe_file}: {error}"
     if check and problem is None:
-        problem = registry.check_import(entry)
-    return ListedTask(entry.name, entry.target, entry.distribution, entry.version, algo, problem)
+        problem = installed.check_import(entry)
+    return ListedTask(
+        name=entry.name,
+        target=entry.target,
+        distribution=entry.distribution,
+        version=entry.version,
+        summary=summary,
+        algo=algo,
+        success=score.get("success"),
+        mean_return=score.get("mean_return"),
+        problem=problem,
+    )
 
 
-def _read_algorithm(entry: registry.TaskEntry) -> str | None:
+def _read_summary(entry: installed.TaskEntry) -> str:
+    """Read the first line of a task's docstring off its source; to import the task would take seconds."""
+    file = entry.module_file
+    return _read_class_summaries(file).get(entry.target.partition(":")[2], "") if file else ""
+
+
+@functools.cache
+def _read_class_summaries(file: Path) -> dict[str, str]:
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (OSError, SyntaxError, ValueError, RecursionError):
+        return {}
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    return {node.name: (ast.get_docstring(node) or "").partition("\n")[0] for node in classes}
+
+
+def _read_algorithm(entry: installed.TaskEntry) -> str | None:
     """Read the algorithm off the packaged recipe; the full check of a recipe would cost its imports."""
     file = entry.recipe_file
     if file is None:
@@ -52,10 +93,22 @@ def _read_algorithm(entry: registry.TaskEntry) -> str | None:
     return str(algo)
 
 
+def _read_score(entry: installed.TaskEntry) -> dict[str, Any]:
+    """Read the measured score off the header of the shipped policy; safetensors' own reader would load NumPy."""
+    if (path := entry.policy_file) is None:
+        return {}
+    try:
+        with untrusted.open_file(path) as file:
+            size = int.from_bytes(file.read(8), "little")
+            header = untrusted.parse_json(file.read(min(size, untrusted.JSON_LIMIT)))
+        score = json.loads(header["__metadata__"]["rlctl"])["provenance"]["score"]
+        return {name: value for name, value in score.items() if isinstance(value, int | float)}
+    except (RlctlError, ValueError, KeyError, TypeError, AttributeError, OSError):
+        return {}  # whoever uses the policy is told what is wrong with it
+
+
 def show(listed: list[ListedTask], json: str | None) -> None:
     """Print the table, or JSON alone for `-`."""
-    from rlctl import output
-
     if json is not None and output.write_result_json(json, {"tasks": listed}):
         return
     if not listed:
@@ -63,11 +116,17 @@ def show(listed: list[ListedTask], json: str | None) -> None:
         return
     from rich.text import Text
 
-    columns = ["task", "origin", "algorithm", *(["problem"] if any(each.problem for each in listed) else [])]
-    rows: list[list[str | Text]] = []
-    for each in listed:
-        origin = f"{each.distribution} {each.version}"
-        problem = Text(each.problem or "", style="red")
-        row: list[str | Text] = [each.name, origin, each.algo or "ppo (default)", problem]
-        rows.append(row[: len(columns)])
-    output.print_table(columns, rows, left=columns)
+    columns = ["task", "success", "return", "algorithm", "origin", "what it does"]
+    rows = [
+        (
+            task.name,
+            "" if task.success is None else f"{task.success:.0%}",
+            "" if task.mean_return is None else f"{task.mean_return:.4g}",
+            "" if task.problem else task.algo or "ppo (default)",
+            f"{task.distribution} {task.version}",
+            Text(task.problem, style="red") if task.problem else task.summary,
+        )
+        for task in listed
+    ]
+    left = ("task", "algorithm", "origin", "what it does")
+    output.print_table(columns, rows, left=left, drop=("origin", "algorithm"))

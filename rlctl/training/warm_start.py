@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rlctl.environments import registry
+from rlctl.environments import installed
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import UsageError
 from rlctl.policy.file import PolicyFile, PolicyInfo, list_actor_tensors
@@ -27,7 +27,7 @@ def find_source(text: str, recipe: Recipe) -> dict[str, Any]:
     """
     if Path(text).suffix == ".onnx":
         raise UsageError(f"--from {text}: an ONNX file cannot be trained on; give the run or its .safetensors file")
-    ships = registry.find(text) is not None and not (Path(text) / "run.json").is_file()
+    ships = installed.find(text) is not None and not (Path(text) / "run.json").is_file()
     file = find_policy(text, PRETRAINED if ships else "best").file
     info = PolicyFile.read_info(file)
     if info.algo != recipe.algo:

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rlctl.environments import registry
+from rlctl.environments import installed, registry
 from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.group import as_json, evaluate_group
 from rlctl.run.directory import GROUP_FILE
@@ -36,7 +36,7 @@ HEAD = """\
 
 def list_tasks() -> list[str]:
     """Return the bundled tasks."""
-    return [each.name for each in registry.list_installed() if each.distribution == registry.OURS]
+    return [each.name for each in installed.list_installed() if each.distribution == installed.OURS]
 
 
 def find_group(task: str, seeds: Sequence[int], root: Path) -> Group | None:
@@ -156,7 +156,7 @@ def main() -> int:
                 return code
             worst = max(worst, code)
         group = find_group(task, parse_seeds(options.seeds), options.root) or find_finished(task, options.root)
-        entry = registry.find(task)
+        entry = installed.find(task)
         if group is not None and entry is not None and entry.module_file is not None:
             by_readme.setdefault(entry.module_file.with_name("README.md"), []).append(read_scores(group))
     for readme, scores in by_readme.items():

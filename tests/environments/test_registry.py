@@ -78,6 +78,29 @@ def test_every_form_of_a_task(my_env, write_module):
     assert type(EnvSpec("Pendulum-v1").make().unwrapped).__name__ == "PendulumEnv"
 
 
+def test_resolving_a_name_leaves_the_path_alone(my_env):
+    before = [*sys.path]
+    for task in ("my_env:MyEnv", "my_env.py:MyEnv", "reach", "Pendulum-v1", "nowhere:E"):
+        registry.find_source_file(task)
+        registry.find_recipe_file(task)
+    assert registry.find_source_file("my_env:MyEnv") == my_env
+    for task in ("reach", "Pendulum-v1"):
+        registry.load(task)
+    assert sys.path == before
+    registry.load("my_env:MyEnv")
+    assert sys.path == [*before, str(my_env.parent)]
+
+
+def test_a_strangers_modules_in_the_current_folder_are_not_run(installed_rlctl, write_module):
+    for name in ("numpy", "json", "signal", "torch", "gymnasium", "rlctl_manipulation", "typer"):
+        write_module(f"{name}.py", f"raise SystemExit('a file of the current folder was imported: {name}')\n")
+    done = installed_rlctl("eval", "reach", "--pretrained", "--episodes", "2", "--n-envs", "2")
+    assert (done.returncode, "2 episodes" in done.stdout) == (0, True), done.stderr
+    write_module("pendulum.py", "from gymnasium.envs.classic_control import PendulumEnv\n")
+    done = installed_rlctl("check-env", "pendulum:PendulumEnv", "--only", "RL1")
+    assert "current folder" not in done.stderr, done.stderr
+
+
 def test_a_file_is_imported_once(my_env):
     assert registry.load("my_env.py:MyEnv") is registry.load(f"{my_env}:MyEnv") is registry.load("my_env:MyEnv")
 

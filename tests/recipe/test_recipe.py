@@ -79,9 +79,9 @@ def test_defaults_for_an_environment_without_a_recipe():
 
 
 def test_every_packaged_recipe_is_valid():
-    from rlctl.environments import registry
+    from rlctl.environments import installed
 
-    for entry in registry.list_installed():
+    for entry in installed.list_installed():
         if entry.distribution == "rlctl":
             assert entry.recipe_file is not None, entry.name
             assert isinstance(resolve(entry.name, None, {}), Recipe)

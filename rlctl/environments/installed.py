@@ -1,0 +1,181 @@
+"""Installed tasks: what each distribution declares under the entry-point group `rlctl.tasks`. Imports no plugin."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.metadata
+import os
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rlctl.environments.plugin_code import find_module_file
+from rlctl.errors import describe_exception, short_repr
+
+GROUP = "rlctl.tasks"
+OURS = "rlctl"
+
+_NAME = re.compile(r"\w[\w.-]{,99}")
+_TARGET = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskEntry:
+    """An installed task, as its distribution declares it; nothing of it is imported."""
+
+    name: str
+    target: str
+    """`package.module:Class`."""
+    distribution: str
+    version: str
+    problem: str | None = None
+    """Why it cannot be used under its name, if so."""
+
+    @property
+    def module_file(self) -> Path | None:
+        """The module's file, found without importing it or its packages."""
+        return find_module_file(self.target.partition(":")[0])
+
+    @property
+    def recipe_file(self) -> Path | None:
+        """The packaged recipe: `<name>.yaml` beside the module, or the module's own, `<module>.yaml`."""
+        file = self.module_file
+        if file is None or self.problem:
+            return None
+        recipes = (file.with_name(f"{self.name}.yaml"), file.with_suffix(".yaml"))
+        return next((recipe for recipe in recipes if recipe.is_file()), None)
+
+    @property
+    def policy_file(self) -> Path | None:
+        """The shipped policy: `policies/<name>.safetensors` beside the module."""
+        file = self.module_file
+        if file is None or self.problem:
+            return None
+        policy = file.parent / "policies" / f"{self.name}.safetensors"
+        return policy if policy.is_file() else None
+
+
+def list_installed() -> list[TaskEntry]:
+    """Return every installed task, by name; of two with one name the bundled one, or the first, can be used.
+
+    The list is made again when `sys.path`, or a folder on it, has changed.
+    """
+    return list(_list_installed(tuple((folder, _find_state(folder or os.curdir)) for folder in sys.path)))
+
+
+def find(name: str) -> TaskEntry | None:
+    """Return the installed task of a name."""
+    if ":" in name:  # names a module, a file or a package
+        return None
+    return next((entry for entry in list_installed() if entry.name == name), None)
+
+
+def _find_state(folder: str) -> tuple[int, ...]:
+    """Return which folder it is, and when something was added or removed; empty if it is none."""
+    try:
+        state = os.stat(folder)
+    except OSError:
+        return ()
+    return state.st_dev, state.st_ino, state.st_mtime_ns
+
+
+@functools.lru_cache(maxsize=4)
+def _list_installed(path: tuple[tuple[str, tuple[int, ...]], ...]) -> list[TaskEntry]:
+    declared: dict[
+        tuple[str, str], TaskEntry
+    ] = {}  # of equal lines the first: a checkout on sys.path next to its own installation declares the same
+    for distribution in importlib.metadata.distributions():
+        for entry in _read_distribution(distribution):
+            declared.setdefault((entry.name, entry.target), entry)
+    entries: list[TaskEntry] = []
+    owners: dict[str, TaskEntry] = {}
+    for entry in sorted(declared.values(), key=_rank):
+        owner = owners.setdefault(entry.name, entry)
+        entries.append(dataclasses.replace(entry, problem=entry.problem or _find_problem(entry, owner)))
+    return entries
+
+
+def _rank(entry: TaskEntry) -> tuple[Any, ...]:
+    return entry.name, entry.problem is not None, entry.distribution != OURS, entry.distribution
+
+
+def _read_distribution(distribution: importlib.metadata.Distribution) -> Iterator[TaskEntry]:
+    """Yield the tasks of a distribution; whatever is broken about it becomes the `problem` of its tasks."""
+    problem = None
+    try:
+        text = distribution.read_text("entry_points.txt") or ""
+    except UnicodeDecodeError as error:
+        text = error.object.decode(errors="replace")
+        problem = "its entry_points.txt is not UTF-8"
+    except OSError:
+        return
+    if GROUP not in text:  # most distributions: their metadata, which is slow to parse, is not needed
+        return
+    try:
+        metadata: Any = distribution.metadata
+        origin = (metadata["Name"] or "?", metadata["Version"] or "?")
+    except Exception as error:  # a parser's own exceptions, where METADATA is missing or damaged
+        origin = ("?", "?")
+        problem = problem or f"its METADATA cannot be read: {describe_exception(error)}"
+    for line in _list_lines(text):
+        name, _, target = (part.strip() for part in line.partition("="))
+        yield TaskEntry(short_repr(name, 100), target, *origin, problem or _find_mistake(name, target))
+
+
+def _list_lines(text: str) -> Iterator[str]:
+    """Yield the lines of our group in the text of an `entry_points.txt`."""
+    section = ""
+    for line in map(str.strip, text.splitlines()):
+        if line.startswith("["):
+            section = line.strip("[] ")
+        elif line and section == GROUP and not line.startswith(("#", ";")):
+            yield line
+
+
+def _find_mistake(name: str, target: str) -> str | None:
+    if not target:
+        return "its entry-point line is not NAME = package.module:Class"
+    if not _NAME.fullmatch(name):
+        return "a task's name has 1 to 100 letters, digits, _, - and ."
+    if not _TARGET.fullmatch(target):
+        return f"its target {short_repr(target)!r} is not package.module:Class"
+    return None
+
+
+def _find_problem(entry: TaskEntry, owner: TaskEntry) -> str | None:
+    if entry is not owner:
+        return f"name taken by {owner.distribution}; use {entry.target}"
+    if entry.module_file is None:
+        return f"module {entry.target.partition(':')[0]!r} is missing"
+    return None
+
+
+def check_import(entry: TaskEntry, timeout_s: float = 60.0) -> str | None:
+    """Import a task in a child process; return what it raised, in a line, or None."""
+    import subprocess
+
+    code = (
+        "from rlctl.environments import registry; from rlctl.errors import RlctlError\n"
+        f"try: registry.load({entry.target!r})\n"
+        "except RlctlError as error: print('\\n@' + str(error).splitlines()[0]); sys.exit(3)\n"
+        "print('\\n@')"
+    )
+    try:
+        child = subprocess.run(
+            [sys.executable, "-P", "-c", code],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=timeout_s,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"import did not end within {timeout_s:.0f} s"
+    lines = [line[1:] for line in child.stdout.splitlines() if line.startswith("@")]
+    if not lines:
+        return f"import ended the process with exit code {child.returncode}"
+    return lines[-1] or None
