@@ -113,6 +113,10 @@ class RunDirectory:
             raise ArtifactError(f"{self.status_file}: not a run of rlctl: it names no task")
         return status
 
+    def id(self) -> str:
+        """Return what tells this run from all others; it stays with the folder when that is moved or copied."""
+        return str(self.status().get("id", ""))
+
     def write_status(self, changes: Mapping[str, Any]) -> None:
         """Put some values into `run.json`."""
         known = files.read_json(self.status_file) if self.status_file.exists() else {}
@@ -152,9 +156,13 @@ class RunDirectory:
 
 
 class RunLock:
-    """Keeps a second process from writing a run; the system releases it when the process ends, however it ends."""
+    """Keeps a second process from writing a run, or another `kind` of folder with runs.
 
-    def __init__(self, folder: Path) -> None:
+    The system releases it when the process ends, however it ends.
+    """
+
+    def __init__(self, folder: Path, kind: str = "run") -> None:
+        self._kind = kind
         self.keeps_out = True
         """Whether it does keep others out: some network file systems have no locks."""
         self._file = folder / ".lock"
@@ -168,7 +176,7 @@ class RunLock:
             owner = os.read(descriptor, 100).decode(errors="replace").strip()
             os.close(descriptor)
             raise UsageError(
-                f"{self._file.parent}: another process is writing this run ({owner or 'unknown'})"
+                f"{self._file.parent}: another process is writing this {self._kind} ({owner or 'unknown'})"
             ) from None
         except OSError as error:
             if error.errno not in _NO_LOCKS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,29 @@ class Table:
         self.size = _read_size(path)
         self._waiting: list[dict[str, Any]] = []
 
-    def cut_back(self, size: int) -> bool:
-        """Forget what came after the first `size` bytes; False if the file is shorter than that."""
-        if self.size > size:
+    def cut_back(self, size: int, sha256: str, steps: int) -> bool:
+        """Cut the file back to its first `size` bytes; False if these are not the ones with this digest.
+
+        Of a file that was edited the whole rows stay whose first column is at most `steps`.
+        """
+        content = self.path.read_bytes()[:size] if self.size else b""
+        intact = len(content) == size and (not size or files.digest(content) == sha256)
+        if intact and self.size > size:
             files.truncate(self.path, size)
+        elif not intact and self.size:
+            size = self._keep_rows(steps)
         self.size = min(size, self.size)
-        return self.size == size
+        return intact
+
+    def _keep_rows(self, steps: int) -> int:
+        """Write the file again with its rows up to `steps` and our line ends; return its size in bytes."""
+        header, *rows = self.path.read_text(encoding="utf-8", errors="replace").splitlines() or [""]
+        whole = [row for row in rows if row.count(",") == header.count(",")]
+        lines = [header, *(row for row in whole if _read_first_number(row) <= steps)]
+        content = "".join(f"{line}\n" for line in lines).encode()
+        files.write_bytes(self.path, content)
+        self.size = len(content)
+        return self.size
 
     def digest(self) -> str:
         """Return the sha256 of the first `size` bytes of the file."""
@@ -64,6 +82,14 @@ class Table:
             writer.writeheader()
         writer.writerows(self._waiting)
         return text.getvalue()
+
+
+def _read_first_number(row: str) -> float:
+    """Return the number in the first column of a row; infinity where there is none."""
+    try:
+        return float(row.partition(",")[0])
+    except ValueError:
+        return math.inf
 
 
 def _read_size(path: Path) -> int:

@@ -8,6 +8,7 @@ buffer of an off-policy algorithm is in segments beside the folders.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import platform
 from pathlib import Path
@@ -43,6 +44,8 @@ class State(pydantic.BaseModel):
     """The content of `state.json`."""
 
     format: int = FORMAT
+    run: str = ""
+    """The `id` of the run that it is of."""
     step: int
     model: dict[str, Any]
     """Plain data of `snapshot.take`."""
@@ -80,6 +83,10 @@ class Checkpoints:
             assert model.replay_buffer is not None  # SB3 makes it in its constructor
             self._replay = ReplaySegments(run.replay_segments, model.replay_buffer)
 
+    @functools.cached_property
+    def _run_id(self) -> str:
+        return self._run.id()
+
     @property
     def _added(self) -> int:
         """How many transitions the replay buffer has been given: one for each step of all environments."""
@@ -98,6 +105,7 @@ class Checkpoints:
             _TENSORS: save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()}),
         }
         state = State(
+            run=self._run_id,
             step=self._model.num_timesteps,
             model=plain,
             progress=progress,
@@ -158,7 +166,10 @@ def read_newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
     damage: list[str] = []
     for folder in reversed(run.checkpoints()):
         try:
-            return read(folder), damage
+            checkpoint = read(folder)
+            if checkpoint.state.run not in ("", run.id()):
+                raise ArtifactError(f"{folder}: the checkpoint of another run; nothing of it is used")
+            return checkpoint, damage
         except ArtifactError as error:
             damage.append(str(error))
     if damage:

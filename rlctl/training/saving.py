@@ -127,14 +127,10 @@ def cut_back(run: RunDirectory, step: int, progress: Progress) -> list[str]:
         (run.metrics_file, progress.metrics_bytes, progress.metrics_sha256),
         (run.evals_file, progress.evals_bytes, progress.evals_sha256),
     ):
-        table = Table(file)
-        if not table.cut_back(size):
+        if not Table(file).cut_back(size, sha256, step):
             warnings.append(
-                f"warning: {file}: rows before step {step:,} are gone: it is shorter than the checkpoint says"
-            )
-        elif size and table.digest() != sha256:
-            warnings.append(
-                f"warning: {file}: damaged, or edited: rows before step {step:,} are not those that were written"
+                f"warning: {file}: edited or damaged: its rows up to step {step:,} are not those that were written; "
+                "they are kept as they are, without lines that are not whole"
             )
     return warnings + _read_best_score(run, progress)
 

@@ -16,6 +16,7 @@ from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.group import GroupScore, as_json, evaluate_group
 from rlctl.recipe.sources import resolve
 from rlctl.rollout.workers import available_cores
+from rlctl.run.directory import RunLock
 from rlctl.run.group import Group, create_group, parse_seeds, read_group
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
@@ -66,6 +67,12 @@ def train_seeds(
     else:
         check_arguments(request)
         group, resume = read_group(Path(str(request.resume))), request
+    with RunLock(group.path, "group"):
+        return _train(group, resume, jobs, episodes)
+
+
+def _train(group: Group, resume: TrainRequest, jobs: int | None, episodes: int) -> SeedsResult:
+    """Train the seeds of a group that are not done; `resume` is what is different now."""
     requests = {seed: _make_request(group, seed, resume) for seed in group.seeds if _is_waiting(group, seed, resume)}
     trainings = Trainings(_choose_jobs(group, len(requests), jobs))
     calls = [

@@ -6,6 +6,7 @@ import datetime
 import os
 import platform
 import sys
+import uuid
 from typing import TYPE_CHECKING, Any
 
 from rlctl.environments.task_version import find_git_commit, identify_task
@@ -44,7 +45,11 @@ def write_start(run: RunDirectory, start: Start) -> None:
     if start.run is not None:
         changes |= {"resumed": _now(), "resumed_at_step": start.step}
     else:
-        changes |= {"started": _now(), "folder": os.getcwd()}  # what a task's path may be relative to
+        changes |= {
+            "id": uuid.uuid4().hex,
+            "started": _now(),
+            "folder": os.getcwd(),
+        }  # what a task's path may be relative to
         if start.source is not None:
             changes["from"] = start.source
     run.write_status(changes)

@@ -45,7 +45,11 @@ def _rank(trial: Trial) -> tuple[bool, float]:
 
 
 def _list_cells(tuning: Tuning, trial: Trial, keys: list[str], run: RunSummary | None) -> tuple[str, ...]:
-    notes = {"done": "", "failed": f"failed: {trial.problem}", "begun": "not finished"}
+    notes = {
+        "done": "",
+        "failed": f"failed: {trial.problem}",
+        "begun": f"not finished: {trial.problem or 'interrupted'}",
+    }
     total, success = tuning.measure(trial, "return"), tuning.measure(trial, "success")
     seconds = None if run is None else run.seconds
     return (

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import signal
 import sys
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 import optuna
@@ -12,6 +15,7 @@ from optuna.trial import TrialState
 
 from rlctl.environments.spec import merge
 from rlctl.errors import UsageError
+from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.trainings import Trainings
@@ -22,6 +26,7 @@ _RANDOM_SHARE = 3  # a third of a step's trials are random, so that there is som
 _EVALUATIONS_UNJUDGED = 2
 _TRIALS_UNJUDGED = 3
 _MOST_REPEATS = 50
+_KILLED = 128 + signal.SIGKILL
 _STATES = {"done": TrialState.COMPLETE, "pruned": TrialState.PRUNED, "failed": TrialState.FAIL}
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -158,21 +163,52 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
     if pruning is None and lacks_metric():
         raise UsageError(f"--metric {tuning.metric}: this task reports no success (no is_success); use --metric return")
     run = tuning.find_run(trial)
-    finished = run is not None and run.status().get("status") == "finished"
-    if code == 0 and finished:
+    if trainings.stopped_by is not None and not (code == 0 and _has_finished(run)):
+        return
+    with _claim(run) as problem:
+        if problem or code == _KILLED:
+            # Nothing is known about its values: `tune --resume` tries it again.
+            trial.problem = problem or "killed by SIGKILL"
+            return
+        _note_end(tuning, trial, run, code, lines, pruned=pruning is not None and pruning.decided)
+        if run is not None:
+            # Replay buffers of dozens of trainings that nobody resumes; their policies stay.
+            files.remove_tree(run.checkpoint(0).parent)
+
+
+def _has_finished(run: RunDirectory | None) -> bool:
+    return run is not None and run.status().get("status") == "finished"
+
+
+@contextlib.contextmanager
+def _claim(run: RunDirectory | None) -> Iterator[str]:
+    """Hold the lock of a run, if there is one; give an error's text where another process holds it."""
+    if run is None:
+        yield ""
+        return
+    try:
+        lock = run.lock()
+    except UsageError as error:
+        yield str(error)
+        return
+    with lock:
+        yield ""
+
+
+def _note_end(
+    tuning: Tuning, trial: Trial, run: RunDirectory | None, code: int, lines: list[str], *, pruned: bool
+) -> None:
+    """Write into a trial how its training ended; `lines` is what it printed."""
+    trial.problem = ""
+    if code == 0 and _has_finished(run):
         trial.score = tuning.measure(trial)
         trial.state = "done" if trial.score is not None else "failed"
         trial.problem = "" if trial.score is not None else f"no evaluation has a {tuning.metric}: is it reported?"
-    elif trainings.stopped_by is not None:
-        return
-    elif pruning is not None and pruning.decided:
+    elif pruned:
         trial.state, trial.score = "pruned", tuning.measure(trial)
     else:
         errors = [line for line in lines if line.startswith("error: ")] or [f"error: exit code {code}", *lines[-1:]]
         trial.state, trial.problem = "failed", errors[0].removeprefix("error: ")
-    if run is not None:
-        # Replay buffers of dozens of trainings that nobody goes on with; their policies stay.
-        files.remove_tree(run.checkpoint(0).parent)
 
 
 def _make_request(tuning: Tuning, trial: Trial) -> TrainRequest:

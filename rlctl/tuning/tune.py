@@ -41,7 +41,7 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
     _require_optuna()
     # It is read before a lock is written into a folder that is none, and again by the holder of the lock.
     tuning = _begin(request, request.task or "") if request.resume is None else load(request.resume)
-    with RunLock(tuning.path):
+    with RunLock(tuning.path, "tuning"):
         return _search(load(tuning.path), jobs)
 
 
@@ -111,8 +111,8 @@ def _search(tuning: Tuning, jobs: int | None) -> Tuning:
         trainings = Trainings(1)
         trainings.run([lambda: train(tuning, first, trainings)], to_go_on)
         tuning.save()
-        if first.state == "failed":
-            raise TaskError(f"{tuning.path}: the recipe as it is failed: {first.problem}")
+        if first.score is None:
+            raise TaskError(f"{tuning.path}: the recipe as it is failed: {first.problem}\nto try again: {to_go_on}")
     content = recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
     for number in range(1, len(tuning.steps) + 1):
         trainings = Trainings(choose_jobs(jobs, tuning.trials_per_step))

@@ -49,13 +49,27 @@ def test_going_on_with_a_table_that_is_there(table):
 
 def test_cutting_back(table):
     add(table, {"steps": 64})
-    size = table.size
+    size, sha256 = table.size, table.digest()
     add(table, {"steps": 128})
     again = Table(table.path)
-    assert again.cut_back(size)
+    assert again.cut_back(size, sha256, 64)
     add(again, {"steps": 128})
     assert table.path.read_text() == "steps\n64\n128\n"
-    assert not Table(table.path).cut_back(10_000)
+    assert not Table(table.path).cut_back(10_000, sha256, 128)
+    assert table.path.read_text() == "steps\n64\n128\n"
+
+
+def test_a_table_that_was_edited_keeps_its_whole_rows(table):
+    """An editor on Windows: each line is a byte longer, so that the size ends in the middle of one."""
+    add(table, {"steps": 64, "success": 0.5})
+    add(table, {"steps": 128, "success": 0.25})
+    size, sha256 = table.size, table.digest()
+    add(table, {"steps": 192, "success": 1})
+    table.path.write_bytes(table.path.read_bytes().replace(b"\n", b"\r\n") + b"a note\r\n19")
+    again = Table(table.path)
+    assert not again.cut_back(size, sha256, 128)
+    add(again, {"steps": 192, "success": 1})
+    assert table.path.read_bytes() == b"steps,success\n64,0.5\n128,0.25\n192,1\n"
 
 
 @pytest.mark.parametrize("room", [0, 1, 3])

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -13,6 +14,7 @@ import pytest
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Gates
 from rlctl.evaluation.group import as_json, evaluate_group
+from rlctl.run.directory import RunLock, is_being_written
 from rlctl.run.group import create_group, find_group, parse_seeds, read_group
 from rlctl.run.lookup import find_policy, find_run
 from rlctl.run.train_request import TrainRequest
@@ -162,6 +164,32 @@ def test_a_signal_stops_all_with_checkpoints(tmp_path):
         run = read_group(path).find_run(seed)
         assert run.status()["status"] == "interrupted"
         assert run.checkpoints()
+
+
+def test_a_group_that_is_being_trained_is_not_resumed(group):
+    with RunLock(group.path, "group"), pytest.raises(UsageError, match=r"another process is writing this group \(pid"):
+        train_seeds(TrainRequest(resume=str(group.path)), None)
+
+
+@pytest.mark.slow
+def test_trainings_end_with_the_process_that_started_them(tmp_path):
+    """It is killed by SIGKILL, which it cannot pass on; then the group can be resumed at once."""
+    options = ["-n", "10000000", "--n-envs", "2", "--jobs", "2", "--no-check", "-o", str(tmp_path)]
+    command = [sys.executable, "-m", "rlctl", "train", LINE, "--seeds", "0-1", *options]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as parent:
+        wait_for(lambda: len(list(tmp_path.glob("*/*/*/run.json"))) == 2)
+        parent.kill()
+    (path,) = tmp_path.glob("*/*_seeds")
+    runs = [read_group(path).find_run(seed) for seed in (0, 1)]
+    wait_for(lambda: not any(is_being_written(run.path) for run in runs))
+    assert not is_being_written(path)
+
+
+def wait_for(condition, timeout_s=120.0):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 def test_what_is_wrong_for_every_seed_is_said_at_once(tmp_path):

@@ -21,6 +21,7 @@ from rlctl.runs.removal import plan_removal
 from rlctl.training.trainings import Trainings
 from rlctl.tuning.tune import tune
 from rlctl.tuning.tune_request import TuneRequest
+from rlctl.tuning.tuning import load
 from tests.training.conftest import ENVS, TINY
 
 LINE = f"{ENVS}:Line"
@@ -32,7 +33,8 @@ class PlayedTrainings:
     """Takes the place of `Trainings.train`: a run whose return is the better, the nearer its values are to the best."""
 
     def __init__(self, monkeypatch):
-        self.calls, self.fails, self.interrupts_at, self.asked = [], lambda settings: False, None, []
+        self.calls, self.fails, self.interrupts_at = [], lambda settings: False, None
+        self.killed_at = None
         self.success = "0.5"
         self.lock = threading.Lock()
         monkeypatch.setattr(Trainings, "train", lambda trainings, *arguments: self.train(trainings, *arguments))
@@ -48,6 +50,8 @@ class PlayedTrainings:
             run = directory.create(LINE, settings["seed"], request.root)
         run.write_status({"task": LINE, "status": "running", "settings": settings})
         run.checkpoint(64).mkdir(parents=True, exist_ok=True)
+        if self.killed_at == len(self.calls):
+            return 137
         if self.interrupts_at == len(self.calls):
             trainings.stopped_by = signal.SIGINT
             return 130
@@ -192,6 +196,38 @@ def test_an_interrupted_tuning_goes_on(played, tmp_path, interrupted_at):
     again = resume(folder, jobs=1)
     assert len(played.calls) == 6
     assert again == tuning
+
+
+@pytest.mark.parametrize("killed_at", [1, 3])
+def test_a_trial_that_was_killed_is_tried_again(played, tmp_path, killed_at):
+    played.killed_at = killed_at
+    if killed_at == 1:
+        with pytest.raises(TaskError, match="the recipe as it is failed: killed by SIGKILL"):
+            begin(tmp_path, RATES, trials=4)
+    else:
+        begin(tmp_path, RATES, trials=4)
+    (folder,) = (tmp_path / "runs").glob("*/*_tune")
+    trial = load(folder).trials[killed_at - 1]
+    assert (trial.state, trial.problem) == ("begun", "killed by SIGKILL")
+    assert load(folder).find_run(trial).checkpoints()
+    tuning = resume(folder, jobs=1)
+    assert {each.state for each in tuning.trials} <= {"done", "pruned"}
+    assert tuning.trials[killed_at - 1].problem == ""
+
+
+def test_nothing_is_removed_in_a_run_that_another_process_holds(played, tmp_path):
+    """The training is still running whose `rlctl tune` was killed."""
+    played.interrupts_at = 2
+    with pytest.raises(Interrupted):
+        begin(tmp_path, RATES, trials=2)
+    (folder,) = (tmp_path / "runs").glob("*/*_tune")
+    run = load(folder).find_run(load(folder).trials[1])
+    played.fails = lambda settings: True
+    with run.lock():
+        tuning = resume(folder, jobs=1)
+    assert tuning.trials[1].state == "begun"
+    assert "another process is writing this run" in tuning.trials[1].problem
+    assert run.checkpoints()
 
 
 def test_several_at_a_time(played, tmp_path):
