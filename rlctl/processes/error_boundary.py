@@ -122,7 +122,7 @@ def _is_out_of_memory(error: BaseException | None) -> bool:
     """Say whether memory was refused: by Python, by the loader of libraries, or by torch."""
     while error is not None:
         text = str(error).lower()
-        refused = isinstance(error, ImportError | OSError | RuntimeError) and any(each in text for each in _NO_MEMORY)
+        refused = isinstance(error, ImportError | OSError | RuntimeError) and any(words in text for words in _NO_MEMORY)
         if isinstance(error, MemoryError) or refused:
             return True
         error = error.__cause__ or error.__context__

@@ -40,7 +40,7 @@ class UnreadableMessageError(OSError):
     """What arrived is not a message."""
 
 
-class _Writer(pickle.Pickler):
+class _MessageWriter(pickle.Pickler):
     def reducer_override(self, value: Any) -> Any:
         """Send numbers, texts and containers of somebody else's classes as built-in ones; refuse other classes."""
         if isinstance(value, np.generic):
@@ -56,7 +56,7 @@ class _Writer(pickle.Pickler):
         return NotImplemented
 
 
-class _Reader(pickle.Unpickler):
+class _MessageReader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         """Return a class of plain data; raises `UnpicklingError` for everything else, which stays unimported."""
         if module in ("rlctl", "builtins") or module.startswith("rlctl.") or (module, name) in _ARRAYS:
@@ -76,14 +76,14 @@ def _is_plain(kind: Any) -> bool:
 def encode(message: Any) -> bytes:
     """Return a message as bytes; raises `TypeError` for what is not plain data."""
     buffer = io.BytesIO()
-    _Writer(buffer, protocol=5).dump(message)
+    _MessageWriter(buffer, protocol=5).dump(message)
     return buffer.getvalue()
 
 
 def decode(content: bytes) -> Any:
     """Return the message of some bytes; raises `UnreadableMessageError` for anything else."""
     try:
-        return _Reader(io.BytesIO(content)).load()
+        return _MessageReader(io.BytesIO(content)).load()
     except Exception as error:  # what the bytes happen to say
         raise UnreadableMessageError(f"not a message of rlctl ({error})") from None
 

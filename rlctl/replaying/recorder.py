@@ -161,7 +161,7 @@ def _make_episode(
     actions = np.array([step.action for step in steps]) if steps else np.zeros((0, *(space.shape or ())))
     observations = dict_spaces.stack([first, *(step.observation for step in steps)])
     raw = _stack_terms([step.raw for step in steps], about)
-    return RecordedEpisode(info, actions, observations, np.array(rewards, np.float64), raw)
+    return RecordedEpisode(actions, observations, np.array(rewards, np.float64), raw, info)
 
 
 def _stack_terms(rows: list[list[float]], about: EnvInfo) -> NDArray[np.float64]:

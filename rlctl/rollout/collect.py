@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.environments.dict_spaces import Observations, join, split
+from rlctl.environments.dict_spaces import join, split
 from rlctl.errors import EpisodeFailed, TaskError
 from rlctl.policy.players.player import Exploration
 from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.workers import Workers
+from rlctl.run.episode import Trajectory
 
 _CONTACTS_MEASURED = 10
 """Of recorded episodes, the first ones; it takes about 3 % of a step."""
@@ -21,20 +22,6 @@ MOST_STEPS = 100_000
 """Of an episode whose environment has no time limit; it may never end."""
 _SEGMENT = 1000
 """Steps after which the main process takes what was recorded of a long episode."""
-
-
-@dataclasses.dataclass
-class Trajectory:
-    """What happened in an episode of T steps."""
-
-    observations: Observations
-    """What each action was chosen from and, last, what the episode ended with: shape (T + 1, ...)."""
-    actions: NDArray[Any]
-    """Shape (T, ...)."""
-    rewards: NDArray[np.float64]
-    """Shape (T,)."""
-    terms: NDArray[np.float64]
-    """Raw reward terms in the order of the task's weights, shape (T, terms)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,9 +113,11 @@ class _Recorder:
         if self._record:
             segment = workers.arrays.segment
             first = 1 if self._parts else 0  # the last observation of the segment before
-            seen = {key: rows[env, first : steps + 1].copy() for key, rows in segment.observation.items()}
-            rows = (segment.action, segment.reward, segment.terms)
-            self._parts.append(Trajectory(seen, *(each[env, :steps].copy() for each in rows)))
+            observations = {key: rows[env, first : steps + 1].copy() for key, rows in segment.observation.items()}
+            actions, rewards, terms = (
+                rows[env, :steps].copy() for rows in (segment.action, segment.reward, segment.terms)
+            )
+            self._parts.append(Trajectory(actions, observations, rewards, terms))
 
     def failed_actions(self, workers: Workers, error: EpisodeFailed) -> NDArray[Any]:
         """Return the actions up to that of the step that failed."""
@@ -140,9 +129,13 @@ class _Recorder:
         if not self._record:
             return None
         parts = self._parts
-        seen = {
+        observations = {
             key: np.concatenate([split(part.observations)[key] for part in parts])
             for key in split(parts[0].observations)
         }
-        names = ("actions", "rewards", "terms")
-        return Trajectory(join(seen), *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return Trajectory(
+            np.concatenate([part.actions for part in parts]),
+            join(observations),
+            np.concatenate([part.rewards for part in parts]),
+            np.concatenate([part.terms for part in parts]),
+        )

@@ -38,22 +38,28 @@ class EpisodeInfo(pydantic.BaseModel, extra="forbid"):
 
 
 @dataclasses.dataclass(frozen=True)
-class RecordedEpisode:
-    """An episode of T steps."""
+class Trajectory:
+    """What happened in T steps of an episode."""
 
-    info: EpisodeInfo
     actions: NDArray[Any]
     """Shape (T, ...)."""
     observations: Observations
-    """Shape (T + 1, ...), or a dict of such: the first is of the reset."""
+    """What each action was chosen from and, last, what the steps ended with: shape (T + 1, ...), or a dict of such."""
     rewards: NDArray[np.float64]
     """Shape (T,)."""
     terms: NDArray[np.float64]
-    """Raw reward terms in the order of `info.term_names`, shape (T, terms)."""
+    """Raw reward terms in the order of the task's weights, shape (T, terms)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedEpisode(Trajectory):
+    """An episode as its file holds it; the reward terms are in the order of `info.term_names`."""
+
+    info: EpisodeInfo
 
 
 def save_episode(path: Path, episode: RecordedEpisode) -> None:
-    """Write an episode, whole or not at all."""
+    """Write an episode, atomically."""
     observations = split(episode.observations)
     parts = {f"observations/{key}" if key else "observations": value for key, value in observations.items()}
     files.write_npz(
@@ -78,7 +84,7 @@ def load_episode(path: Path) -> RecordedEpisode:
     prefix = "observations/"
     parts = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
     observations: Observations = parts or arrays["observations"]
-    episode = RecordedEpisode(info, arrays["actions"], observations, arrays["rewards"], arrays["terms"])
+    episode = RecordedEpisode(arrays["actions"], observations, arrays["rewards"], arrays["terms"], info)
     if (problem := _find_mismatch(episode)) is not None:
         raise ArtifactError(f"{path}: damaged: {problem}")
     return episode

@@ -112,7 +112,7 @@ class Evaluator:
         nothing = np.zeros(0)
         # Of a reset that failed there is no action to take the shape from.
         actions = np.asarray(error.actions).reshape(-1, *(self._goal.spaces()[1].shape or ()))
-        episode = RecordedEpisode(info, actions, nothing, nothing, nothing.reshape(0, 0))
+        episode = RecordedEpisode(actions, nothing, nothing, nothing.reshape(0, 0), info)
         written: list[Path] = []
         self._saver.attempt("failed episode", lambda: written.append(self._write(episode)))
         return error.with_hint(f"to reproduce it: rlctl replay {shlex.quote(str(written[0]))}") if written else error
@@ -135,7 +135,7 @@ class Evaluator:
             term_names=list(self._goal.reward_weights),
             versions=collect_versions(),
         )
-        return RecordedEpisode(info, trajectory.actions, trajectory.observations, trajectory.rewards, trajectory.terms)
+        return RecordedEpisode(**vars(trajectory), info=info)
 
 
 def remove_after(run: RunDirectory, steps: int) -> None:

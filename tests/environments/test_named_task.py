@@ -115,7 +115,7 @@ def test_an_episode_that_names_a_function_runs_nothing(tmp_path):
     mark, path = tmp_path / "ran", tmp_path / "000000.npz"
     spec = EnvSpec("os:system", {"command": f"touch {mark}"})
     info = EpisodeInfo(spec=spec, seed=1, total_reward=0.0)
-    save_episode(path, RecordedEpisode(info, np.zeros((1, 1)), np.zeros((2, 1)), np.zeros(1), np.zeros((1, 0))))
+    save_episode(path, RecordedEpisode(np.zeros((1, 1)), np.zeros((2, 1)), np.zeros(1), np.zeros((1, 0)), info))
     with pytest.raises(ArtifactError, match=r"^a recorded episode names 'os:system' as its task"):
         load_episode(path).info.spec.make()
     assert not mark.exists()

@@ -28,7 +28,7 @@ def path(tmp_path):
 def episode(observations):
     rng = np.random.default_rng(0)
     return RecordedEpisode(
-        INFO, rng.normal(size=(3, 2)).astype(np.float32), observations, rng.normal(size=3), rng.normal(size=(3, 1))
+        rng.normal(size=(3, 2)).astype(np.float32), observations, rng.normal(size=3), rng.normal(size=(3, 1)), INFO
     )
 
 
@@ -101,9 +101,9 @@ def test_of_an_episode_that_failed_there_are_the_actions_alone(path):
     failed = INFO.model_copy(update={"failure": "RuntimeError", "term_names": []})
     nothing = np.zeros(0)
     actions = np.ones((3, 2), np.float32)
-    save_episode(path, RecordedEpisode(failed, actions, nothing, nothing, nothing.reshape(0, 0)))
+    save_episode(path, RecordedEpisode(actions, nothing, nothing, nothing.reshape(0, 0), failed))
     np.testing.assert_array_equal(load_episode(path).actions, actions)
     whole = failed.model_copy(update={"failure": ""})
-    save_episode(path, RecordedEpisode(whole, actions, nothing, nothing, nothing.reshape(0, 0)))
+    save_episode(path, RecordedEpisode(actions, nothing, nothing, nothing.reshape(0, 0), whole))
     with pytest.raises(ArtifactError, match="not 0 of them"):
         load_episode(path)

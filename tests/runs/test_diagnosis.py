@@ -91,7 +91,7 @@ def make_episode(actions, observations=None, terms=None):
     observations = np.zeros((steps + 1, 3), np.float32) if observations is None else observations
     names = ["alive", "progress"]
     info = EpisodeInfo(spec=EnvSpec("reach"), seed=1, total_reward=float(terms.sum()), term_names=names)
-    return RecordedEpisode(info, actions.astype(np.float32), observations, terms.sum(axis=1), terms)
+    return RecordedEpisode(actions.astype(np.float32), observations, terms.sum(axis=1), terms, info)
 
 
 SMOOTH = np.column_stack([np.sin(np.arange(100) / 20), np.cos(np.arange(100) / 20)])

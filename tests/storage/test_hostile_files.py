@@ -33,7 +33,7 @@ class Bait:
 def episode(tmp_path):
     path = tmp_path / "000000.npz"
     rows = np.zeros((3, 2), np.float32)
-    save_episode(path, RecordedEpisode(INFO, rows, np.zeros((4, 5), np.float32), np.zeros(3), np.zeros((3, 1))))
+    save_episode(path, RecordedEpisode(rows, np.zeros((4, 5), np.float32), np.zeros(3), np.zeros((3, 1)), INFO))
     return path
 
 

@@ -33,11 +33,11 @@ def open_world(spec: EnvSpec) -> TaskEnv:
 
 def find_joints(env: TaskEnv) -> dict[str, tuple[Any, int]]:
     """Return the joints of the world by name: the body and the index in its joint arrays."""
-    found: dict[str, tuple[Any, int]] = {}
+    joints: dict[str, tuple[Any, int]] = {}
     for body in env.sim.bodies.values():
         for index, joint in enumerate(body.joint_names):
-            found.setdefault(joint, (body, index))
-    return found
+            joints.setdefault(joint, (body, index))
+    return joints
 
 
 def describe_expected(env: TaskEnv, task: str) -> Expected:

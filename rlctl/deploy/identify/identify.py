@@ -29,7 +29,7 @@ _TOLD_APART = 1.05  # ratio of two delays' errors from which on they differ
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class IdentifiedValue:
     """A value with its 95 % interval."""
 
     name: str
@@ -45,19 +45,19 @@ class Found:
 
 @dataclasses.dataclass(frozen=True)
 class Identification:
-    """What a log says of a task's physical values."""
+    """The physical values of a task that a log determines, and how well."""
 
     task: str
     log: Path
     rows: int
     seconds: float
-    values: list[Found]
+    values: list[IdentifiedValue]
     delay_event: str
     delay: int
     """[control steps]."""
     delay_known: bool
     position_error: tuple[float, float]
-    """Root mean square of the positions' error [rad or m], with the task's own values and with the found ones."""
+    """Root mean square of the positions' error [rad or m], with the task's own values and with the identified ones."""
     velocity_error: tuple[float, float]
     """[rad/s or m/s]."""
     curves: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -66,11 +66,11 @@ class Identification:
     def events(self) -> dict[str, dict[str, Any]]:
         """Return what is known as a recipe's `events`: the intervals, to train on, at least 2 % to each side."""
         settings: dict[str, dict[str, Any]] = {}
-        for each in self.values:
-            if each.known:
-                least = _LEAST_WIDTH * abs(each.value)
-                low, high = min(each.low, each.value - least), max(each.high, each.value + least)
-                settings.setdefault(each.event, {})[each.key] = [_round(low), _round(high)]
+        for value in self.values:
+            if value.known:
+                least = _LEAST_WIDTH * abs(value.value)
+                low, high = min(value.low, value.value - least), max(value.high, value.value + least)
+                settings.setdefault(value.event, {})[value.key] = [_round(low), _round(high)]
         if self.delay_event and self.delay_known:
             settings[self.delay_event] = {"steps": [self.delay, self.delay]}
         return settings
@@ -92,7 +92,7 @@ def identify(
     """Find the values of a task's events, all or those named, with which the simulation follows a log.
 
     Raises `ArtifactError` for a log that cannot be used, `UsageError` for what the task does not have, and `AnswerIsNo`
-    if the log says nothing of any value.
+    if the log contains no information about any value.
     """
     env = open_world(spec)
     try:
@@ -103,33 +103,33 @@ def identify(
         check_actions(log, log_file, np.ravel(space.low), np.ravel(space.high))
         if log.positions.std(axis=0).max() < _STILL:
             raise AnswerIsNo(
-                f"{log_file}: nothing moves in this log, so it says nothing of {', '.join(_list_names(unknowns))}; "
-                f"a trajectory that does: rlctl identify {spec.task} --excite FILE"
+                f"{log_file}: nothing moves in this log, so it contains no information about "
+                f"{', '.join(_list_names(unknowns))}; a trajectory that does: rlctl identify {spec.task} --excite FILE"
             )
         follower = Follower(env, log, unknowns)
         weights = 1.0 / follower.spread
         with SearchWorkers(spec, log, unknowns, n_workers or available_cores()) as workers:
             fits = search(workers, unknowns, weights, seed, report)
         best = min(fits.values(), key=lambda fit: fit.cost)
-        found = _judge(unknowns, best)
+        values = _estimate_values(unknowns, best)
         delay_known = all(fit.cost > _TOLD_APART * best.cost for fit in fits.values() if fit is not best)
-        if not any(each.known for each in found) and not (unknowns.delay and delay_known):
-            notes = "; ".join(dict.fromkeys(each.note for each in found))
+        if not any(value.known for value in values) and not (unknowns.delay and delay_known):
+            notes = "; ".join(dict.fromkeys(value.note for value in values))
             raise AnswerIsNo(
                 f"{log_file}: this log determines none of the values: {notes}\n"
                 f"a trajectory that moves more: rlctl identify {spec.task} --excite FILE"
             )
-        return _summarise(spec.task, log_file, follower, log, best, found, delay_known)
+        return _summarise(spec.task, log_file, follower, log, best, values, delay_known)
     finally:
         env.close()
 
 
 def _list_names(unknowns: Unknowns) -> list[str]:
-    return [*(each.name for each in unknowns.parameters), *([unknowns.delay] if unknowns.delay else [])]
+    return [*(parameter.name for parameter in unknowns.parameters), *([unknowns.delay] if unknowns.delay else [])]
 
 
 def _summarise(
-    task: str, file: Path, follower: Follower, log: Log, best: Fit, found: list[Found], delay_known: bool
+    task: str, file: Path, follower: Follower, log: Log, best: Fit, values: list[IdentifiedValue], delay_known: bool
 ) -> Identification:
     before, after = follower.compare(None, 0), follower.compare(best.at, best.delay)
     count = len(log.joints)
@@ -145,7 +145,7 @@ def _summarise(
         log=file,
         rows=len(log.actions),
         seconds=len(log.actions) * follower.control_dt,
-        values=found,
+        values=values,
         delay_event=follower.unknowns.delay,
         delay=best.delay,
         delay_known=delay_known,
@@ -164,11 +164,11 @@ def _root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.square(values).mean()))
 
 
-def _judge(unknowns: Unknowns, fit: Fit) -> list[Found]:
+def _estimate_values(unknowns: Unknowns, fit: Fit) -> list[IdentifiedValue]:
     """Return each value with its interval, and whether the log determines it."""
     if not unknowns.parameters:
         return []
-    spans = np.array([each.relative_span for each in unknowns.parameters])
+    spans = np.array([parameter.relative_span for parameter in unknowns.parameters])
     # As changes of the values' logarithms (or of the values themselves), not of positions in their ranges.
     information = fit.information / np.outer(spans, spans)
     regular = information + 1e-9 * np.trace(information) * np.eye(len(spans)) + 1e-12 * np.eye(len(spans))
@@ -179,12 +179,14 @@ def _judge(unknowns: Unknowns, fit: Fit) -> list[Found]:
     without_trace = np.diag(information) <= 1e-9 * np.trace(information)
     deviations[without_trace] = alone[without_trace] = 1e6  # whatever the errors are that are left
     return [
-        _judge_one(unknowns, index, fit, float(deviations[index]), float(alone[index]), regular)
+        _estimate_value(unknowns, index, fit, float(deviations[index]), float(alone[index]), regular)
         for index in range(len(spans))
     ]
 
 
-def _judge_one(unknowns: Unknowns, index: int, fit: Fit, deviation: float, alone: float, information: Array) -> Found:
+def _estimate_value(
+    unknowns: Unknowns, index: int, fit: Fit, deviation: float, alone: float, information: Array
+) -> IdentifiedValue:
     parameter, position = unknowns.parameters[index], float(fit.at[index])
     value, half = parameter.value(position), CONFIDENCE * deviation
     if parameter.is_logarithmic:
@@ -199,13 +201,15 @@ def _judge_one(unknowns: Unknowns, index: int, fit: Fit, deviation: float, alone
         note = (
             _explain_unknown(unknowns, index, information)
             if known_alone
-            else f"this log says nothing of {parameter.name}"
+            else f"this log contains no information about {parameter.name}"
         )
     elif min(position, 1 - position) < 0.005:
         end = parameter.low if position < 0.5 else parameter.high
         note = f"at the end of the range it was looked for in, {end:.3g}: is something else different?"
         known = False
-    return Found(parameter.name, parameter.event, parameter.key, value, float(low), float(high), bool(known), note)
+    return IdentifiedValue(
+        parameter.name, parameter.event, parameter.key, value, float(low), float(high), bool(known), note
+    )
 
 
 def _explain_unknown(unknowns: Unknowns, index: int, information: Array) -> str:
@@ -213,7 +217,9 @@ def _explain_unknown(unknowns: Unknowns, index: int, information: Array) -> str:
     sizes, directions = np.linalg.eigh(information)
     shares = np.abs(directions[index]) / np.sqrt(np.maximum(sizes, 1e-12 * sizes[-1]))
     direction = directions[:, int(shares.argmax())]
-    names = [each.name for each, part in zip(unknowns.parameters, direction, strict=True) if abs(part) >= _SHARE]
+    names = [
+        parameter.name for parameter, part in zip(unknowns.parameters, direction, strict=True) if abs(part) >= _SHARE
+    ]
     own: Parameter = unknowns.parameters[index]
     others = [name for name in names if name != own.name] or ["the others"]
     return f"this log cannot tell {own.name} from {' and '.join(others)}"

@@ -109,13 +109,13 @@ def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:
     names = [name.strip() for name in rows[0]]
     if doubled := [name for name in names if names.count(name) > 1]:
         raise ArtifactError(f"{path}: there are two columns {doubled[0]!r}")
-    kept = [(line, row) for line, row in enumerate(rows[1:], start=2) if row]
-    if len(kept) < LEAST_ROWS:
+    numbered = [(line, row) for line, row in enumerate(rows[1:], start=2) if row]
+    if len(numbered) < LEAST_ROWS:
         raise ArtifactError(
-            f"{path}: {len(kept)} rows; a recording of a few seconds is needed, at least {LEAST_ROWS} rows"
+            f"{path}: {len(numbered)} rows; a recording of a few seconds is needed, at least {LEAST_ROWS} rows"
         )
-    values = np.array([_read_row(path, line, row, names) for line, row in kept])
-    return dict(zip(names, values.T, strict=True)), [line for line, _ in kept]
+    values = np.array([_read_row(path, line, row, names) for line, row in numbered])
+    return dict(zip(names, values.T, strict=True)), [line for line, _ in numbered]
 
 
 def _read_row(path: Path, line: int, row: list[str], names: list[str]) -> list[float]:

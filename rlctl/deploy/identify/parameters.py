@@ -1,4 +1,4 @@
-"""What of a task's events can be found from a log: physical values that hold for a whole episode, and the delay."""
+"""The physical values of a task's events that a log can determine: those of a whole episode, and the delay."""
 
 from __future__ import annotations
 
@@ -28,10 +28,12 @@ class Parameter:
 
     @property
     def name(self) -> str:
+        """The name in reports: EVENT.KEY."""
         return f"{self.event}.{self.key}"
 
     @property
     def is_logarithmic(self) -> bool:
+        """Whether a change of the value by a factor counts, and not by a difference."""
         return self.low > 0
 
     def value(self, position: float) -> float:
@@ -80,7 +82,7 @@ def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: st
     """
     for name in chosen:
         check_name(name, events, f"--event: {task} has no event", UsageError)
-    found: list[Parameter] = []
+    parameters: list[Parameter] = []
     delayed, longest = "", 0
     for name, event in events.items():
         ranges = _list_ranges(name, event)
@@ -96,10 +98,10 @@ def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: st
         if is_delay:
             delayed, longest = name, max(5, 2 * int(ranges["steps"][1]))
         else:
-            found += [_make_parameter(name, key, *values, event.nominal(key)) for key, values in ranges.items()]
-    if not found and not delayed:
+            parameters += [_make_parameter(name, key, *values, event.nominal(key)) for key, values in ranges.items()]
+    if not parameters and not delayed:
         raise UsageError(f"{task} has no event with a physical value to find: see rlctl tasks show {task}")
-    return Unknowns(tuple(found), delayed, longest)
+    return Unknowns(tuple(parameters), delayed, longest)
 
 
 def _list_ranges(name: str, event: Event) -> dict[str, tuple[float, float]]:

@@ -9,7 +9,7 @@ import yaml
 
 from rlctl import output
 from rlctl.deploy.identify.excite import Excitation
-from rlctl.deploy.identify.identify import Found, Identification
+from rlctl.deploy.identify.identify import Identification, IdentifiedValue
 
 _PLOT_SIZE = (100, 18)
 _PLOT_POINTS = 400
@@ -35,8 +35,8 @@ def write_fragment(result: Identification) -> str:
 
 
 def _list_lines(result: Identification) -> list[str]:
-    width = max([len(each.name) for each in result.values] + [len(result.delay_event) + 6, len("position error")])
-    lines = [f"{each.name:<{width}}  {_format_value(each)}" for each in result.values]
+    width = max([len(value.name) for value in result.values] + [len(result.delay_event) + 6, len("position error")])
+    lines = [f"{value.name:<{width}}  {_format_value(value)}" for value in result.values]
     if result.delay_event:
         note = "" if result.delay_known else "; this log cannot tell it from one step more or less"
         lines.append(f"{result.delay_event + '.steps':<{width}}  {result.delay}{note}")
@@ -45,10 +45,10 @@ def _list_lines(result: Identification) -> list[str]:
     return lines
 
 
-def _format_value(found: Found) -> str:
-    if found.known:
-        return f"{found.value:.4g}, 95 % in [{found.low:.4g}, {found.high:.4g}]"
-    return f"not known: {found.note}"
+def _format_value(value: IdentifiedValue) -> str:
+    if value.known:
+        return f"{value.value:.4g}, 95 % in [{value.low:.4g}, {value.high:.4g}]"
+    return f"not known: {value.note}"
 
 
 def draw_curves(result: Identification) -> str:

@@ -52,7 +52,7 @@ class Follow:
 
 
 @dataclasses.dataclass(frozen=True)
-class Trial:
+class SearchPoint:
     """A point of the search: positions of the values in their ranges, and a delay [steps]."""
 
     at: list[float]
@@ -63,7 +63,7 @@ class Trial:
 class ComputeCosts:
     """What a worker is asked: the cost of each trial."""
 
-    trials: list[Trial]
+    trials: list[SearchPoint]
     weights: Array
 
 
@@ -71,7 +71,7 @@ class ComputeCosts:
 class FindFit:
     """What a worker is asked: the best fit near a trial."""
 
-    start: Trial
+    start: SearchPoint
     weights: Array
     evaluations: int
 
@@ -132,7 +132,7 @@ def search(
     follow_up([FindFit(start, weights, _EVALUATIONS) for start in starts])
     best = _best(fits)
     while beside := [d for d in (best.delay - 1, best.delay + 1) if 0 <= d <= _LONGEST_DELAY and d not in fits]:
-        follow_up([FindFit(Trial(best.at.tolist(), delay), weights, _EVALUATIONS) for delay in beside])
+        follow_up([FindFit(SearchPoint(best.at.tolist(), delay), weights, _EVALUATIONS) for delay in beside])
         if _best(fits).delay == best.delay:
             break
         best = _best(fits)
@@ -142,7 +142,7 @@ def search(
     near = [d for d in (best.delay - 1, best.delay, best.delay + 1) if d in fits]
     fits = {}
     evaluations = {delay: _LAST_EVALUATIONS if delay == best.delay else _EVALUATIONS for delay in near}
-    follow_up([FindFit(Trial(best.at.tolist(), delay), weights, evaluations[delay]) for delay in near])
+    follow_up([FindFit(SearchPoint(best.at.tolist(), delay), weights, evaluations[delay]) for delay in near])
     return fits
 
 
@@ -150,21 +150,21 @@ def _best(fits: dict[int, Fit]) -> Fit:
     return min(fits.values(), key=lambda fit: fit.cost)
 
 
-def _make_trials(unknowns: Unknowns, seed: int) -> list[Trial]:
+def _make_trials(unknowns: Unknowns, seed: int) -> list[SearchPoint]:
     """Return the built world with every delay, then points all over the ranges, with every delay in turn."""
     from scipy.stats import qmc
 
     size = len(unknowns.parameters)
     delays = range(unknowns.longest_delay + 1)
-    built = [Trial([parameter.first for parameter in unknowns.parameters], delay) for delay in delays]
+    built = [SearchPoint([parameter.first for parameter in unknowns.parameters], delay) for delay in delays]
     if size == 0:
         return built
     count = max(len(delays), _TRIALS * (size + 1))
     points = qmc.Halton(size, seed=seed).random(count).tolist()
-    return built + [Trial(point, delays[index % len(delays)]) for index, point in enumerate(points)]
+    return built + [SearchPoint(point, delays[index % len(delays)]) for index, point in enumerate(points)]
 
 
-def _choose_starts(built: Trial, ranked: list[Trial]) -> list[Trial]:
+def _choose_starts(built: SearchPoint, ranked: list[SearchPoint]) -> list[SearchPoint]:
     """Return the best trial of each of the best delays, then the next best ones, and the built world."""
     firsts = list({trial.delay: trial for trial in reversed(ranked)}.values())
     firsts = [trial for trial in ranked if trial in firsts][:_STARTS]
@@ -191,7 +191,7 @@ def main(connection: Connection) -> None:
     answer_messages(connection, answer, describe_failure)
 
 
-def _compute_cost(follower: Follower, trial: Trial, weights: Array) -> float:
+def _compute_cost(follower: Follower, trial: SearchPoint, weights: Array) -> float:
     cost = float(np.square(follower.compare(np.array(trial.at), trial.delay) * weights).mean())
     return cost if np.isfinite(cost) else np.inf  # a simulation that diverged costs more than any other
 

@@ -8,11 +8,11 @@ import pytest
 
 from rlctl.deploy.identify.excite import write_excitation
 from rlctl.deploy.identify.follow import Follower, open_world
-from rlctl.deploy.identify.identify import _judge, identify
+from rlctl.deploy.identify.identify import _estimate_values, identify
 from rlctl.deploy.identify.log import Expected, Log, read_log, write_log
 from rlctl.deploy.identify.parameters import Parameter, Unknowns
 from rlctl.deploy.identify.report import show, write_fragment
-from rlctl.deploy.identify.search import Fit, Trial, _choose_starts, _make_trials
+from rlctl.deploy.identify.search import Fit, SearchPoint, _choose_starts, _make_trials
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
@@ -120,11 +120,15 @@ def test_values_that_the_log_cannot_tell_apart_are_named(real):
 
 def test_a_log_that_tells_nothing_is_told_so(real, tmp_path):
     # Nothing is touched, so friction leaves no trace.
-    with pytest.raises(AnswerIsNo, match=r"determines none of the values: this log says nothing of friction\.friction"):
+    with pytest.raises(
+        AnswerIsNo, match=r"none of the values: this log contains no information about friction\.friction"
+    ):
         identify(SPEC, real, events=["friction"], n_workers=1)
     still = tmp_path / "still.csv"
     write_log(still, Log(EXPECTED.driven, *(np.zeros((40, 2)) for _ in range(3))), EXPECTED)
-    with pytest.raises(AnswerIsNo, match=r"nothing moves in this log, so it says nothing of mass\.factor, late"):
+    with pytest.raises(
+        AnswerIsNo, match=r"nothing moves in .*, so it contains no information about mass\.factor, late"
+    ):
         identify(SPEC, still, events=["mass", "late"])
 
 
@@ -233,14 +237,14 @@ def test_a_value_without_a_trace_is_not_known_in_a_log_without_noise():
     parameters = tuple(Parameter(name, "factor", 0.5, 2.0) for name in ("mass", "friction"))
     errors = np.full(4, 1e-9)
     fit = Fit(np.full(2, 0.5), 0, 1e-12, np.diag([1e4, 0.0]), errors, 50.0)
-    mass, friction = _judge(Unknowns(parameters), fit)
+    mass, friction = _estimate_values(Unknowns(parameters), fit)
     assert mass.known
-    assert (friction.known, friction.note) == (False, "this log says nothing of friction.factor")
+    assert (friction.known, friction.note) == (False, "this log contains no information about friction.factor")
 
 
 def test_the_built_world_is_tried_first():
     mass = Parameter("mass", "factor", 0.5, 2.0, 1.0)
     unknown = Parameter("friction", "friction", 0.1, 2.0)
     trials = _make_trials(Unknowns((mass, unknown), "late", 1), 0)
-    assert trials[:2] == [Trial([pytest.approx(0.5), 0.5], delay) for delay in (0, 1)]
+    assert trials[:2] == [SearchPoint([pytest.approx(0.5), 0.5], delay) for delay in (0, 1)]
     assert _choose_starts(trials[0], trials[1:])[-1] == trials[0]
