@@ -15,12 +15,16 @@ def collect_versions() -> dict[str, str]:
 @functools.cache  # each is read from a file, and every checkpoint needs them
 def _read_versions() -> dict[str, str]:
     import platform
-    from importlib.metadata import PackageNotFoundError, version
+    from importlib.metadata import PackageNotFoundError, distribution
 
     versions = {"python": platform.python_version(), "rlctl": __version__}
-    for library in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet"):
+    for library in ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet", "mujoco"):
         try:
-            versions[library] = version(library)
+            installed = distribution(library)
         except PackageNotFoundError:
             continue
+        versions[library] = installed.version
+        if library == "pybullet":  # a wheel and a build from source differ in the last bits of a simulation
+            tags = [line.removeprefix("Tag: ") for line in (installed.read_text("WHEEL") or "").splitlines()]
+            versions["pybullet build"] = next((tag for tag in tags if tag.startswith("cp")), "unknown")
     return versions

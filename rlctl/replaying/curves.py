@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import split_names
 from rlctl.replaying.recorder import Rollout
-from rlctl.replaying.scene import Scene, encode_jpeg
+from rlctl.replaying.scene import BodyMotion, Scene, encode_jpeg
 
 Color = tuple[int, int, int]
 # Distinct on the viewer's dark and light background; the first eight also to colour-blind eyes.
@@ -60,6 +60,26 @@ class Plot:
     entity: str
     kind: str
     """reward, action, joints, observation or image."""
+    values: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    """What it shows, shape (rows, curves)."""
+
+    @property
+    def legend(self) -> tuple[str, tuple[float, float]]:
+        """The corner in which a legend needs the least room, and a range of the values with which it covers none.
+
+        A legend is taken to cover a third of the width, and a tenth of the height for each of at most six curves.
+        """
+        values = self.values[np.isfinite(self.values).all(axis=1)] if self.values.size else np.zeros((1, 1))
+        values = values if len(values) else np.zeros((1, 1))
+        share, part = min(0.1 * values.shape[1], 0.6), -(-len(values) // 3)
+        low, high = float(values.min()), float(values.max())
+        low, high = (low - 0.5, high + 0.5) if low == high else (low, high)
+        ranges = {}
+        for side, rows in (("Right", values[-part:]), ("Left", values[:part])):
+            ranges[f"{side}Top"] = low, max(high, low + (float(rows.max()) - low) / (1 - share))
+            ranges[f"{side}Bottom"] = min(low, high - (high - float(rows.min())) / (1 - share)), high
+        corner = min(ranges, key=lambda name: ranges[name][1] - ranges[name][0])
+        return corner, ranges[corner]
 
 
 def send_curves(rollout: Rollout, timelines: Timelines) -> list[Plot]:
@@ -104,14 +124,17 @@ def _rewards(rollout: Rollout, timelines: Timelines) -> list[Plot]:
         _send(timelines, entity, 1, rollout.weighted_terms[:, index : index + 1], [name], colors=[color])
     if rollout.successes is not None:
         _send(timelines, "success", 1, rollout.successes[:, None], ["success"], colors=[_PALETTE[2]])
-    return [Plot("reward, by weighted term" if names else "reward", "reward", "reward")]
+    shown = np.concatenate([rewards, rollout.weighted_terms], axis=1)
+    return [Plot("reward, by weighted term" if names else "reward", "reward", "reward", shown)]
 
 
 def _actions(rollout: Rollout, timelines: Timelines) -> list[Plot]:
     actions = rollout.episode.actions.reshape(rollout.length, math.prod(rollout.episode.actions.shape[1:]))
-    _send(timelines, "action", 1, actions, _numbered("action", actions.shape[1]))
+    joints, count = rollout.env.joints, actions.shape[1]
+    names = list(joints.names) if joints is not None and len(joints.names) == count else _numbered("action", count)
+    _send(timelines, "action", 1, actions, names)
     meaning = rollout.env.action_meaning
-    return [Plot(f"action: {meaning}" if meaning else "action", "action", "action")]
+    return [Plot(f"action: {meaning}" if meaning else "action", "action", "action", actions)]
 
 
 def _joints(scene: Scene, timelines: Timelines) -> list[Plot]:
@@ -123,10 +146,15 @@ def _joints(scene: Scene, timelines: Timelines) -> list[Plot]:
         _send(timelines, velocities, 0, body.joint_velocities, names)
     if not robots:
         return []
+    shown = [np.concatenate(values, axis=1) for values in zip(*map(_joint_states, robots), strict=True)]
     return [
-        Plot("joint positions", "joints/position", "joints"),
-        Plot("joint velocities", "joints/velocity", "joints"),
+        Plot("joint positions", "joints/position", "joints", shown[0]),
+        Plot("joint velocities", "joints/velocity", "joints", shown[1]),
     ]
+
+
+def _joint_states(body: BodyMotion) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return body.joint_positions, body.joint_velocities
 
 
 def _numbered(name: str, count: int) -> list[str]:
@@ -146,7 +174,7 @@ def _observations(rollout: Rollout, timelines: Timelines) -> list[Plot]:
         flat = values.reshape(len(values), -1)
         shown = flat[:, :_MOST_SERIES]
         _send(timelines, entity, 0, shown, _numbered(name or "observation", flat.shape[1])[: shown.shape[1]])
-        plots.append(Plot(f"{title} [{unit}]" if unit else title, entity, "observation"))
+        plots.append(Plot(f"{title} [{unit}]" if unit else title, entity, "observation", shown))
     return plots
 
 

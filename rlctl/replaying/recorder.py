@@ -26,6 +26,9 @@ Choose = Callable[[Any, int], Any]
 Watch = Callable[[int], None]
 """Looks at an environment after a step; 0 is the reset."""
 
+ONLY_OF_POLICIES = ("torch", "stable-baselines3", "sb3-contrib")
+"""What policies depend on and episodes, whose actions are recorded, do not."""
+
 
 @dataclasses.dataclass(frozen=True)
 class LogEntry:

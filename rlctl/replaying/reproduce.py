@@ -9,6 +9,7 @@ from rlctl import output
 from rlctl.errors import UsageError
 from rlctl.replaying.difference import find_difference
 from rlctl.replaying.recorder import (
+    ONLY_OF_POLICIES,
     Rollout,
     check_actions,
     current_versions,
@@ -76,5 +77,6 @@ def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verif
     with closing(spec.make()) as env:
         rollout = play_episode(env, spec, info.seed, recorded_actions(episode, env, path), policy=info.policy)
     now = current_versions(spec.task)
-    other = {name: (version, now.get(name)) for name, version in info.versions.items() if now.get(name) != version}
+    relevant = {name: version for name, version in info.versions.items() if name not in ONLY_OF_POLICIES}
+    other = {name: (version, now.get(name)) for name, version in relevant.items() if now.get(name) != version}
     return rollout, Verification(path, find_difference(episode, rollout), other)

@@ -25,7 +25,7 @@ from rlctl.storage import files
 Followed = tuple[str, BodyMotion] | None
 """What the camera follows: an entity, and the body that it is of."""
 
-_LEVEL_COLORS = {"INFO": 0xB0D0FFFF, "WARN": 0xFFC060FF, "DEBUG": 0xB0B0B0FF}
+_LEVEL_COLORS = {"INFO": 0x3D7DD8FF, "WARN": 0xC06A00FF, "DEBUG": 0x787878FF}  # read on white and on black
 _EYE_DIRECTION = np.array([1.0, 0.75, 0.5])  # from the front left, looking down
 _GOAL_MARGIN = 2.5  # distance of the eye in distances of the goal; from 1.9 on it is in a view of 55 degrees
 _PLOT_ROWS = (("reward",), ("action",), ("joints", "observation"))  # by kind; those of a row are tabs
@@ -46,17 +46,16 @@ def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: 
     )
     stream.set_log_time_enabled(False)
 
-    def write(part: Path) -> None:
-        try:
-            with stream:
-                # What is sent before `save` waits in memory: the layout is known only at the end.
-                layout = _send(stream, rollout, title, warn, several)
-                stream.save(part, default_blueprint=layout)
-                stream.flush()
-        except RuntimeError as error:  # what Rerun raises when the disk is full
-            raise ArtifactError(f"{path}: cannot be written: {error}") from error
-
-    files.write_with(path, write)
+    with stream:
+        layout = _send(stream, rollout, title, warn, several)
+        # Into memory: where the disk is full, what writes files in Rerun can wait for ever.
+        recording = stream.memory_recording()
+        stream.send_blueprint(layout, make_active=False, make_default=True)
+        content = recording.drain_as_bytes()
+    try:
+        files.write_bytes(path, content)
+    except OSError as error:
+        raise ArtifactError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def _recording_id(episode: RecordedEpisode) -> str:
@@ -157,8 +156,13 @@ def _curves(plots: Sequence[Plot]) -> rrb.Container:
 
 
 def _plot(plot: Plot) -> rrb.TimeSeriesView:
-    legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=True)
-    return rrb.TimeSeriesView(name=plot.title, origin=f"/{plot.entity}", plot_legend=legend)
+    corner, span = plot.legend
+    return rrb.TimeSeriesView(
+        name=plot.title,
+        origin=f"/{plot.entity}",
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.auto(corner), visible=True),
+        axis_y=rrb.ScalarAxis(range=span),
+    )
 
 
 def _world(scene: Scene, followed: Followed) -> rrb.Spatial3DView:

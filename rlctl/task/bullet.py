@@ -72,3 +72,27 @@ def read_complaint(call: Callable[[], object]) -> str:
         file.seek(0)
         text = file.read().decode(errors="replace")
     return " ".join(re.sub(r"b3(Error|Warning)\[.*\]:", " ", text).split())
+
+
+def check_display() -> None:
+    """Raise `UsageError` where PyBullet's window cannot open: PyBullet itself would end the process."""
+    if sys.platform != "linux":
+        return
+    display, instead = os.environ.get("DISPLAY"), "leave out --gui (in Python: render_mode) to do without"
+    if not display:
+        raise UsageError(f"PyBullet's window needs a display, and DISPLAY is not set; {instead}")
+    if not _x_server_answers():
+        raise UsageError(f"PyBullet's window needs a display, and no X server answers at {display}; {instead}")
+
+
+def _x_server_answers() -> bool:
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")  # the one that PyBullet itself loads
+    except OSError:
+        return False
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
+    connection = x11.XOpenDisplay(None)
+    if connection:
+        x11.XCloseDisplay(connection)
+    return bool(connection)

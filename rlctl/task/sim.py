@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body
-from rlctl.task.bullet import pybullet, pybullet_data, read_complaint
+from rlctl.task.bullet import check_display, pybullet, pybullet_data, read_complaint
 from rlctl.task.constraints import Constraints
 
 
@@ -47,6 +47,8 @@ class Sim(Constraints):
     """
 
     def __init__(self, *, control_dt: float, substeps: int, solver_iterations: int = 50, gui: bool = False) -> None:
+        if gui:
+            check_display()
         self.client: int = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self.client < 0:
             raise TaskError("PyBullet could not open a window: is there a display? Leave out --gui to do without.")

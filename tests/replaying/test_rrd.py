@@ -1,11 +1,13 @@
 import json
+import resource
 
 import numpy as np
 import pytest
 
 from rlctl.environments.dict_spaces import split_names
 from rlctl.errors import ArtifactError
-from rlctl.replaying.rrd import write_rrd
+from rlctl.replaying.curves import Plot
+from rlctl.replaying.rrd import _LEVEL_COLORS, write_rrd
 from rlctl.task import rough_heights
 from tests.replaying.conftest import play, reach
 from tests.replaying.reading import column, entities, properties, reader, static
@@ -131,16 +133,55 @@ def test_same_episode_same_recording_id(recording, tmp_path):
     assert ids[0] == ids[1] != ids[2]
 
 
-def test_file_appears_whole_or_not_at_all(reached, tmp_path, monkeypatch):
-    import rerun
-
-    def full(self, **_):
-        raise RuntimeError("no space left")
-
-    monkeypatch.setattr(rerun.RecordingStream, "flush", full)
-    with pytest.raises(ArtifactError, match=r"reach\.rrd: cannot be written: no space left"):
-        write_rrd(tmp_path / "reach.rrd", reached, title="reach", warn=print)
+def test_a_full_disk_is_an_error_of_one_line(reached, tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        with pytest.raises(ArtifactError, match=r"reach\.rrd: cannot be written: File too large"):
+            write_rrd(tmp_path / "reach.rrd", reached, title="reach", warn=print)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_actions_are_named_by_joints(recording, reached):
+    assert static(recording, "/action", "SeriesLines:names") == list(reached.env.joints.names)
+
+
+@pytest.mark.parametrize(
+    ("values", "corner"),
+    [
+        (np.linspace(0, 1, 90)[:, None], "RightBottom"),
+        (np.linspace(1, 0, 90)[:, None], "RightTop"),
+        (np.random.default_rng(0).normal(size=(90, 7)), None),
+        (np.full((5, 2), 3.0), None),
+        (np.zeros((0, 2)), None),
+        (np.full((3, 1), np.nan), None),
+    ],
+)
+def test_a_legend_covers_no_curve(values, corner):
+    chosen, (low, high) = Plot("p", "p", "action", values).legend
+    assert corner in (None, chosen)
+    assert low < high
+    if not np.isfinite(values).all() or not values.size:
+        return
+    height, third = (high - low) * min(0.1 * values.shape[1], 0.6), len(values) // 3
+    near = values[-third:] if chosen.startswith("Right") else values[:third]
+    assert near.max() <= high - height + 1e-9 if chosen.endswith("Top") else near.min() >= low + height - 1e-9
+
+
+def luminance(color: int) -> float:
+    """Return the relative luminance of 0xRRGGBBAA, by WCAG 2."""
+    channels = [(color >> shift & 0xFF) / 255 for shift in (24, 16, 8)]
+    linear = [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in channels]
+    return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
+
+
+@pytest.mark.parametrize("background", [0xFFFFFFFF, 0x0D1011FF], ids=["light", "dark"])
+def test_events_are_readable_in_both_themes(background):
+    for color in _LEVEL_COLORS.values():
+        low, high = sorted([luminance(color), luminance(background)])
+        assert (high + 0.05) / (low + 0.05) > 3.9
 
 
 def test_free_body_moves_by_its_link_frame(tumble):

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from rlctl.errors import RecipeError, TaskError
+from rlctl.errors import RecipeError, TaskError, UsageError
 from rlctl.task import Box, Task
 from rlctl.task.env import TaskEnv
 from tests.task.tasks import Bounded, Buttons, ByName, Plain, Slider
@@ -297,3 +297,10 @@ def test_gymnasiums_own_checker_is_content(make):
     from gymnasium.utils.env_checker import check_env
 
     check_env(make(Bounded(start=0.0)), skip_render_check=True)
+
+
+@pytest.mark.parametrize(("display", "why"), [("", "DISPLAY is not set"), (":9876", "no X server answers at :9876")])
+def test_a_window_without_a_display_does_not_end_the_process(monkeypatch, display, why):
+    monkeypatch.setenv("DISPLAY", display)
+    with pytest.raises(UsageError, match=f"PyBullet's window needs a display, and {why}; leave out --gui"):
+        TaskEnv(Slider(), render_mode="human")
