@@ -58,7 +58,10 @@ def play(program, *arguments):
 def test_loop_with_the_c_function(rlctl, tmp_path):
     done = rlctl("export", "reach", "--pretrained", "--c", "-o", "policy.c", timeout=300)
     assert done.returncode == 0, done.stderr
-    assert "period: 0.0166667 s" in play(build(tmp_path, f"-DPOLICY_C={tmp_path / 'policy.c'}"))
+    said = play(build(tmp_path, f"-DPOLICY_C={tmp_path / 'policy.c'}"))
+    assert "period: 0.0166667 s" in said
+    assert "joint_positions (7) [rad], joint_velocities (7) [rad/s]" in said
+    assert "action: 7 elements: lbr_iiwa_joint_1 (-1 to 1), " in said
 
 
 @pytest.fixture
@@ -97,4 +100,4 @@ def test_loop_with_onnx_runtime(rlctl, tmp_path, onnxruntime):
     assert done.returncode == 0, done.stderr
     program = build(tmp_path, f"-DONNXRUNTIME_DIR={onnxruntime}")
     said = play(program, tmp_path / "policy.onnx")
-    assert "joint_positions (7), joint_velocities (7)" in said
+    assert "joint_positions (7) [rad], joint_velocities (7) [rad/s]" in said

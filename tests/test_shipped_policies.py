@@ -10,6 +10,7 @@ from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.score import measure_score
 from rlctl.exporting.policy_file import export_actor
+from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
 from rlctl.recipe.sources import resolve_packaged
@@ -99,7 +100,7 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
     run.write_status({"task": "reach", "git_commit": "abc"})
     run.write_recipe(resolve_packaged("reach"))
     target = tmp_path / "reach.safetensors"
-    report = export_actor(str(run.path), checkpoint="best", target=target, episodes=3)
+    report = export_actor(ExportRequest(str(run.path), checkpoint="best", policy=target, episodes=3))
     policy = PolicyFile.read(target)
     written, actor = policy.info, policy.tensors
     assert actor.keys() == tensors.keys()
@@ -113,20 +114,20 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
     assert scores["random"].action_change == pytest.approx(2 / 3, abs=0.05)  # two uniform numbers in [-1, 1]
     assert scores["policy"].mean_return > scores["zero"].mean_return
     with pytest.raises(UsageError, match=r"policy.txt: the name of a policy file ends in .safetensors"):
-        export_actor(str(run.path), checkpoint="best", target=tmp_path / "policy.txt")
+        export_actor(ExportRequest(str(run.path), checkpoint="best", policy=tmp_path / "policy.txt"))
     PolicyFile(info, tensors).write(target)
     with pytest.raises(UsageError, match="no recipe is known of this policy; give the run"):
-        export_actor(str(target), checkpoint="best", target=tmp_path / "other.safetensors")
+        export_actor(ExportRequest(str(target), checkpoint="best", policy=tmp_path / "other.safetensors"))
     (tmp_path / "policy.onnx").touch()
     with pytest.raises(UsageError, match=r"policy.onnx: no recipe is known of this policy; give the run"):
-        export_actor(str(tmp_path / "policy.onnx"), checkpoint="best", target=target)
+        export_actor(ExportRequest(str(tmp_path / "policy.onnx"), checkpoint="best", policy=target))
 
 
 def test_a_shipped_policy_is_measured_anew(tmp_path):
     shipped = PolicyFile.read_info(find_shipped_policy("reach")).provenance
     target = tmp_path / "reach.safetensors"
     for source, checkpoint in (("reach", "pretrained"), (str(target), "best")):  # the second in its own place
-        again = export_actor(source, checkpoint=checkpoint, target=target, episodes=2).provenance
+        again = export_actor(ExportRequest(source, checkpoint=checkpoint, policy=target, episodes=2)).provenance
         assert (again.run, again.recipe, again.git_commit) == (shipped.run, shipped.recipe, shipped.git_commit)
         assert again.source_sha256 == shipped.source_sha256
         assert again.score.episodes == 2

@@ -10,7 +10,17 @@ class CPolicy : public Policy {
   CPolicy() {
     description_.observation_size = POLICY_OBSERVATION_SIZE;
     description_.action_size = POLICY_ACTION_SIZE;
-    description_.control_dt = POLICY_CONTROL_DT;  // the bounds are inside the function, the names in its header
+    description_.control_dt = POLICY_CONTROL_DT;
+    for (int i = 0; i < POLICY_OBSERVATION_PARTS; ++i) {
+      description_.observation_names.emplace_back(policy_observation_names[i]);
+      description_.observation_units.emplace_back(policy_observation_units[i]);
+      description_.observation_sizes.push_back(policy_observation_sizes[i]);
+    }
+    for (int i = 0; i < POLICY_ACTION_SIZE; ++i) {
+      description_.action_names.emplace_back(policy_action_names[i]);
+      description_.low.push_back(policy_action_low[i]);
+      description_.high.push_back(policy_action_high[i]);
+    }
   }
   const Description& description() const override { return description_; }
   void reset() override {}

@@ -37,10 +37,14 @@ void describe(const Description& about) {
   std::cerr << "observation: " << about.observation_size << " elements";
   for (std::size_t i = 0; i < about.observation_names.size() && i < about.observation_sizes.size(); ++i) {
     std::cerr << (i == 0 ? ": " : ", ") << about.observation_names[i] << " (" << about.observation_sizes[i] << ")";
+    if (i < about.observation_units.size() && !about.observation_units[i].empty()) {
+      std::cerr << " [" << about.observation_units[i] << "]";
+    }
   }
   std::cerr << "\naction: " << about.action_size << " elements";
-  for (std::size_t i = 0; i < about.joint_names.size(); ++i) {
-    std::cerr << (i == 0 ? ": " : ", ") << about.joint_names[i];
+  for (std::size_t i = 0; i < about.action_names.size(); ++i) {
+    std::cerr << (i == 0 ? ": " : ", ") << about.action_names[i];
+    if (i < about.low.size() && i < about.high.size()) std::cerr << " (" << about.low[i] << " to " << about.high[i] << ")";
   }
   std::cerr << "\nperiod: " << about.control_dt << " s\n";
 }

@@ -74,7 +74,8 @@ class OnnxPolicy : public Policy {
     for (const auto& size : split(look_up("observation_sizes"))) {
       description_.observation_sizes.push_back(std::stoi(size));
     }
-    description_.joint_names = split(look_up("joint_names"));
+    description_.observation_units = split(look_up("observation_units"));
+    description_.action_names = split(look_up("joint_names"));
     for (const auto& value : split(look_up("action_low"))) description_.low.push_back(std::stof(value));
     for (const auto& value : split(look_up("action_high"))) description_.high.push_back(std::stof(value));
     const std::string period = look_up("control_dt");  // "0.02 s"

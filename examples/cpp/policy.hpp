@@ -7,8 +7,9 @@
 
 struct Description {
   std::vector<std::string> observation_names;  // in the order of the observation; empty if not known
+  std::vector<std::string> observation_units;  // a unit per name, "" if not known
   std::vector<int> observation_sizes;          // elements per name
-  std::vector<std::string> joint_names;        // in the order of the action; empty if not known
+  std::vector<std::string> action_names;       // in the order of the action, joints if known; empty if not known
   int observation_size = 0;
   int action_size = 0;
   double control_dt = 0.0;         // [s]

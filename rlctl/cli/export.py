@@ -9,6 +9,7 @@ import typer
 
 from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Run, choose_checkpoint, claim_stdout
 from rlctl.errors import UsageError
+from rlctl.exporting.request import ExportRequest, Format
 
 
 def export(
@@ -32,16 +33,17 @@ def export(
     """Turn a policy into a self-contained ONNX file or C source, and verify that it acts the same."""
     claim_stdout()
     checkpoint = choose_checkpoint(checkpoint, pretrained)
+    if policy is not None and (output is not None or onnx or c):
+        raise UsageError("--policy FILE writes that file and no other: leave out --output, --onnx and --c")
+    wanted: dict[Format, bool] = {"onnx": onnx or not c, "c": c}
+    formats = tuple(name for name, is_wanted in wanted.items() if is_wanted)
+    request = ExportRequest(run, formats, checkpoint, output, policy)
     if policy is not None:
-        if output is not None or onnx or c:
-            raise UsageError("--policy FILE writes that file and no other: leave out --output, --onnx and --c")
         from rlctl.exporting import policy_file
 
-        policy_file.show(policy_file.export_actor(run, checkpoint=checkpoint, target=policy), json)
+        policy_file.show(policy_file.export_actor(request), json)
         return
-    from rlctl.exporting.export import Format, export_policy
+    from rlctl.exporting.export import export_policy
     from rlctl.exporting.report import show
 
-    wanted: dict[Format, bool] = {"onnx": onnx or not c, "c": c}
-    formats = [name for name, is_wanted in wanted.items() if is_wanted]
-    show(export_policy(run, formats, checkpoint=checkpoint, output=output), json)
+    show(export_policy(request), json)

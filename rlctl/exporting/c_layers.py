@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -191,10 +191,8 @@ class CWriter:
 
     def _define(self, name: str, values: NDArray[Any], kind: str = "float") -> str:
         name = self._number(name)
-        numbers = [write_number(each, kind) for each in values]
-        rows = [", ".join(numbers[low : low + _PER_LINE]) for low in range(0, len(numbers), _PER_LINE)]
-        body = ",\n    ".join(rows)
-        self.constants.append(f"static const {kind} {name}[{len(values)}] = {{\n    {body},\n}};\n")
+        numbers = [write_number(value, kind) for value in values]
+        self.constants.append(write_array(f"static const {kind} {name}", numbers))
         return name
 
     def _add_linear(self, weight: NDArray[Any], source: str, inputs: int, target: str) -> None:
@@ -219,8 +217,17 @@ def _offset(offset: int) -> str:
     return f"{offset} + i" if offset else "i"
 
 
+def write_array(declaration: str, values: Sequence[str]) -> str:
+    """Return the definition of an array; `declaration` has its type and name."""
+    rows = [", ".join(values[low : low + _PER_LINE]) for low in range(0, len(values), _PER_LINE)]
+    body = ",\n    ".join(rows)
+    return f"{declaration}[{len(values)}] = {{\n    {body},\n}};\n"
+
+
 def write_number(value: Any, kind: str) -> str:
     """Return a number as C reads it back, bit for bit."""
+    if kind == "int":
+        return str(int(value))
     if np.isinf(value):
         return "INFINITY" if value > 0 else "-INFINITY"
     return f"{np.float32(value)!s}f" if kind == "float" else repr(float(value))

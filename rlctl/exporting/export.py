@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.report import ExportReport, format_agreement, format_closed_loop
+from rlctl.exporting.request import ExportRequest
 from rlctl.output import print_notes
 from rlctl.policy import onnx_file
 from rlctl.policy.file import PolicyFile, PolicyInfo
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from rlctl.exporting.verify import Agreement, ClosedLoop
     from rlctl.policy.torch_policy import TorchPolicy
 
-Format = Literal["onnx", "c"]
 C_OBSERVATIONS = 2000
 """On which a C function is compared."""
 
@@ -41,28 +40,21 @@ class _Export(NamedTuple):
     workers: Workers
 
 
-def export_policy(
-    run: str | None, formats: Sequence[Format], *, checkpoint: str, output: Path | None
-) -> list[ExportReport]:
+def export_policy(request: ExportRequest) -> list[ExportReport]:
     """Export a policy in one or more formats and verify each file in the policy's own environment.
 
-    `run` is what the user typed: a run, a policy file, or None for the latest run. Files are written to `output`, by
-    default into the run's folder, beside a policy file that belongs to none, or here for a shipped policy; of several
-    formats each has its own suffix. Raises `UsageError` for a policy that has no such form, and `AnswerIsNo` with the
-    numbers if a file does not act as the policy does; then that file is not left.
+    Of several formats each file has its own suffix. Raises `UsageError` for a policy that has no such form, and
+    `AnswerIsNo` with the numbers if a file does not act as the policy does; then that file is not left.
     """
-    found = lookup.find_policy(run, checkpoint)
+    found, formats, output = lookup.find_policy(request.run, request.checkpoint), request.formats, request.output
     print_notes(found.notes)
     if found.file.suffix == ".onnx":
         raise UsageError(f"{found.file}: an ONNX file already; export the run or its .safetensors file")
     if output is None:
-        beside = Path() if checkpoint == PRETRAINED else found.file.parent
+        beside = Path() if request.checkpoint == PRETRAINED else found.file.parent
         output = found.run.onnx_file if found.run else beside / found.file.name
         output = output.with_suffix(f".{formats[0]}")
-    if output.suffix not in [f".{each}" for each in formats]:
-        kind = "an ONNX file" if formats[0] == "onnx" else "a C file"
-        raise UsageError(f"--output {output}: the name of {kind} ends in .{formats[0]}")
-    return _export(found, [output.with_suffix(f".{each}") for each in formats])
+    return _export(found, [output.with_suffix(f".{name}") for name in formats])
 
 
 def _export(found: FoundPolicy, targets: list[Path]) -> list[ExportReport]:

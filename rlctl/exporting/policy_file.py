@@ -13,6 +13,7 @@ from rlctl.environments.task_version import identify_task
 from rlctl.errors import UsageError
 from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.score import describe_score, measure_score
+from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.players.baselines import BASELINES
 from rlctl.policy.shipped import Provenance
@@ -31,25 +32,26 @@ class PolicyFileReport:
     """[bytes]"""
 
 
-def export_actor(run: str | None, *, checkpoint: str, target: Path, episodes: int = 100) -> PolicyFileReport:
-    """Measure a run's policy and write its actor, with that score, recipe, task version and commit.
+def export_actor(request: ExportRequest) -> PolicyFileReport:
+    """Measure a run's policy and write its actor to `request.policy`, with score, recipe, task version and commit.
 
-    Zero and random actions are measured on the same episodes. A policy file that was written so is measured anew, as
-    its task is now. Raises `UsageError` for any other policy without a run.
+    Zero and random actions are measured on the same episodes. A policy file that was written this way is measured
+    again, with its task as it is now. Raises `UsageError` for any other policy without a run.
     """
-    if target.suffix != ".safetensors":
-        raise UsageError(f"--policy {target}: the name of a policy file ends in .safetensors")
-    found = lookup.find_policy(run, checkpoint)
+    assert request.policy is not None  # what is asked for here
+    target, found = request.policy, lookup.find_policy(request.run, request.checkpoint)
     output.print_notes(found.notes)
     origin = _find_origin(found)
     policy = PolicyFile.read(found.file)
     spec = found.locate(policy.info.spec)
-    request = EvalRequest(run=str(found.file), episodes=episodes)
+    evaluation = EvalRequest(run=str(found.file), episodes=request.episodes)
     provenance = Provenance(
         **origin,
         **identify_task(spec.task),
-        score=measure_score(request),
-        baselines={name: measure_score(dataclasses.replace(request, baseline=name, spec=spec)) for name in BASELINES},
+        score=measure_score(evaluation),
+        baselines={
+            name: measure_score(dataclasses.replace(evaluation, baseline=name, spec=spec)) for name in BASELINES
+        },
     )
     policy = policy.actor_only().with_info(provenance=provenance)
     policy.write(target)

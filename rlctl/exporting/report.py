@@ -98,9 +98,11 @@ def format_agreement(agreement: Agreement) -> str:
 def format_closed_loop(loop: ClosedLoop) -> str:
     """Return the comparison of whole episodes, in a line."""
     episodes = output.format_count(loop.episodes, "episode")
+    success = "" if loop.same_success is None else f"success same in {loop.same_success}, "
+    length = f"length {'same ' if loop.same_success is None else ''}in {loop.same_length}"
     text = (
-        f"{episodes}: success same in {loop.same_success}, length in {loop.same_length}, "
-        f"return within {loop.max_return_difference:.1e} "
+        f"{episodes}: {success}{length}, return within {loop.max_return_difference:.1e} "
         f"(mean {loop.mean_return:.5g} and {loop.mean_return_exported:.5g})"
     )
-    return f"{text}; the policy itself differs as much with other last bits" if loop.magnified else text
+    chaotic = "; the episodes are chaotic: a change in the last bits makes the original policy differ as much"
+    return text + chaotic * loop.magnified

@@ -119,7 +119,8 @@ class ClosedLoop:
     """The same episodes, played once with each policy."""
 
     episodes: int
-    same_success: int
+    same_success: int | None
+    """None where the task reports no success."""
     same_length: int
     max_return_difference: float
     """Relative to the larger of the episode's own return and the mean size of a return."""
@@ -131,7 +132,7 @@ class ClosedLoop:
     @property
     def agrees(self) -> bool:
         """Whether every episode had the same success and length, and a return within the limit."""
-        same = self.same_success == self.same_length == self.episodes
+        same = self.same_success in (None, self.episodes) and self.same_length == self.episodes
         return same and self.max_return_difference <= MAX_RETURN_DIFFERENCE
 
 
@@ -245,7 +246,9 @@ def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> Cl
     relative = np.divide(difference, scale, out=np.zeros_like(difference), where=scale > 0)
     return ClosedLoop(
         episodes=len(pairs),
-        same_success=sum(ours.success == theirs.success for ours, theirs in pairs),
+        same_success=None
+        if all(ours.success is None and theirs.success is None for ours, theirs in pairs)
+        else sum(ours.success == theirs.success for ours, theirs in pairs),
         same_length=sum(ours.length == theirs.length for ours, theirs in pairs),
         max_return_difference=float(relative.max()),
         mean_return=float(returns[:, 0].mean()),

@@ -26,7 +26,7 @@ def show(result: TrainResult, json: str | None) -> None:
         f"run: {result.run.path}",
         "next:",
         f"  rlctl eval {run}",
-        f"  rlctl export {run} --onnx",
+        *([] if result.progress.best_success == 0 else [f"  rlctl export {run} --onnx"]),
         f"  rlctl replay {run}",
         f"  tensorboard --logdir {shlex.quote(str(result.run.tensorboard))}",
     ]

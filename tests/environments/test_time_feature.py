@@ -12,6 +12,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError
 from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
 from rlctl.exporting.export import export_policy
+from rlctl.exporting.request import ExportRequest
 from rlctl.importing.import_model import import_model
 from rlctl.recipe import recipe
 from rlctl.replaying.replay import ReplayRequest, run_replay
@@ -112,7 +113,7 @@ def test_the_zoos_agents_play_as_they_did(zoo_agent):
 def test_export_and_replay_honour_it(zoo_agent, tmp_path):
     _, _, imported = zoo_agent
     # It raises unless the file acts the same in closed loop.
-    export_policy(str(imported.file), ["onnx"], checkpoint="best", output=tmp_path / "policy.onnx")
+    export_policy(ExportRequest(str(imported.file), ("onnx",), "best", tmp_path / "policy.onnx"))
     (episode,) = run_replay(ReplayRequest(str(tmp_path / "policy.onnx"), output=tmp_path)).episodes
     assert run_replay(ReplayRequest(None, verify=episode.episode)).verification.difference is None
 

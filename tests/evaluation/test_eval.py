@@ -205,9 +205,10 @@ def test_a_run_without_a_best_policy(rlctl, reach_run, tmp_path):
 
 def test_an_exported_policy_is_evaluated_alike_and_without_torch(reach_run, evaluation, tmp_path):
     from rlctl.exporting.export import export_policy
+    from rlctl.exporting.request import ExportRequest
 
     exported = tmp_path / "policy.onnx"
-    export_policy(str(reach_run.path), ["onnx"], checkpoint="best", output=exported)
+    export_policy(ExportRequest(str(reach_run.path), ("onnx",), "best", exported))
     code = (
         "import sys; from rlctl.cli import run\n"
         f"code = run(['eval', {str(exported)!r}, '--task', 'reach', '--episodes', '6', '--n-envs', '1',"

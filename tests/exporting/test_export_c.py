@@ -1,5 +1,6 @@
 """The C function does what the policy does, compiled with every warning."""
 
+import ctypes
 import shutil
 import subprocess
 
@@ -11,9 +12,11 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.exporting.c_source import FLAGS, build_library, find_compiler, write_c
 from rlctl.exporting.export import export_policy
+from rlctl.exporting.request import ExportRequest
 from rlctl.policy.c_policy import CPolicy
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy
+from rlctl.task.joints import Joints
 from tests.exporting.test_export_graph import random_observations
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")
@@ -107,7 +110,7 @@ def test_export_is_verified(algo, frames, small, train, write, tmp_path):
     small_spec = small()
     spec = EnvSpec(small_spec.task, small_spec.parameters, frame_stack=frames)
     path = write(train(algo, spec, steps=0), algo, spec)
-    onnx, report = export_policy(str(path), ["onnx", "c"], checkpoint="best", output=None)
+    onnx, report = export_policy(ExportRequest(str(path), ("onnx", "c"), "best", None))
     assert (onnx.path, report.path) == (path.with_suffix(".onnx"), path.with_suffix(".c"))
     assert report.agreement.observations >= 2000
     assert report.agreement.agrees
@@ -125,7 +128,7 @@ def test_export_is_verified(algo, frames, small, train, write, tmp_path):
 def test_without_a_compiler_it_is_not_verified(small, train, write, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     path = write(train("ppo", small(), steps=0), "ppo", small())
-    (report,) = export_policy(str(path), ["c"], checkpoint="best", output=path.with_name("my policy-2.c"))
+    (report,) = export_policy(ExportRequest(str(path), ("c",), "best", path.with_name("my policy-2.c")))
     assert report.path.is_file()
     assert report.details["header"].name == "my_policy_2.h"
     assert report.as_json()["verified"] is False
@@ -149,7 +152,7 @@ def test_what_c_cannot_carry_is_refused_on_the_command_line(rlctl, small, train,
 def test_name_of_the_output(small, train, write, tmp_path):
     path = write(train("ppo", small(), steps=0), "ppo", small())
     with pytest.raises(UsageError, match=r"the name of a C file ends in \.c"):
-        export_policy(str(path), ["c"], checkpoint="best", output=tmp_path / "policy.onnx")
+        export_policy(ExportRequest(str(path), ("c",), "best", tmp_path / "policy.onnx"))
 
 
 @needs_compiler
@@ -157,13 +160,53 @@ def test_names_of_a_stranger_stay_in_their_comments(small, train, write, tmp_pat
     model = train("ppo", small(), steps=0)
     path = write(model, "ppo", small())
     policy = PolicyFile.read(path)
-    info = policy.info
     evil = '*/ #error "out"\n#error "line" /* \\'
-    env = info.env.model_copy(update={"action_meaning": evil, "robot": evil, "observation_sizes": {evil: 3}})
-    info = info.model_copy(update={"env": env})
+    env = policy.info.env.model_copy(update={"action_meaning": evil, "robot": evil, "observation_sizes": {evil: 3}})
+    policy = policy.with_info(env=env)
     code = write_c(policy, "int")
     assert code.name == "int"
-    build_library(code, info, tmp_path, [*find_compiler(), "-Werror"])
+    library = build_library(code, policy.info, tmp_path, [*find_compiler(), "-Werror"])
+    assert read_texts(library, "int_observation_names", 1) == [evil]
+
+
+def read_texts(library, name, count):
+    return [text.decode() for text in (ctypes.c_char_p * count).in_dll(ctypes.CDLL(str(library)), name)]
+
+
+def read_numbers(library, name, count, kind=ctypes.c_float):
+    return list((kind * count).in_dll(ctypes.CDLL(str(library)), name))
+
+
+@needs_compiler
+@pytest.mark.parametrize("frames", [1, 3])
+def test_names_bounds_and_units_are_data(frames, small, train, write, tmp_path):
+    spec = EnvSpec(small().task, small().parameters, frame_stack=frames)
+    policy = PolicyFile.read(write(train("ppo", spec, steps=0), "ppo", spec))
+    joints = Joints(names=("elbow ??/", "\u00fcber"))
+    env = {"observation_sizes": {"angle": 1, "speed": 2}, "observation_units": {"speed": "m/s"}, "joints": joints}
+    policy = policy.with_info(env=policy.info.env.model_copy(update=env))
+    code = write_c(policy, "policy")
+    library = build_library(code, policy.info, tmp_path, [*find_compiler(), "-Werror"])
+    assert "extern const char *const policy_action_names[POLICY_ACTION_SIZE];" in code.header
+    assert "#define POLICY_OBSERVATION_PARTS 2" in code.header
+    assert read_texts(library, "policy_observation_names", 2) == ["angle", "speed"]
+    assert read_texts(library, "policy_observation_units", 2) == ["", "m/s"]
+    assert read_numbers(library, "policy_observation_sizes", 2, ctypes.c_int) == [1, 2]
+    assert read_numbers(library, "policy_observation_low", 3) == [-np.inf] * 3
+    assert read_texts(library, "policy_action_names", 2) == ["elbow ??/", "\u00fcber"]
+    assert read_numbers(library, "policy_action_low", 2) == [-2.0, -0.5]
+    assert read_numbers(library, "policy_action_high", 2) == [1.0, 3.0]
+
+
+@needs_compiler
+def test_choices_are_data(small, train, write, tmp_path):
+    spec = small("parts", "multidiscrete")
+    info, code = write_source(write(train("ppo", spec, steps=0), "ppo", spec))
+    library = build_library(code, info, tmp_path, [*find_compiler(), "-Werror"])
+    assert read_texts(library, "policy_observation_names", 3) == ["joints", "mode", "switch"]
+    assert read_numbers(library, "policy_observation_high", 6) == [np.inf] * 3 + [4, 1, 1]
+    assert read_texts(library, "policy_action_names", 3) == ["action[0]", "action[1]", "action[2]"]
+    assert read_numbers(library, "policy_action_high", 3, ctypes.c_int) == [1, 2, 3]
 
 
 @needs_compiler

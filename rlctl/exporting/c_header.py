@@ -1,0 +1,202 @@
+"""The header of a C policy: what each element of observation and action is, in words and as data."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.environments.dict_spaces import SINGLE, split_space
+from rlctl.exporting.c_layers import write_array, write_number
+from rlctl.output import format_count
+from rlctl.policy.c_policy import action_type, observation_type
+from rlctl.policy.file import PolicyInfo
+from rlctl.version import __version__
+
+_NUMBERS = {"float32": "float", "float64": "double"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Element:
+    """A named part of the observation, or an element of the action."""
+
+    name: str
+    size: int
+    unit: str = ""
+    """Empty where it is not known."""
+
+
+class Layout:
+    """Which element of the C function's observation and action is what; `name` begins everything in the header."""
+
+    def __init__(self, name: str, info: PolicyInfo) -> None:
+        self.name = name
+        self.info = info
+        space, self.action_space = info.env.spaces()
+        self.frames = info.spec.frame_stack
+        self.parts = split_space(space)
+        self.sizes = {key: math.prod(part.shape or ()) for key, part in self.parts.items()}
+        self.size = sum(self.sizes.values()) // self.frames
+        self.type = _NUMBERS[observation_type(info).name]
+        self.action_type = _NUMBERS.get(action_type(info).name, "int")
+        self.action_size = math.prod(self.action_space.shape or ())
+        self.observed = self._list_observed()
+        self.actions = self._list_actions()
+
+    def _list_observed(self) -> list[Element]:
+        env = self.info.env
+        sizes = env.observation_sizes
+        if SINGLE not in self.parts:
+            sizes = self.sizes
+        if sum(sizes.values()) != self.size:
+            sizes = {"observation": self.size}
+        return [Element(name, size, env.observation_units.get(name, "")) for name, size in sizes.items()]
+
+    def _list_actions(self) -> list[Element]:
+        joints = self.info.env.joints
+        if joints and len(joints.names) == self.action_size:
+            return [Element(name, 1) for name in joints.names]
+        return [Element(f"action[{index}]", 1) for index in range(self.action_size)]
+
+    def list_state(self) -> list[str]:
+        """Return the part of the state that remembers earlier observations."""
+        return [f"{self.type} frames[{self.frames * self.size}]; /* oldest first */", "int begun;"]
+
+    def describe_observation(self) -> list[str]:
+        """Return a line per name in an observation: its elements, size and unit."""
+        lines, first = [], 0
+        for part in self.observed:
+            unit = f" [{part.unit}]" if part.unit else ""
+            index = f"[{first}]" if part.size == 1 else f"[{first}..{first + part.size - 1}]"
+            lines.append(f"  {index:<10} {part.name}{unit}")
+            first += part.size
+        return lines
+
+    def describe_action(self) -> list[str]:
+        """Return the meaning of the action, with its bounds."""
+        meaning, space = self.info.env.action_meaning or "as the environment takes it", self.action_space
+        if not isinstance(space, spaces.Box):
+            return [f"  {meaning}: {' '.join(str(space).split())}, counted from 0"]
+        bounds = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)
+        ranges = [f"from {low:.6g} to {high:.6g}" for low, high in bounds]
+        if self.info.env.joints and self.actions[0].name == self.info.env.joints.names[0]:
+            ranges = [f"{joint.name}, {limits}" for joint, limits in zip(self.actions, ranges, strict=True)]
+        elif len(set(ranges)) == 1:
+            return [f"  {meaning}; each {ranges[0]}"]
+        return [f"  {meaning}", *(f"  [{index}] {limits}" for index, limits in enumerate(ranges))]
+
+    def list_arrays(self) -> list[tuple[str, str, str, list[str]]]:
+        """Return the header's constant arrays: type, name, the macro of the length, and the values as C."""
+        observation_low, observation_high = _find_bounds(self.parts.values(), self.size)
+        action_low, action_high = _find_bounds([self.action_space], self.action_size)
+        observation, action = self.type, self.action_type
+        return [
+            ("char *const", "observation_names", "OBSERVATION_PARTS", [_quote(part.name) for part in self.observed]),
+            ("char *const", "observation_units", "OBSERVATION_PARTS", [_quote(part.unit) for part in self.observed]),
+            ("int", "observation_sizes", "OBSERVATION_PARTS", [str(part.size) for part in self.observed]),
+            (observation, "observation_low", "OBSERVATION_SIZE", _write_numbers(observation_low, observation)),
+            (observation, "observation_high", "OBSERVATION_SIZE", _write_numbers(observation_high, observation)),
+            ("char *const", "action_names", "ACTION_SIZE", [_quote(element.name) for element in self.actions]),
+            (action, "action_low", "ACTION_SIZE", _write_numbers(action_low, action)),
+            (action, "action_high", "ACTION_SIZE", _write_numbers(action_high, action)),
+        ]
+
+
+def _find_bounds(parts: Iterable[spaces.Space[Any]], size: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the lowest and highest value of the last `size` elements: of a stack of frames those of the newest."""
+    bounds = [_find_part_bounds(part) for part in parts]
+    low, high = (np.concatenate([np.ravel(pair[side]) for pair in bounds])[-size:] for side in (0, 1))
+    return low, high
+
+
+def _find_part_bounds(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    if isinstance(space, spaces.Box):
+        return space.low, space.high
+    if isinstance(space, spaces.Discrete):
+        return np.array(0), np.array(space.n - 1)
+    highest = space.nvec - 1 if isinstance(space, spaces.MultiDiscrete) else np.ones(space.shape or (), int)
+    return np.zeros_like(highest), highest
+
+
+def _write_numbers(values: NDArray[Any], kind: str) -> list[str]:
+    return [write_number(value, kind) for value in values]
+
+
+def _quote(text: str) -> str:
+    """Return a C string of a text in UTF-8, whatever characters it has."""
+    plain = {*range(32, 127)} - set(b'"\\?')  # two question marks begin a trigraph
+    return '"' + "".join(chr(byte) if byte in plain else f"\\{byte:03o}" for byte in text.encode()) + '"'
+
+
+def write_data(layout: Layout) -> list[str]:
+    """Return the definitions of the header's arrays."""
+    return [
+        write_array(f"const {kind} {layout.name}_{array}", values) for kind, array, _, values in layout.list_arrays()
+    ]
+
+
+def write_header(layout: Layout, members: list[str], prototype: str) -> str:
+    """Return the header; `members` are the fields of the state, `prototype` declares the function that acts."""
+    name, info = layout.name, layout.info
+    upper, control_dt = name.upper(), info.env.control_dt
+    declarations = [_declare_data(layout), f"{prototype};"]
+    if members:
+        reset = f"/* Call it when an episode begins. */\nvoid {name}_reset({name}_state *state);"
+        fields = "\n".join(f"    {member}" for member in members)
+        declarations[1:1] = [f"typedef struct {{\n{fields}\n}} {name}_state;", reset]
+    sizes = [
+        f"#define {upper}_OBSERVATION_SIZE {layout.size}",
+        f"#define {upper}_OBSERVATION_PARTS {len(layout.observed)} /* with a name each */",
+        f"#define {upper}_ACTION_SIZE {layout.action_size}",
+    ]
+    if control_dt is not None:
+        sizes.append(f"#define {upper}_CONTROL_DT {control_dt!r} /* [s] */")
+    blocks = [
+        f"#ifndef {upper}_H\n#define {upper}_H",
+        "\n".join(sizes),
+        '#ifdef __cplusplus\nextern "C" {\n#endif',
+        *declarations,
+        "#ifdef __cplusplus\n}\n#endif",
+        "#endif",
+    ]
+    return "\n\n".join([write_comment(_describe(layout, bool(members))), *blocks]) + "\n"
+
+
+def _describe(layout: Layout, has_state: bool) -> list[str]:
+    name, info = layout.name, layout.info
+    stacked = f"; one observation, the last {layout.frames} are stacked inside" if layout.frames > 1 else ""
+    return [
+        f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps. Written by rlctl "
+        f"{__version__}; do not edit.",
+        *([f"Robot: {info.env.robot}."] if info.env.robot else []),
+        *([f"Call {name}_act every {info.env.control_dt!r} s."] if info.env.control_dt is not None else []),
+        "",
+        f"observation, {layout.size} elements, raw: normalisation is inside{stacked}",
+        *layout.describe_observation(),
+        f"action, {format_count(layout.action_size, 'element')}",
+        *layout.describe_action(),
+        "",
+        f"Nothing is allocated, and nothing is shared between calls{' but the state' if has_state else ''}.",
+        "A NaN in the observation gives NaN actions or an arbitrary choice: check what sensors say before.",
+    ]
+
+
+def _declare_data(layout: Layout) -> str:
+    upper = layout.name.upper()
+    arrays = [
+        f"extern const {kind} {layout.name}_{array}[{upper}_{size}];" for kind, array, size, _ in layout.list_arrays()
+    ]
+    return "\n".join(['/* The same as data; an unknown unit is "", bounds may be infinite. */', *arrays])
+
+
+def write_comment(lines: list[str]) -> str:
+    """Return a comment that ends where it is to end, whatever names a task has."""
+    plain = [" ".join(line.split()) if line.lstrip() == line else line for line in lines]
+    safe = [re.sub(r"[\r\n\v\f\0]", " ", line).replace("*/", "* /").replace("/*", "/ *").rstrip("\\") for line in plain]
+    return "/* " + "\n".join(f" * {line}".rstrip() for line in safe)[3:] + "\n */"

@@ -1,0 +1,34 @@
+"""What an export is asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from rlctl.errors import UsageError
+
+Format = Literal["onnx", "c"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportRequest:
+    """What `rlctl export` is asked for; raises `UsageError` for what excludes each other."""
+
+    run: str | None
+    """What the user typed: a run, a policy file, a task that ships one, or None for the latest run."""
+    formats: tuple[Format, ...] = ("onnx",)
+    checkpoint: str = "best"
+    output: Path | None = None
+    """Default: in the run's folder, next to a policy file that belongs to none, or here for a shipped policy."""
+    policy: Path | None = None
+    """Write the actor with its measured score to this file instead, as plugins ship it."""
+    episodes: int = 100
+    """Played for that score."""
+
+    def __post_init__(self) -> None:
+        if self.policy is not None and self.policy.suffix != ".safetensors":
+            raise UsageError(f"--policy {self.policy}: the name of a policy file ends in .safetensors")
+        if self.output is not None and self.output.suffix not in [f".{name}" for name in self.formats]:
+            kind = "an ONNX file" if self.formats[0] == "onnx" else "a C file"
+            raise UsageError(f"--output {self.output}: the name of {kind} ends in .{self.formats[0]}")
