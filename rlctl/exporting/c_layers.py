@@ -66,8 +66,8 @@ _FUNCTIONS = {
     "apply_gates": """static void apply_gates(const float *gates, int count, float *hidden, float *cell)
 {
     for (int i = 0; i < count; ++i) {
-        const float kept = sigmoid(gates[count + i]) * cell[i];
-        cell[i] = kept + sigmoid(gates[i]) * hyperbolic_tangent(gates[2 * count + i]);
+        const float remembered = sigmoid(gates[count + i]) * cell[i];
+        cell[i] = remembered + sigmoid(gates[i]) * hyperbolic_tangent(gates[2 * count + i]);
         hidden[i] = sigmoid(gates[3 * count + i]) * hyperbolic_tangent(cell[i]);
     }
 }

@@ -1,4 +1,4 @@
-"""`rlctl export`: a policy file becomes an ONNX file or C source, which is kept only if it acts the same."""
+"""`rlctl export`: a policy file becomes an ONNX file or C source, which stays only if it acts the same."""
 
 from __future__ import annotations
 
@@ -46,22 +46,22 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
     Of several formats each file has its own suffix. Raises `UsageError` for a policy that has no such form, and
     `AnswerIsNo` with the numbers if a file does not act as the policy does; then that file is not left.
     """
-    found, formats, output = lookup.find_policy(request.run, request.checkpoint), request.formats, request.output
-    print_notes(found.notes)
-    if found.file.suffix == ".onnx":
-        raise UsageError(f"{found.file}: an ONNX file already; export the run or its .safetensors file")
+    source, formats, output = lookup.find_policy(request.run, request.checkpoint), request.formats, request.output
+    print_notes(source.notes)
+    if source.file.suffix == ".onnx":
+        raise UsageError(f"{source.file}: an ONNX file already; export the run or its .safetensors file")
     if output is None:
-        beside = Path() if request.checkpoint == PRETRAINED else found.file.parent
-        output = found.run.onnx_file if found.run else beside / found.file.name
+        beside = Path() if request.checkpoint == PRETRAINED else source.file.parent
+        output = source.run.onnx_file if source.run else beside / source.file.name
         output = output.with_suffix(f".{formats[0]}")
-    return _export(found, [output.with_suffix(f".{name}") for name in formats])
+    return _export(source, [output.with_suffix(f".{name}") for name in formats])
 
 
-def _export(found: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
-    policy = check_playable(PolicyFile.read(found.file))
+def _export(source: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
+    policy = check_playable(PolicyFile.read(source.file))
     info = policy.info
     # The environments are built while torch is imported.
-    with Workers(found.locate(info.spec), available_cores()) as workers:
+    with Workers(source.locate(info.spec), available_cores()) as workers:
         from rlctl.exporting.actor import build
         from rlctl.exporting.c_source import write_c
         from rlctl.policy.torch_policy import TorchPolicy, pin_threads
@@ -69,9 +69,9 @@ def _export(found: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
         pin_threads()
         models = [(target, build(policy)) for target in targets if target.suffix == ".onnx"]
         sources = [(target, write_c(policy, target.stem)) for target in targets if target.suffix == ".c"]
-        job = _Export(found.file, info, TorchPolicy.load(found.file), workers)
-        _check_environment(found.file, info, workers)
-        return [*(_export_onnx(job, *each) for each in models), *(_export_c(job, *each) for each in sources)]
+        job = _Export(source.file, info, TorchPolicy.load(source.file), workers)
+        _check_environment(source.file, info, workers)
+        return [*(_export_onnx(job, *model) for model in models), *(_export_c(job, *source) for source in sources)]
 
 
 def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) -> None:
@@ -102,9 +102,9 @@ def _export_onnx(job: _Export, target: Path, model: onnx.ModelProto) -> ExportRe
                 **_verify(job, target, exported, part, "the ONNX file", 1000),
                 size=size,
                 written=f"{target} ({size / 1000:,.1f} kB, opset {opset})",
-                interface=[(kind, ", ".join(map(_format_port, each))) for kind, each in ports.items()],
+                interface=[(kind, ", ".join(map(_format_port, some))) for kind, some in ports.items()],
                 next=shlex.join(["rlctl", "eval", str(target), "--task", job.info.spec.task]),
-                details={"opset": opset} | {kind: [_describe_port(one) for one in ports[kind]] for kind in ports},
+                details={"opset": opset} | {kind: [_describe_port(port) for port in ports[kind]] for kind in ports},
             )
         )
 
@@ -178,4 +178,4 @@ def _explain_failure(job: _Export, target: Path, what: str, agreement: Agreement
             "every action agrees, but the episodes do not: is the environment reproducible? "
             f"rlctl check-env {job.info.spec.task}"
         )
-    return f"{target}: not verified, not kept: {why}\n{format_agreement(agreement)}\n{format_closed_loop(loop)}"
+    return f"{target}: not verified, not written: {why}\n{format_agreement(agreement)}\n{format_closed_loop(loop)}"

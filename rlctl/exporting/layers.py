@@ -49,7 +49,7 @@ class Graph:
 
     def input(self, name: str, dtype: Any, shape: Sequence[int | str], meaning: str) -> str:
         """Add an input; raises `UsageError` if its name is taken, as a dict observation may have any key."""
-        if not name or name.startswith("/") or name in (each.name for each in self._inputs):
+        if not name or name.startswith("/") or name in (port.name for port in self._inputs):
             raise UsageError(f"export: an observation cannot be named {name!r} in an ONNX file")
         self._inputs.append(helper.make_tensor_value_info(name, _find_type(dtype), list(shape), meaning))
         return name
@@ -78,11 +78,11 @@ class Graph:
 
     def output(self, value: str, name: str, dtype: Any, shape: Sequence[int | str], meaning: str) -> None:
         """Make a value an output, under a name."""
-        if name in (each.name for each in self._inputs):
+        if name in (port.name for port in self._inputs):
             raise UsageError(f"export: an observation cannot be named {name!r} in an ONNX file, an output is")
         for node in self._nodes:
             for names in (node.input, node.output):
-                names[:] = [name if each == value else each for each in names]
+                names[:] = [name if other == value else other for other in names]
         self._outputs.append(helper.make_tensor_value_info(name, _find_type(dtype), list(shape), meaning))
 
     def model(self, metadata: Mapping[str, str], meaning: str) -> onnx.ModelProto:
@@ -236,8 +236,8 @@ def emit_lstm(graph: Graph, value: str, state: tuple[str, str], lstm: Lstm) -> t
 
 def _add_lstm_constants(graph: Graph, layer: LstmLayer, name: str) -> list[str]:
     """Input weights, recurrent weights and biases of a layer, with a leading dimension for ONNX's directions."""
-    weights = [_reorder_gates(each) for each in (layer.of_input, layer.of_hidden)]
-    biases = [_reorder_gates(each) for each in layer.biases] or [np.zeros(len(weights[0]), np.float32)] * 2
+    weights = [_reorder_gates(weight) for weight in (layer.of_input, layer.of_hidden)]
+    biases = [_reorder_gates(bias) for bias in layer.biases] or [np.zeros(len(weights[0]), np.float32)] * 2
     return [
         graph.constant(f"{name}.weight_ih", weights[0][None]),
         graph.constant(f"{name}.weight_hh", weights[1][None]),

@@ -39,12 +39,12 @@ def export_actor(request: ExportRequest) -> PolicyFileReport:
     again, with its task as it is now. Raises `UsageError` for any other policy without a run.
     """
     assert request.policy is not None  # what is asked for here
-    target, found = request.policy, lookup.find_policy(request.run, request.checkpoint)
-    output.print_notes(found.notes)
-    origin = _find_origin(found)
-    policy = PolicyFile.read(found.file)
-    spec = found.locate(policy.info.spec)
-    evaluation = EvalRequest(run=str(found.file), episodes=request.episodes)
+    target, source = request.policy, lookup.find_policy(request.run, request.checkpoint)
+    output.print_notes(source.notes)
+    origin = _find_origin(source)
+    policy = PolicyFile.read(source.file)
+    spec = source.locate(policy.info.spec)
+    evaluation = EvalRequest(run=str(source.file), episodes=request.episodes)
     provenance = Provenance(
         **origin,
         **identify_task(spec.task),
@@ -58,17 +58,17 @@ def export_actor(request: ExportRequest) -> PolicyFileReport:
     return PolicyFileReport(target, policy.info, provenance, target.stat().st_size)
 
 
-def _find_origin(found: FoundPolicy) -> dict[str, Any]:
+def _find_origin(source: FoundPolicy) -> dict[str, Any]:
     """Return which training a policy is from, as `Provenance` has it."""
-    if found.run is not None:
+    if source.run is not None:
         return {
-            "run": "/".join(found.run.path.resolve().parts[-2:]),
-            "git_commit": found.run.status().get("git_commit"),
-            "recipe": found.run.recipe().model_dump(mode="json", by_alias=True),
+            "run": "/".join(source.run.path.resolve().parts[-2:]),
+            "git_commit": source.run.status().get("git_commit"),
+            "recipe": source.run.recipe().model_dump(mode="json", by_alias=True),
         }
-    before = PolicyFile.read_info(found.file).provenance if found.file.suffix == ".safetensors" else None
+    before = PolicyFile.read_info(source.file).provenance if source.file.suffix == ".safetensors" else None
     if before is None:
-        raise UsageError(f"{found.file}: no recipe is known of this policy; give the run that it is from")
+        raise UsageError(f"{source.file}: no recipe is known of this policy; give the run that it is from")
     return before.model_dump(include={"run", "git_commit", "recipe"})
 
 

@@ -27,9 +27,9 @@ class ExportReport:
     interface: list[tuple[str, str]]
     """What goes in and comes out, for people: a word and a text each."""
     next: str
-    """A command to go on with."""
+    """A command to continue with."""
     details: Mapping[str, Any]
-    """What is known of a file of this format alone."""
+    """What only files of this format have."""
     agreement: Agreement | None = None
     closed_loop: ClosedLoop | None = None
     latency: Latency | None = None
@@ -69,7 +69,7 @@ def show(reports: list[ExportReport], json: str | None) -> None:
     The JSON of one format is an object; of several it is one object per format, by the suffix of its file.
     """
     if json is not None:
-        by_format = {each.path.suffix[1:]: each.as_json() for each in reports}
+        by_format = {report.path.suffix[1:]: report.as_json() for report in reports}
         if output.write_result_json(json, by_format if len(reports) > 1 else reports[0].as_json()):
             return
     from rich.text import Text

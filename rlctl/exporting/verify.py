@@ -64,7 +64,7 @@ class Comparison:
     """Collects how far apart actions are. `add` right after the torch policy has acted: its logits are looked at."""
 
     def __init__(self, torch_policy: TorchPolicy) -> None:
-        self.found = Agreement()
+        self.agreement = Agreement()
         self._space = torch_policy.action_space
         self._logits: NDArray[np.float32]
         if not isinstance(self._space, spaces.Box):
@@ -84,10 +84,10 @@ class Comparison:
         if not isinstance(self._space, spaces.Box):
             for row in np.flatnonzero(differs).tolist():
                 if self._is_near_tie(row, expected[row], actions[row]):
-                    self.found.near_ties += 1
+                    self.agreement.near_ties += 1
                     differs[row], difference[row] = False, 0.0
-        self.found.max_difference = max(self.found.max_difference, float(difference.max()))
-        self.found.beyond_limit += int(differs.sum())
+        self.agreement.max_difference = max(self.agreement.max_difference, float(difference.max()))
+        self.agreement.beyond_limit += int(differs.sum())
 
     def _is_near_tie(self, row: int, expected: NDArray[Any], action: NDArray[Any]) -> bool:
         return all(
@@ -172,22 +172,22 @@ def verify(
     if isinstance(exported, OnnxPolicy):
         _compare_batch(torch_policy, exported, expected, comparison)
     played = EPISODES
-    while comparison.found.observations < min_observations:
-        missing = min_observations / comparison.found.observations - 1.0
+    while comparison.agreement.observations < min_observations:
+        missing = min_observations / comparison.agreement.observations - 1.0
         total = played + max(1, round(1.1 * missing * played))
         more = play_episodes(workers, episode_seeds(0, Stream.VERIFY, total)[played:], record=True)
         _compare_actions(torch_policy, exported, more, comparison)
         played = total
     workers.set_other_policy(str(file.resolve()))
     done = play_episodes(workers, seeds, record=True)
-    compared = comparison.found.observations
+    compared = comparison.agreement.observations
     _compare_actions(torch_policy, exported, done, comparison)
-    comparison.found.observations = compared  # those of one policy's rollouts are counted
+    comparison.agreement.observations = compared  # those of one policy's rollouts are counted
     comparison.close()
     loop = compare_episodes(expected, done)
-    if comparison.found.agrees and not loop.agrees:
+    if comparison.agreement.agrees and not loop.agrees:
         loop = dataclasses.replace(loop, magnified=_magnifies_rounding(torch_policy.file, workers, expected))
-    return comparison.found, loop
+    return comparison.agreement, loop
 
 
 def _magnifies_rounding(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> bool:
@@ -223,17 +223,18 @@ def _compare_actions(
             some = map_parts(operator.itemgetter(slice(low, low + rows)), observations)
             actions = [exported.predict(take_row(some, row)) for row in range(rows)]
             comparison.add(torch_policy.act(some), np.stack(actions))
-        comparison.found.observations += length
+        comparison.agreement.observations += length
 
 
 def _compare_batch(
     torch_policy: TorchPolicy, exported: OnnxPolicy, episodes: Sequence[Episode], comparison: Comparison
 ) -> None:
     """Ask both policies on the first observations of some episodes, all at once."""
-    first = stack([take_row(each.trajectory.observations, 0) for each in episodes if each.trajectory is not None])
+    trajectories = [episode.trajectory for episode in episodes]
+    first = stack([take_row(trajectory.observations, 0) for trajectory in trajectories if trajectory is not None])
     torch_policy.reset()
     comparison.add(torch_policy.act(first), exported.start_episodes(first))
-    comparison.found.batch_sizes.append(len(episodes))
+    comparison.agreement.batch_sizes.append(len(episodes))
 
 
 def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> ClosedLoop:

@@ -124,7 +124,7 @@ def _find_difference(
 
 def _describe_shape(space: spaces.Space[Any]) -> Any:
     if isinstance(space, spaces.Dict):
-        return {key: _describe_shape(each) for key, each in space.spaces.items()}
+        return {key: _describe_shape(part) for key, part in space.spaces.items()}
     counts = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
     return str(space) if counts else f"{type(space).__name__}{space.shape}"
 

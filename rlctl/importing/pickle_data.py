@@ -233,9 +233,9 @@ def read_plain(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list | tuple):
-        return [read_plain(each) for each in value]
+        return [read_plain(item) for item in value]
     if isinstance(value, Call) and str(value.function) == "collections.OrderedDict":
         value = value.items
     if isinstance(value, dict):
-        return {str(key): read_plain(each) for key, each in value.items()}
+        return {str(key): read_plain(item) for key, item in value.items()}
     raise NotPlainData(f"{value if isinstance(value, Name) else getattr(value, 'function', type(value).__name__)}")

@@ -82,11 +82,11 @@ def read_model(path: Path, algo: str | None = None) -> SavedModel:
         data = json.loads(_read_member(archive, "data"))
         if not isinstance(data, dict):
             raise NotPlainData("its data is not a mapping")
-        found = _find_algorithm(data)
-        if algo not in (None, found) and {algo, found} not in _SAME_POLICY:
-            raise UsageError(f"--algo {algo}: {path} is a model of {found}")
+        saved_algo = _find_algorithm(data)
+        if algo not in (None, saved_algo) and {algo, saved_algo} not in _SAME_POLICY:
+            raise UsageError(f"--algo {algo}: {path} is a model of {saved_algo}")
         return SavedModel(
-            algo=algo or found,
+            algo=algo or saved_algo,
             observation_space=read_space(_decode(data, "observation_space")),
             action_space=read_space(_decode(data, "action_space")),
             policy_kwargs=_read_policy_kwargs(data),
@@ -206,11 +206,11 @@ def read_normalization(path: Path) -> SavedNormalization | None:
         statistics = state["obs_rms"]
         parts = statistics if isinstance(statistics, dict) else {"": statistics}
         fields = {
-            key: _split_object(each, "stable_baselines3.common.running_mean_std.")[1] for key, each in parts.items()
+            key: _split_object(part, "stable_baselines3.common.running_mean_std.")[1] for key, part in parts.items()
         }
         return SavedNormalization(
-            mean={key: read_array(each["mean"]).astype(np.float64) for key, each in fields.items()},
-            var={key: read_array(each["var"]).astype(np.float64) for key, each in fields.items()},
+            mean={key: read_array(values["mean"]).astype(np.float64) for key, values in fields.items()},
+            var={key: read_array(values["var"]).astype(np.float64) for key, values in fields.items()},
             clip=float(state["clip_obs"]),
         )
 

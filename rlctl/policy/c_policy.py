@@ -50,7 +50,7 @@ class CPolicy(Policy):
         self._action = np.zeros(math.prod(self.action_space.shape or ()), action_type(info))
         # Opaque, and a multiple of four bytes.
         self._memory = np.zeros(library.rlctl_state_size() // 4, np.float32)
-        self._pointers = tuple(each.ctypes.data for each in (self._observation, self._memory, self._action))
+        self._pointers = tuple(array.ctypes.data for array in (self._observation, self._memory, self._action))
         self._shape = self.action_space.shape or ()
         self._dtype = self._action.dtype if isinstance(self.action_space, spaces.Box) else np.dtype(np.int64)
 

@@ -34,7 +34,7 @@ ACTOR_CRITIC = (*SQUASHED_GAUSSIAN, *DETERMINISTIC)
 
 
 class Score(pydantic.BaseModel, extra="forbid"):
-    """What a policy reached in the evaluation that it was kept for."""
+    """The score of the evaluation that made a policy the best of its run."""
 
     success: float | None
     mean_return: float

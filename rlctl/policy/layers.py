@@ -107,6 +107,7 @@ class Normalize(Layer):
         self.prepare()
 
     def prepare(self) -> None:
+        """Compute the deviation from the variance, which may have changed."""
         self._deviation = np.sqrt(self.variance + self.epsilon)
 
     def __call__(self, value: Array) -> Array:

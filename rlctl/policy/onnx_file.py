@@ -46,17 +46,17 @@ def check(content: bytes) -> None:
     if model.functions or model.training_info:
         raise ValueError("it has functions, which no policy needs")
     attributes = [attribute for node in model.graph.node for attribute in node.attribute]
-    if any(each.graphs or each.HasField("g") for each in attributes):
+    if any(attribute.graphs or attribute.HasField("g") for attribute in attributes):
         raise ValueError("it has loops or branches, which no policy needs")
     if model.graph.sparse_initializer or any(
-        each.sparse_tensors or each.HasField("sparse_tensor") for each in attributes
+        attribute.sparse_tensors or attribute.HasField("sparse_tensor") for attribute in attributes
     ):
         raise ValueError("it has sparse tensors, which no policy needs")
-    inside = [tensor for each in attributes for tensor in (each.t, *each.tensors)]
+    inside = [tensor for attribute in attributes for tensor in (attribute.t, *attribute.tensors)]
     for tensor in (*model.graph.initializer, *inside):
         if tensor.external_data or tensor.data_location != onnx.TensorProto.DEFAULT:
             raise ValueError("a tensor of it is in another file")
-    metadata = {each.key: each.value for each in model.metadata_props}
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
     if METADATA_KEY in metadata:
         _check_digest(content, metadata.get(DIGEST_KEY, ""))
 

@@ -37,7 +37,7 @@ class OnnxPolicy(Policy):
     def __init__(self, info: PolicyInfo, session: onnxruntime.InferenceSession) -> None:
         super().__init__(info)
         self.session = session
-        inputs = {each.name: each.shape for each in session.get_inputs()}
+        inputs = {port.name: port.shape for port in session.get_inputs()}
         for key, (shape, _) in self._parts.items():
             if inputs.get(key or SINGLE_INPUT, [None])[1:] != list(shape):
                 raise ValueError(f"no input {key or SINGLE_INPUT!r} of shape {('batch', *shape)}")

@@ -59,7 +59,9 @@ class Provenance(pydantic.BaseModel, extra="forbid"):
 
 def list_shipped() -> list[str]:
     """Return the installed tasks that ship a policy."""
-    return [each.name for each in installed.list_installed() if each.problem is None and each.policy_file is not None]
+    return [
+        entry.name for entry in installed.list_installed() if entry.problem is None and entry.policy_file is not None
+    ]
 
 
 def find_shipped_policy(task: str | None) -> Path:
@@ -68,7 +70,7 @@ def find_shipped_policy(task: str | None) -> Path:
         raise UsageError(f"--pretrained: give a task that ships a policy: {', '.join(list_shipped()) or 'none does'}")
     entry = installed.find(task)
     if entry is None:
-        names = [each.name for each in installed.list_installed()]
+        names = [entry.name for entry in installed.list_installed()]
         raise UsageError(
             f"no task {task!r} is installed, and only installed tasks ship policies.{did_you_mean(task, names)}"
         )

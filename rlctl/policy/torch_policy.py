@@ -186,7 +186,8 @@ class TorchPolicy(Policy):
     def normalize(self, observations: Observations) -> Observations:
         """Return observations, one or several, as the network gets them."""
         parts = split(observations)
-        normalized: Observations = join({**parts, **{key: each(parts[key]) for key, each in self._normalize.items()}})
+        changed = {key: normalize(parts[key]) for key, normalize in self._normalize.items()}
+        normalized: Observations = join({**parts, **changed})
         return normalized
 
     def act(self, observations: Observations) -> NDArray[Any]:

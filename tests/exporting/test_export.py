@@ -99,7 +99,7 @@ def test_not_verified_is_not_kept(small, train, write, tmp_path):
     target = tmp_path / "out" / "policy.onnx"
     target.parent.mkdir()
     target.write_bytes(b"former")
-    with pytest.raises(AnswerIsNo, match="not verified, not kept") as raised:
+    with pytest.raises(AnswerIsNo, match="not verified, not written") as raised:
         export(path, target)
     first, agreement, loop = str(raised.value).splitlines()
     assert first.startswith(f"{target}: ")
@@ -159,7 +159,7 @@ def test_only_near_ties_may_be_chosen_differently(action, logits, other, near_ti
     comparison = Comparison(policy)
     expected = policy.act(np.zeros((1, 3), np.float32))
     comparison.add(expected, np.array(other))
-    seen = comparison.found
+    seen = comparison.agreement
     assert (seen.near_ties, seen.beyond_limit) == ((1, 0) if near_tie else (0, 1))
     assert seen.agrees == near_tie
 
@@ -167,7 +167,7 @@ def test_only_near_ties_may_be_chosen_differently(action, logits, other, near_ti
 def test_not_a_number_is_beyond_the_limit(small, train, write):
     comparison = Comparison(TorchPolicy.load(write(train("ppo", small(), steps=0), "ppo", small())))
     comparison.add(np.zeros((2, 2), np.float32), np.array([[np.nan, 0.0], [0.0, 0.0]], np.float32))
-    assert comparison.found.beyond_limit == 1
+    assert comparison.agreement.beyond_limit == 1
 
 
 def test_episodes_are_compared_in_numbers():
@@ -256,7 +256,7 @@ def test_command_line_when_the_answer_is_no(rlctl, small, train, write, tmp_path
     done = rlctl("export", path.name, "--onnx", cwd=tmp_path)
     assert done.returncode == 1
     assert done.stdout == ""
-    assert done.stderr.startswith("error: policy.onnx: not verified, not kept: ")
+    assert done.stderr.startswith("error: policy.onnx: not verified, not written: ")
     assert not path.with_suffix(".onnx").exists()
 
 

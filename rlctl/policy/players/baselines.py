@@ -55,6 +55,7 @@ class ZeroPlayer(Player):
             self._action = np.full(space.shape or (), getattr(space, "start", 0), np.int64)
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Return the same action always."""
         return self._action, self._action
 
 
@@ -65,6 +66,7 @@ class RandomPlayer(Player):
         self._space = space
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Return an action that follows from seed and step alone."""
         self._space.seed(int(make_generator(seed, 0, step).integers(2**31)))
         action = self._space.sample()
         return action, action

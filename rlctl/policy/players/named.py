@@ -32,6 +32,7 @@ class ExportedPlayer(Player):
         self._policy = CPolicy.load(Path(path)) if path.endswith(LIBRARY_SUFFIX) else load_policy(Path(path))
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Return the deterministic action; at step 0 a recurrent policy forgets."""
         if step == 0:
             self._policy.reset()
         action = self._policy.predict(observation)

@@ -67,17 +67,17 @@ class Player(abc.ABC):
         """Return the action that is stored and the one that the environment takes, for a step of an episode, from 0."""
 
     def explore(self, exploration: Exploration) -> None:  # noqa: B027 (most players cannot)
-        """Differ from the deterministic actions so from now on."""
+        """Explore this way from now on."""
 
     def close(self) -> None:  # noqa: B027
-        """Give back what it holds."""
+        """Release what it holds, such as a connection."""
 
     def report(self) -> dict[str, Any]:
-        """Return what there is to say of the episode that ended, as plain data."""
+        """Return plain data about the episode that ended, for its result."""
         return {}
 
     def begin_segment(self, seed: int, step: int) -> None:  # noqa: B027 (most players have nothing to do)
-        """Begin to play on at a step of an episode."""
+        """Continue at a step of an episode; the policy's numbers may have changed."""
 
     @property
     def state(self) -> Array | None:

@@ -37,12 +37,15 @@ class PolicyPlayer(Player):
 
     @property
     def state(self) -> Array | None:
+        """Hidden and cell state, shape (2, layers, hidden); None without an LSTM."""
         return None if self._network.lstm is None else self._network.lstm.state
 
     def explore(self, exploration: Exploration) -> None:
+        """Explore from the next action on."""
         self.exploration = exploration
 
     def begin_segment(self, seed: int, step: int) -> None:
+        """Use the present numbers; gSDE draws its matrix for this step."""
         self._network.prepare()
         if self._uses_sde and self.exploration.stochastic:
             self._draw_matrix(seed, step)
@@ -56,6 +59,10 @@ class PolicyPlayer(Player):
         self._matrix = std * make_generator(seed, _MATRIX, step).standard_normal(size, np.float32)
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Return the action that is stored, shape (elements,), and that of the environment; an LSTM goes one step on.
+
+        Raises `DivergedError` for an action that is not finite.
+        """
         exploration = self.exploration
         if exploration.warmup:
             return self._act_uniform(*self._noise.draw(seed, step))
