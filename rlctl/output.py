@@ -7,6 +7,7 @@ import functools
 import itertools
 import json
 import os
+import re
 import stat
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console, JustifyMethod
     from rich.text import Text
 
+_CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # all but tab and newline
 _PIPED_WIDTH = 1000  # nothing folds: a line stays a line for grep
 
 
@@ -64,15 +66,28 @@ def err() -> Console:
     return _make_console(None)
 
 
+def escape_controls(text: str) -> str:
+    """Return text with control characters written as `\\x1b`: a terminal obeys them, and names can contain any."""
+    return _CONTROLS.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
+
+
 def _make_console(stream: TextIO | None) -> Console:
     """Return a console for a stream, or for what stderr is whenever it writes: a notebook may replace it."""
-    from rich.console import Console
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
+
+    class SafeConsole(Console):
+        """Writes no control character of a text itself, whatever is printed."""
+
+        def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+            for segment in super().render(renderable, options):
+                yield segment if segment.control else Segment(escape_controls(segment.text), segment.style)
 
     terminal = (stream or sys.stderr).isatty()
     width = None if terminal else _PIPED_WIDTH
     # Neither markup nor emoji: "car.py:Car: no findings" would have one in it, and "joint[left]" would lose its end.
     options: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False, "soft_wrap": not terminal}
-    return Console(file=stream, stderr=stream is None, width=width, **options)
+    return SafeConsole(file=stream, stderr=stream is None, width=width, **options)
 
 
 def is_utf8() -> bool:

@@ -89,9 +89,11 @@ def limit_exit_handlers(code: int) -> None:
 
 def report(error: RlctlError) -> int:
     """Print one of our own errors; return its exit code."""
+    from rlctl.output import escape_controls
+
     if error.details:
-        print(error.details.rstrip(), file=sys.stderr)
-    first, *rest = str(error).splitlines()
+        print(escape_controls(error.details.rstrip()), file=sys.stderr)
+    first, *rest = escape_controls(str(error)).split("\n")
     print(f"error: {first}", *rest, sep="\n", file=sys.stderr)
     return error.exit_code
 

@@ -125,7 +125,8 @@ def plot(run: RunDescription, name: str) -> str:
     plotext.plotsize(*_PLOT_SIZE)
     plotext.title(f"{name} over steps")
     if name == "success":
-        plotext.ylim(0, 1)
+        plotext.ylim(0, 1)  # a point far outside would take all memory
+        lines = [[(step, min(max(value, 0.0), 1.0)) for step, value in points] for points in lines]
     for points, label, marker in zip(
         lines, ("training", "evaluations"), (("braille", "●") if is_utf8 else (".", "o")), strict=True
     ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import math
@@ -15,6 +16,8 @@ from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
 
 Rows = list[dict[str, float | None]]
 """Of a table, oldest first; an empty field is None."""
+_LARGEST = 1e100
+"""No training has larger numbers; what draws and adds them would overflow."""
 _TAIL_BYTES = 4096
 """The last row of a table is looked for here; a row has at most some hundred bytes."""
 
@@ -98,26 +101,26 @@ def summarize(path: Path) -> RunSummary:
 
 
 def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
-    last = last_row(run.metrics_file)
+    last = last_row(run.metrics_file) or {}
     evaluations = read_table(run.evals_file)
     best = best_row(evaluations)
     if status.get("status") == "finished":  # new episodes may have decided for the last policy
         best = next((row for row in evaluations if row["steps"] == status.get("best_step")), best)
     state, reason = _state(run, status)
-    steps = int(float(last["steps"])) if last else status.get("steps")
+    steps = _first_number(last.get("steps"), status.get("steps"))
     if state == "stopped" and (checkpoints := run.checkpoints()):
-        steps = max(steps or 0, int(checkpoints[-1].name))  # an interrupted training saves after its last row
+        steps = max(steps or 0.0, float(checkpoints[-1].name))  # an interrupted training saves after its last row
     return RunSummary(
         path=run.path,
         task=status["task"],
         algo=str(status.get("algo", "")),
-        seed=status.get("seed"),
+        seed=_whole(_first_number(status.get("seed"))),
         state=state,
         reason=reason,
         started=str(status.get("started", "")),
-        steps=steps,
-        seconds=status.get("seconds") or (float(last["seconds"]) if last else None),
-        best_step=int(best["steps"] or 0) if best else None,
+        steps=_whole(steps),
+        seconds=_first_number(status.get("seconds"), last.get("seconds")),
+        best_step=_whole(best["steps"]) if best else None,
         best_success=best["success"] if best else None,
         best_return=best["return"] if best else None,
         changes=dict(status.get("recipe_changes") or {}),
@@ -125,6 +128,20 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
         folder=str(status.get("folder") or ""),
         source_sha256=str(status.get("source_sha256") or ""),
     )
+
+
+def _first_number(*values: object) -> float | None:
+    """Return the first value that is a number, or the text of one, and not absurdly large."""
+    for value in values:
+        if isinstance(value, str | int | float) and not isinstance(value, bool):
+            with contextlib.suppress(ValueError, OverflowError):
+                if abs(number := float(value)) < _LARGEST:
+                    return number
+    return None
+
+
+def _whole(number: float | None) -> int | None:
+    return None if number is None else int(number)
 
 
 def _state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str]:
@@ -144,7 +161,10 @@ def _first_line(text: str) -> str:
 
 
 def read_table(path: Path) -> Rows:
-    """Return a table's rows with numbers; rows cut short by a killed process are left out."""
+    """Return a table's rows with numbers; rows cut short by a killed process or without numbers are left out.
+
+    Infinite and absurdly large values are None.
+    """
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as file:
             rows = list(csv.DictReader(file))
@@ -157,9 +177,10 @@ def _numbers(row: dict[str, Any]) -> dict[str, float | None] | None:
     if None in row or None in row.values():
         return None
     try:
-        return {name: float(value) if value else None for name, value in row.items()}
+        numbers = {name: float(value) if value else None for name, value in row.items()}
     except ValueError:
         return None
+    return {name: value if value is not None and abs(value) < _LARGEST else None for name, value in numbers.items()}
 
 
 def list_points(rows: Rows, column: str) -> list[tuple[float, float]]:

@@ -19,8 +19,9 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_litter(tmp_path, monkeypa
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError, match="No space") as caught:
         files.write_bytes(path, b"new")
+    assert caught.value.filename == str(path)  # and not the file beside it
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["policy.bin"]
 

@@ -86,7 +86,7 @@ def summarize_result(report: Report) -> str:
         return "No evaluation yet."
     if len(scored) == 1:
         summary = scored[0].summary
-        best = next(row for row in scored[0].evaluations if row.get("steps") == summary.best_step)
+        best = next((row for row in scored[0].evaluations if row.get("steps") == summary.best_step), {})
         count = f"{best['episodes']:,.0f}" if best.get("episodes") else "its"
         verb = "has"
         if summary.best_success is not None:

@@ -31,7 +31,7 @@ def write_report(
     is_html = form == "html"
     text = _render(f"report.{form}.jinja", is_html, _values(report, is_html, pictures))
     if target is None and not is_html:
-        output.results().write(text)
+        output.results().write(output.escape_controls(text))
         return None
     path = target or DEFAULT_FILE
     files.write_bytes(path, text.encode())
@@ -41,8 +41,18 @@ def write_report(
 def _render(template: str, escape: bool, values: dict[str, Any]) -> str:
     import jinja2
 
-    environment = jinja2.Environment(autoescape=escape, trim_blocks=True, undefined=jinja2.StrictUndefined)
+    finalize = None if escape else _escape_html
+    environment = jinja2.Environment(
+        autoescape=escape, trim_blocks=True, undefined=jinja2.StrictUndefined, finalize=finalize
+    )
     return environment.from_string(Path(__file__).with_name(template).read_text(encoding="utf-8")).render(values)
+
+
+def _escape_html(value: Any) -> Any:
+    """Return a text for Markdown, in which HTML would act; a block of code is marked as safe and stays as it is."""
+    if hasattr(value, "__html__") or not isinstance(value, str):
+        return value
+    return value.replace("&", "&amp;").replace("<", "&lt;")
 
 
 def _values(report: Report, is_html: bool, pictures: bool) -> dict[str, Any]:

@@ -1,0 +1,82 @@
+"""What stands in a run folder, and its name, is text: no terminal obeys it, and nothing in it is a traceback."""
+
+import json
+import random
+
+import pytest
+
+from rlctl.errors import RlctlError
+from rlctl.run.directory import RunDirectory
+from rlctl.runs import listing, show
+from rlctl.runs.report.write import write_report
+
+RED = "\x1b[31mred\x1b]0;title\x07\x9b2J"
+
+
+def test_escape_sequences_never_reach_the_terminal(write_run, rlctl):
+    name = f"reach/2026-11-21_10-00-00{RED}_s0"
+    folder = write_run(
+        name, status="failed", error=RED, algo=RED, recipe_changes={RED: RED}, versions={RED: RED}, started=RED
+    )
+    write_run("reach/2026-11-21_11-00-00_s0", algo="ppo")
+    (folder.parent / RED).mkdir()
+    shown = rlctl("runs").stdout
+    assert r"2026-11-21_10-00-00\x1b[31mred\x1b]0;title" in shown
+    outputs = [
+        rlctl("runs", "show", folder),
+        rlctl("runs", "report", folder, "--format", "md"),
+        rlctl("runs", "show", f"nowhere{RED}"),
+        rlctl("runs", "rm", folder),
+        rlctl("eval", folder),
+    ]
+    assert [done.returncode for done in outputs] == [0, 0, 5, 2, 5]
+    for text in (shown, *(done.stdout + done.stderr for done in outputs)):
+        assert r"\x1b[31mred" in text
+        assert not {"\x1b", "\x07", "\x9b"} & set(text)
+
+
+def test_markdown_has_no_html_of_a_run(write_run, rlctl):
+    folder = write_run("reach/2026-11-21_10-00-00<b>_s0", status="failed", error="<img src=x> & more", algo="<i>")
+    (folder / "recipe.yaml").write_text("algo: <ppo>\n```\n<script>\n")
+    text = rlctl("runs", "report", folder, "--format", "md").stdout
+    assert "&lt;img src=x> &amp; more" in text
+    outside = "".join(text.split("```")[::2])
+    assert not {"<b>", "<i>", "<img", "<script"} & {
+        part for part in ("<b>", "<i>", "<img", "<script") if part in outside
+    }
+    assert "algo: <ppo>" in text  # in a block of code nothing acts
+
+
+VALUES = ["abc", RED, 1e308, -1e308, 10**400, float("nan"), True, None, [1], {"a": [1]}, ""]
+CELLS = ["abc", "1e308", "-1e308", "nan", "inf", RED.replace("\x07", ""), "5e-324", "9" * 30, ""]
+COLUMNS = ("steps", "seconds", "return", "success", "length", "terminated", "term/a", "approx_kl", "value", "std")
+
+
+def scramble(folder, random):
+    status = json.loads((folder / "run.json").read_text())
+    status |= {key: random.choice(VALUES) for key in status if key != "task" and random.random() < 0.2}
+    (folder / "run.json").write_text(json.dumps(status))
+    for file in ("metrics.csv", "evals.csv"):
+        rows = [
+            [str(100 * step), *(random.choice(CELLS) if random.random() < 0.4 else "0.5" for _ in COLUMNS[1:])]
+            for step in range(random.choice((0, 1, 5, 14)))
+        ]
+        (folder / file).write_text("\n".join(",".join(row) for row in [COLUMNS, *rows]) + "\n")
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.filterwarnings("error")
+def test_whatever_a_run_holds_it_is_shown(write_run, seed, tmp_path):
+    folder = write_run(
+        "reach/2026-11-21_10-00-00_s0", steps=1000, best_step=1000, started="2026-11-21T10:00:00", error="",
+        recipe_changes={"seed": 3}, versions={"rlctl": "0.1"}, observations_outside=3, folder="/", source_sha256="a",
+        **{"from": {"policy": "a", "training_steps": 3}},
+    )  # fmt: skip
+    scramble(folder, random.Random(seed))
+    for sort in ("newest", "score", "steps", "minutes"):
+        listing.show(listing.list_runs(sort=sort), str(tmp_path / "list.json"))
+    try:
+        show.show(show.RunDescription(RunDirectory(folder)), str(tmp_path / "show.json"))
+        write_report([str(folder)], target=tmp_path / "report.html", pictures=False)
+    except RlctlError:
+        pass
