@@ -22,6 +22,8 @@ _SORT_KEYS = {
 }
 _COLUMNS = ("run", "algo", "seed", "state", "steps", "minutes", "success", "return", "differs from the recipe")
 _LEFT = ("run", "algo", "state", "differs from the recipe")
+_DROP = ("minutes", "differs from the recipe", "algo", "seed", "return", "steps")
+"""The columns that a narrow terminal does without, in this order."""
 _CHANGES_SHOWN = 4
 _STATE_SHOWN = 44  # characters; `rlctl runs show` has the whole error
 
@@ -53,7 +55,7 @@ def show(runs: list[RunSummary], json: str | None) -> None:
     if not runs:
         out.print(f"no runs yet under {ROOT.resolve()}; train one: rlctl train reach")
         return
-    output.print_table(_COLUMNS, map(_cells, runs), left=_LEFT)
+    output.print_table(_COLUMNS, map(_cells, runs), left=_LEFT, drop=_DROP)
     for change, names in _find_source_changes(runs).items():
         out.print(f"warning: {change}, in: {', '.join(names)}")
 

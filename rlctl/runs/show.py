@@ -22,6 +22,7 @@ from rlctl.runs.listing import as_json
 from rlctl.runs.summary import Rows, list_points, summarize
 
 _EVALUATIONS_SHOWN = 12
+_ALWAYS_SHOWN = ("steps", "success", "return")
 _PLOT_SIZE = (90, 13)
 """Columns and lines of a curve."""
 
@@ -140,7 +141,11 @@ def _show_evaluations(rows: Rows) -> None:
     shown = rows[-_EVALUATIONS_SHOWN:]
     if len(rows) > len(shown):
         output.out().print(f"the last {len(shown)} of {len(rows)} evaluations:")
-    output.print_table(*tabulate(shown)) if shown else output.out().print("no evaluation yet")
+    if not shown:
+        output.out().print("no evaluation yet")
+        return
+    columns, cells = tabulate(shown)
+    output.print_table(columns, cells, drop=[name for name in reversed(columns) if name not in _ALWAYS_SHOWN])
 
 
 def tabulate(rows: Rows) -> tuple[list[str], list[list[str]]]:

@@ -107,7 +107,9 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
     if status.get("status") == "finished":  # new episodes may have decided for the last policy
         best = next((row for row in evaluations if row["steps"] == status.get("best_step")), best)
     state, reason = _state(run, status)
-    steps = _first_number(last.get("steps"), status.get("steps"))
+    steps = _first_number(last.get("steps", status.get("steps")))
+    if last and steps is None:
+        raise ArtifactError(f"{run.metrics_file.name}: its last row has no number of steps")
     if state == "stopped" and (checkpoints := run.checkpoints()):
         steps = max(steps or 0.0, float(checkpoints[-1].name))  # an interrupted training saves after its last row
     return RunSummary(

@@ -1,4 +1,10 @@
+import contextlib
 import json
+import os
+import pty
+import re
+import subprocess
+import sys
 import time
 
 import pytest
@@ -96,3 +102,38 @@ def test_a_thousand_runs_are_listed_quickly(write_run):
     begun = time.process_time()
     assert len(list_runs()) == 1000
     assert time.process_time() - begun < 5  # 0.1 on an idle machine
+
+
+def on_terminal(*arguments, columns):
+    """Return what a command shows on a terminal of so many columns."""
+    leader, follower = pty.openpty()
+    env = {**os.environ, "COLUMNS": str(columns), "NO_COLOR": "1", "TERM": "xterm"}
+    command = [sys.executable, "-m", "rlctl", *arguments]
+    done = subprocess.Popen(command, stdout=follower, stderr=subprocess.PIPE, env=env)
+    os.close(follower)
+    shown = b""
+    with contextlib.suppress(OSError):  # how Linux reports that the other end has closed
+        while part := os.read(leader, 4096):
+            shown += part
+    done.communicate()
+    os.close(leader)
+    return re.sub(r"\x1b\[[0-9;]*m", "", shown.decode()).replace("\r\n", "\n")
+
+
+def test_a_narrow_terminal_has_fewer_columns_and_no_broken_names(write_run):
+    name = "half-cheetah/2026-01-01_00-00-00_s0"
+    changes = {"algo_kwargs.gamma": 0.9, "total_timesteps": 1000}
+    run = write_run(name, recipe_changes=changes, evals=((123_456, 0.25, 1234.5),), steps=123_456)
+    terms = [f"term/quantity_{number}" for number in range(9)]
+    (run / "evals.csv").write_text(
+        f"steps,episodes,success,return,{','.join(terms)}\n123456,100,0.25,1234.5,{','.join(['0.123456'] * 9)}\n"
+    )
+    shown = on_terminal("runs", columns=80)
+    assert max(map(len, shown.splitlines())) <= 80
+    (line,) = [line for line in shown.splitlines() if name in line]
+    assert line.split() == [name, "ppo", "0", "done", "1,000", "25.0%", "1234.50"]
+    assert f"{name}  ppo" in on_terminal("runs", columns=160)
+    table = on_terminal("runs", "show", name.replace("half", "runs/half"), columns=80).splitlines()
+    header = next(index for index, line in enumerate(table) if line.startswith("  steps"))
+    assert len(table[header]) <= 80
+    assert table[header + 1].split()[:4] == ["123,456", "100", "25.0%", "1234"]
