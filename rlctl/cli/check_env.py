@@ -27,7 +27,8 @@ def check_env(
     env_timeout: EnvTimeout = 10.0,
     list_rules: Annotated[bool, typer.Option("--list", help="List all rules, and do nothing else.")] = False,
     explain: Annotated[
-        str | None, typer.Option(metavar="RULE", help="Say what a rule means, and do nothing else.")
+        str | None,
+        typer.Option(metavar="RULE", help="Say what a rule, or a finding as Q10, means."),
     ] = None,
 ) -> None:
     """Find what is wrong with an environment before hours of training do."""
@@ -38,6 +39,12 @@ def check_env(
     from rlctl.checking.formats import rules
     from rlctl.environments.spec import EnvSpec
 
+    if explain is not None and explain.upper().startswith("Q"):
+        from rlctl import output as streams
+        from rlctl.runs import diagnosis
+
+        streams.out().print("\n".join(diagnosis.explain(explain)))
+        return
     if list_rules or explain is not None:
         rules.show_list() if explain is None else rules.explain(explain)
         return

@@ -20,6 +20,9 @@ class _RunsGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
 
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only list what would be removed.")]
+
 app = typer.Typer(cls=_RunsGroup, help="List runs, show one, report and compare them, remove what is not needed.")
 
 
@@ -133,17 +136,25 @@ def remove_runs(
             min=0,
         ),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    yes: Yes = False,
+    dry_run: DryRun = False,
 ) -> None:
     """Remove runs, never one that is being trained."""
     from rlctl.runs.removal import plan_removal, remove_with_report
 
-    remove_with_report(plan_removal(runs or [], keep_best=keep_best), yes=yes)
+    remove_with_report(plan_removal(runs or [], keep_best=keep_best), yes=yes, dry_run=dry_run)
 
 
 @app.command("prune")
-def prune_runs(yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False) -> None:
+def prune_runs(
+    runs: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="RUN", help="Runs, groups, globs or folders of runs.", show_default="all"),
+    ] = None,
+    yes: Yes = False,
+    dry_run: DryRun = False,
+) -> None:
     """Remove the checkpoints of finished runs, which are needed only to make these longer."""
     from rlctl.runs.removal import plan_prune, remove_with_report
 
-    remove_with_report(plan_prune(), yes=yes)
+    remove_with_report(plan_prune(runs or []), yes=yes, dry_run=dry_run)

@@ -45,7 +45,10 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
         # The link first: names go by a clock, which may have been set back since.
         newest = _read_latest(root) or next(iter(_list_newest_first(root, "*/*/run.json", "*/*/*_s*/run.json")), None)
         if newest is None:
-            raise ArtifactError(f"no run yet under {root.resolve()}; train one: rlctl train reach")
+            tunings = sorted(root.glob(f"*/*/{TUNE_FILE}"))
+            trials = f", but trials of rlctl tune; name one in {tunings[-1].parent}" if tunings else ""
+            hint = trials or "; train one: rlctl train reach"
+            raise ArtifactError(f"no run yet under {root.resolve()}{hint}")
         return newest
     if (Path(text) / "run.json").is_file():
         return RunDirectory(Path(text))
@@ -58,6 +61,9 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
         return found[0]
     if text and Path(text).is_dir():
         raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
+    if Path(text).is_file() and Path(text).suffix != ".zip":
+        hint = f"; its run: {Path(text).parent}" if (Path(text).parent / "run.json").is_file() else ""
+        raise ArtifactError(f"{text}: not a run, and no policy (.safetensors, .onnx){hint}")
     if Path(text).suffix == ".zip":
         raise ArtifactError(
             f"{text}: a .zip, as Stable-Baselines3 saves models, not a run; make a policy of it: "
@@ -223,7 +229,8 @@ def _read_latest(root: Path) -> RunDirectory | None:
 
 
 def _list_newest_first(root: Path, *patterns: str) -> list[RunDirectory]:
-    found = (file.parent for pattern in patterns for file in root.glob(pattern))
-    runs = [run for run in found if _RUN_NAME.match(run.name)]
+    """Return the runs below `root`, but for the trials of a tuning."""
+    folders = (file.parent for pattern in patterns for file in root.glob(pattern))
+    runs = [run for run in folders if _RUN_NAME.match(run.name) and not (run.parent / TUNE_FILE).is_file()]
     runs.sort(key=lambda run: (run.name[:19], (run / "run.json").stat().st_mtime_ns), reverse=True)
     return [RunDirectory(run) for run in runs]

@@ -7,7 +7,6 @@ are compared as recipes: each run's best policy is evaluated, and the score of a
 from __future__ import annotations
 
 import dataclasses
-import glob
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, Evaluation, run_evaluation
-from rlctl.recipe.recipe import find_difference, find_mixed
-from rlctl.run.directory import RunDirectory, is_group
-from rlctl.run.group import find_group, read_group
-from rlctl.run.lookup import describe_source_change, find_run
+from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
+from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
+from rlctl.run.directory import RunDirectory
+from rlctl.run.lookup import describe_source_change
+from rlctl.runs.selection import find_runs_of
 from rlctl.runs.significance import Difference, Quantity, Verdict, compare_episodes, compare_seeds
 from rlctl.runs.summary import read_table, summarize
 
@@ -152,7 +152,7 @@ def compare(
             Candidate(
                 side,
                 _differences(baseline, side, of_recipes, len(others)),
-                find_difference(recipe[0], recipes[0][0]),
+                find_recipe_changes(recipe[0], recipes[0][0]),
             )
             for side, recipe in zip(others, recipes[1:], strict=True)
         ],
@@ -161,23 +161,21 @@ def compare(
     )
 
 
-def find_runs_of(text: str) -> list[RunDirectory]:
-    """Return the runs that a word stands for: those of a glob, a group or a folder of runs, or one run."""
-    if any(character in text for character in "*?[") and not Path(text).exists():
-        found = [RunDirectory(path) for path in map(Path, sorted(glob.glob(text))) if (path / "run.json").is_file()]
-        if not found:
-            raise ArtifactError(f"{text}: no run matches")
-        return found
-    path = Path(text)
-    if not is_group(path) and (found := [RunDirectory(file.parent) for file in sorted(path.glob("*/run.json"))]):
-        return found
-    if (folder := find_group(text)) is None:
-        return [find_run(text)]
-    group = read_group(folder)
-    runs = [run for seed in group.seeds if (run := group.find_run(seed)) is not None]
-    if not runs:
-        raise ArtifactError(f"{text}: none of its seeds has begun")
-    return runs
+def find_recipe_changes(recipe: Recipe, baseline: Recipe) -> dict[str, tuple[Any, Any]]:
+    """Return per dotted key that differs its value in `recipe` and in `baseline`; where it is not set, the default."""
+    changes = {
+        key: (_find_effective(recipe, key, value), _find_effective(baseline, key, before))
+        for key, (value, before) in find_difference(recipe, baseline).items()
+    }
+    return {key: pair for key, pair in changes.items() if pair[0] != pair[1]}
+
+
+def _find_effective(recipe: Recipe, key: str, value: Any) -> Any:
+    section, _, name = key.partition(".")
+    if value != NOT_SET or section != "algo_kwargs":
+        return value
+    field = ALGORITHM_PARAMETERS[recipe.algo].model_fields.get(name)
+    return value if field is None else field.default
 
 
 def _refuse_unequal(texts: Sequence[str], groups: list[list[RunDirectory]]) -> None:

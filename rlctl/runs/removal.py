@@ -13,7 +13,8 @@ from rlctl import output
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
 from rlctl.runs.listing import list_runs
-from rlctl.runs.summary import RunSummary
+from rlctl.runs.selection import find_runs_of
+from rlctl.runs.summary import RunSummary, summarize
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,10 +67,18 @@ def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:
     return [run for task in by_task.values() for run in task[count:]]
 
 
-def plan_prune(root: Path = ROOT) -> Removal:
-    """Find the checkpoints, replay buffers included, of finished runs; they are needed only to train on."""
-    runs = [run for run in list_runs(root=root) if run.state == "done" and not is_being_written(run.path)]
-    folders = [RunDirectory(run.path).checkpoint(0).parent for run in runs]
+def plan_prune(runs: Sequence[str] = (), root: Path = ROOT) -> Removal:
+    """Find the checkpoints, replay buffers included, of finished runs; they are needed only to train on.
+
+    `runs` are runs, groups, globs or folders of runs; by default all. Raises `UsageError` for one of these that has not
+    finished.
+    """
+    named = [summarize(run.path) for text in runs for run in find_runs_of(text)]
+    for run in named:
+        if run.state != "done":
+            raise UsageError(f"{run.path}: {run.state}; only a finished run can do without its checkpoints")
+    candidates = named if runs else [run for run in list_runs(root=root) if run.state == "done"]
+    folders = [RunDirectory(run.path).checkpoint(0).parent for run in candidates if not is_being_written(run.path)]
     return _measured([folder for folder in folders if folder.is_dir()])
 
 
@@ -78,8 +87,8 @@ def _measured(paths: list[Path]) -> Removal:
     return Removal(paths, size)
 
 
-def remove_with_report(removal: Removal, *, yes: bool) -> None:
-    """List what is to go and its size, ask, remove, and say what came free.
+def remove_with_report(removal: Removal, *, yes: bool, dry_run: bool = False) -> None:
+    """List what is to go and its size, ask, remove, and say what came free; `dry_run` only lists.
 
     Raises `UsageError` where nobody can be asked and `yes` is not set.
     """
@@ -90,6 +99,9 @@ def remove_with_report(removal: Removal, *, yes: bool) -> None:
         out.print("nothing to remove")
         return
     what = output.format_count(len(removal.paths), "folder")
+    if dry_run:
+        out.print(f"would remove {what}: {format_bytes(removal.bytes)}")
+        return
     refusal = "nothing was removed: there is no terminal to ask on; --yes removes without asking"
     if not yes and not output.confirm(f"remove {what}, {format_bytes(removal.bytes)}?", refusal):
         return

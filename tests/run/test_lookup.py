@@ -194,3 +194,23 @@ def test_a_task_by_path_is_found_from_other_folders(root, make_run, tmp_path, mo
     assert lookup.locate_task("swing.py:Swing", moved) == "swing.py:Swing"
     assert lookup.locate_task("reach", moved) == "reach"
     assert lookup.locate_task("swing.py:Swing", None) == "swing.py:Swing"
+
+
+def test_trials_of_a_tuning_are_not_the_latest(root, make_run):
+    assert "train one" in error(ArtifactError, find_run, "latest", root)
+    make_run("reach/2026-01-02_10-00-00_tune", "2026-01-02_10-00-01_s0", policy=None)
+    folder = root / "reach/2026-01-02_10-00-00_tune"
+    (folder / directory.TUNE_FILE).write_text("{}")
+    assert f"but trials of rlctl tune; name one in {folder}" in error(
+        ArtifactError, find_policy, "latest", "best", root
+    )
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    assert find_policy("latest", root=root).run.path == run.path
+
+
+def test_a_file_that_is_no_policy(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    run.metrics_file.write_text("steps\n")
+    assert error(ArtifactError, find_policy, str(run.metrics_file), "best", root) == (
+        f"{run.metrics_file}: not a run, and no policy (.safetensors, .onnx); its run: {run.path}"
+    )

@@ -8,9 +8,11 @@ import pytest
 from rlctl.environments.spec import EnvSpec, merge
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, choose_spec, load_player
+from rlctl.recipe.sources import resolve
 from rlctl.run.train_request import TrainRequest
-from rlctl.runs.comparison import Candidate, Comparison, Side, compare, find_runs_of
+from rlctl.runs.comparison import Candidate, Comparison, Side, compare, find_recipe_changes
 from rlctl.runs.comparison_report import as_json, format_needed
+from rlctl.runs.selection import find_runs_of
 from rlctl.runs.significance import Verdict
 from rlctl.training.request import run_training
 from tests.training.conftest import ENVS, TINY
@@ -116,3 +118,11 @@ def test_gate(root):
                 each.check()
         else:
             each.check()
+
+
+def test_a_parameter_that_is_not_set_has_its_default():
+    higher = resolve("ant", None, {"algo": "sac", "algo_kwargs": {"learning_rate": 0.002}})
+    unset = resolve("ant", None, {"algo": "sac"})
+    same = resolve("ant", None, {"algo": "sac", "algo_kwargs": {"learning_rate": 0.0003}})
+    assert find_recipe_changes(higher, unset) == {"algo_kwargs.learning_rate": (0.002, 0.0003)}
+    assert find_recipe_changes(same, unset) == {}

@@ -161,7 +161,7 @@ def test_standing_that_still_gets_longer_is_no_finding(write_training):
         ("Q3", {**FLAT, "gradient_norm": np.geomspace(0.1, 1e9, UPDATES)}, {"episodes": [make_episode(SMOOTH)]}),
         ("Q3", {}, {"status": "diverged", "error": "training diverged: loss is not finite at step 900."}),
         ("Q5", {}, {"status": "failed", "error": "task 'arm': Cannot load URDF file arm.urdf"}),
-        ("Q7", {}, {"episodes": [make_episode(SHAKING, terms=np.tile([1.0, 0.0], (100, 1)))]}),
+        ("Q7", {"success": None}, {"episodes": [make_episode(SHAKING, terms=np.tile([1.0, 0.0], (100, 1)))]}),
         ("Q9", {**FLAT, "explained_variance": 0.01}, {}),
         ("Q9", {"terminated": 1.0, "explained_variance": 0.01}, {}),
         (
@@ -322,3 +322,19 @@ def test_damaged_run_is_not_an_error(write_training):
     assert diagnose(run) == []
     run.status_file.unlink()
     assert diagnose(run) == []
+
+
+def test_who_learns_to_succeed_does_not_shake_in_place(write_training):
+    episodes = [make_episode(SHAKING, terms=np.tile([1.0, 0.0], (100, 1)))]
+    run = write_training({"success": None}, {"success": [0.03, 0.27, 0.3, 0.4, 0.47]}, episodes=episodes)
+    assert "Q7" not in {finding.id for finding in diagnose(run)}
+
+
+def test_a_finding_is_explained(rlctl):
+    done = rlctl("check-env", "--explain", "q10")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("Q10 ")
+    assert "\n  try: " in done.stdout
+    done = rlctl("check-env", "--explain", "Q99")
+    assert done.returncode == 2
+    assert "no finding 'Q99'" in done.stderr

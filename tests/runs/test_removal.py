@@ -124,3 +124,17 @@ def test_prune_frees_checkpoints_of_finished_runs_only(write_run):
     assert not (done / "checkpoints").exists()
     assert (done / "run.json").exists()
     assert (stopped / "checkpoints").exists()
+
+
+def test_only_what_is_named_is_pruned_and_a_dry_run_removes_nothing(write_run, rlctl):
+    one, two = (write_run(f"{task}/2026-01-01_00-00-00_s0") for task in ("reach", "ant"))
+    stopped = write_run("reach/2026-01-01_00-00-01_s0", "interrupted")
+    done = rlctl("runs", "prune", "runs/ant/*", "--dry-run")
+    assert done.stdout.splitlines() == ["runs/ant/2026-01-01_00-00-00_s0/checkpoints", "would remove 1 folder: 5.0 kB"]
+    done = rlctl("runs", "rm", one, "--dry-run")
+    assert (done.returncode, done.stdout.splitlines()[0]) == (0, str(one))
+    assert rlctl("runs", "prune", "runs/ant/*", "--yes").returncode == 0
+    assert [(run / "checkpoints").exists() for run in (one, two)] == [True, False]
+    done = rlctl("runs", "prune", stopped, "--yes")
+    assert done.returncode == 2
+    assert "only a finished run can do without its checkpoints" in done.stderr

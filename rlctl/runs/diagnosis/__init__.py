@@ -4,6 +4,6 @@ One sign alone means little: in a perfect training of `reach`, `approx_kl > 0.03
 finding needs several signs together; which ones, and all texts, are data in `findings.yaml`.
 """
 
-from rlctl.runs.diagnosis.findings import Finding, Grade, diagnose, format_end, format_finding
+from rlctl.runs.diagnosis.findings import Finding, Grade, diagnose, explain, format_end, format_finding
 
-__all__ = ["Finding", "Grade", "diagnose", "format_end", "format_finding"]
+__all__ = ["Finding", "Grade", "diagnose", "explain", "format_end", "format_finding"]

@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from rlctl.errors import UsageError, did_you_mean
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.run.directory import RunDirectory
 from rlctl.runs.diagnosis import episode_signs, record_signs, signs, update_signs
@@ -118,6 +119,21 @@ def _settings(names: Iterable[str], history: History) -> Iterable[Setting]:
             continue
         advice = f"usually {row['range']}, often {row['common']}; raise: {row['raise']}; lower: {row['lower']}"
         yield Setting(name, history.parameters[name], advice)
+
+
+def explain(code: str) -> list[str]:
+    """Return what the findings of an id, as Q10, mean, and what to try; raises `UsageError` for another id."""
+    texts = [text for text in _texts()["findings"] if text["id"] == code.upper()]
+    if not texts:
+        known = list(dict.fromkeys(text["id"] for text in _texts()["findings"]))
+        raise UsageError(f"no finding {code!r}.{did_you_mean(code, known)} There are: {', '.join(known)}")
+    lines = []
+    for text in texts:
+        lines += [f"{text['id']} {text['name']} ({text['grade']})", f"  {text['meaning']}"]
+        lines += [f"  try: {advice}" for advice in text["try"]]
+        if text["settings"]:
+            lines.append(f"  settings: {', '.join(text['settings'])}")
+    return lines
 
 
 def format_finding(finding: Finding) -> list[str]:

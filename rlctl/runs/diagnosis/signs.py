@@ -60,6 +60,14 @@ def _rises(success: Curve) -> bool:
     return len(success) > 1 and float(success.values[1:].max() - success.values[0]) > 0.1
 
 
+def success_rises(run: History) -> str | None:
+    """The success rate of the evaluations rises, so the policy does more than collect what every step pays."""
+    success = run.evaluation_curve("success")
+    if len(success) < 2 or not _rises(success):
+        return None
+    return f"success of the evaluations rises from {success.values[0]:.1%} to {success.values[1:].max():.1%}"
+
+
 def never_succeeds(run: History) -> str | None:
     """Success is reported, and there is hardly any."""
     found = [each for each in run.successes if len(each)]

@@ -13,8 +13,8 @@ import numpy as np
 from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.recipe.recipe import NOT_SET, find_mixed
 from rlctl.run.episode import RecordedEpisode
-from rlctl.runs.comparison import find_runs_of
 from rlctl.runs.diagnosis import Finding
+from rlctl.runs.selection import find_runs_of
 from rlctl.runs.show import RunDescription
 from rlctl.runs.summary import Rows, list_points
 
