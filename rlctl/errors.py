@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import re
+import shlex
 import traceback
 from collections.abc import Iterable
 from pathlib import Path
@@ -153,6 +155,19 @@ def check_name(
     if name not in (names := list(known)):
         there = short_repr(", ".join(names) or none, 200)
         raise error(f"{no_such} {short_repr(name)!r}.{did_you_mean(str(name), names)} {listed}: {there}.")
+
+
+def explain_missing_package(user: str, missing: str | None, extra: str) -> str:
+    """Return `USER needs MISSING: pip install ...` with the packages of an extra of rlctl, which is on no index."""
+    from importlib import metadata
+
+    try:
+        requirements = metadata.requires("rlctl") or []
+    except metadata.PackageNotFoundError:  # a copy that was not installed
+        requirements = []
+    suffix = re.compile(rf"""\s*;.*extra == ['"]{extra}['"].*""")
+    packages = [suffix.sub("", line) for line in requirements if suffix.search(line)]
+    return f"{user} needs {missing}: pip install {shlex.join(packages or [str(missing)])}"
 
 
 def short_repr(value: object, length: int = 80) -> str:

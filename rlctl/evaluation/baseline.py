@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import UsageError
+from rlctl.errors import UsageError, explain_missing_package
 from rlctl.policy.players.baselines import BASELINES, load_function
 from rlctl.policy.players.named import SERVER
 from rlctl.rollout.workers import Workers
@@ -51,7 +51,7 @@ def _ask_server(address: str) -> None:
     try:
         from rlctl.deploy.server.client import PolicyClient
     except ModuleNotFoundError as error:
-        raise UsageError(f"--policy {address} needs {error.name}: pip install 'rlctl[serve]'") from None
+        raise UsageError(explain_missing_package(f"--policy {address}", error.name, "serve")) from None
     PolicyClient(address).close()
 
 

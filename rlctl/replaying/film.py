@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import RlctlError, UsageError
+from rlctl.errors import RlctlError, UsageError, explain_missing_package
 from rlctl.replaying.recorder import Choose, Rollout, frame_time, play_episode
 from rlctl.replaying.report import FilmReport
 from rlctl.replaying.scene import Env
@@ -34,7 +34,9 @@ def check_file(path: Path) -> None:
         try:
             import av  # noqa: F401
         except ImportError:
-            raise UsageError("--video: .mp4 needs PyAV: pip install 'rlctl[video]'; .gif needs nothing more") from None
+            raise UsageError(
+                f"{explain_missing_package(f'--video {path}', 'PyAV', 'video')}; .gif needs nothing more"
+            ) from None
 
 
 def make_filmable(spec: EnvSpec) -> Env:

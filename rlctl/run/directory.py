@@ -46,6 +46,9 @@ class RunDirectory:
     def __fspath__(self) -> str:
         return str(self.path)
 
+    def __repr__(self) -> str:
+        return f"RunDirectory({str(self.path)!r})"
+
     recipe_file = _Place("recipe.yaml")
     """The resolved recipe."""
     status_file = _Place("run.json")
@@ -94,6 +97,11 @@ class RunDirectory:
         from rlctl.recipe.recipe import validate
         from rlctl.recipe.sources import read
 
+        if not self.recipe_file.exists():
+            raise ArtifactError(
+                f"{self.recipe_file}: no such file; a run needs the recipe that it was trained with\n"
+                f"its policy can still be used: rlctl eval {self.best_policy}"
+            )
         content = read(self.recipe_file)
         if not files.is_as_sealed(self.recipe_file):
             raise ArtifactError(

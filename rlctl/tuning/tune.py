@@ -14,7 +14,7 @@ from typing import Any
 
 from rlctl import output
 from rlctl.environments.spec import merge
-from rlctl.errors import TaskError, UsageError
+from rlctl.errors import TaskError, UsageError, explain_missing_package
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import Recipe
 from rlctl.recipe.sources import find_config, resolve_with_stages
@@ -69,7 +69,7 @@ def _require_optuna() -> None:
     try:
         import optuna  # noqa: F401
     except ModuleNotFoundError as error:
-        raise UsageError(f"rlctl tune needs {error.name}: pip install 'rlctl[tune]'") from None
+        raise UsageError(explain_missing_package("rlctl tune", error.name, "tune")) from None
 
 
 def _check(dimension: Dimension, task: str, request: TuneRequest) -> None:

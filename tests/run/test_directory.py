@@ -21,6 +21,14 @@ def error(kind, call, *arguments):
     return str(caught.value)
 
 
+def test_a_recipe_that_was_deleted(make_run):
+    run = make_run("reach", "2026-01-01_00-00-00_s0")
+    with pytest.raises(
+        ArtifactError, match=r"recipe.yaml: no such file; a run needs the recipe that it was trained with"
+    ):
+        run.recipe()
+
+
 def test_a_recipe_that_was_edited_is_refused(make_run):
     run = make_run("reach", "2026-01-01_00-00-00_s0")
     run.write_recipe(Recipe(algo="ppo", total_timesteps=100, n_envs=4, seed=3))

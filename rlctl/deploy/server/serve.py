@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.deploy.server.served_policy import load_served_policy
-from rlctl.errors import ArtifactError, RlctlError, UsageError
+from rlctl.errors import ArtifactError, RlctlError, UsageError, explain_missing_package
 
 if TYPE_CHECKING:
     from rlctl.deploy.server.server import PolicyServer
@@ -46,7 +46,7 @@ def make_server(file: Path, settings: ServerSettings) -> PolicyServer:
 
         from rlctl.deploy.server.server import PolicyServer
     except ModuleNotFoundError as error:
-        raise UsageError(f"rlctl serve needs {error.name}: pip install 'rlctl[serve]'") from None
+        raise UsageError(explain_missing_package("rlctl serve", error.name, "serve")) from None
     key = _read_key(settings.key_file)
     if settings.host not in LOOPBACK and key is None:
         raise UsageError(

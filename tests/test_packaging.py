@@ -1,0 +1,80 @@
+"""What is declared, what is packed, and what CI caches."""
+
+import ast
+import importlib.metadata
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+from hatchling.builders.sdist import SdistBuilder
+
+from rlctl.errors import explain_missing_package
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+OF_USERS = {"gym", "minari", "lerobot"}
+"""What rlctl looks for in an environment's own imports and needs nothing of."""
+
+
+def normalize(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def list_imports(folder: str) -> set[str]:
+    names: set[str] = set()
+    for file in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.add(node.module)
+    return names
+
+
+def test_every_import_is_a_declared_dependency():
+    extras = [line for lines in PROJECT["optional-dependencies"].values() for line in lines]
+    declared = {normalize(re.match(r"[\w.-]+", line)[0]) for line in [*PROJECT["dependencies"], *extras]}
+    providers = importlib.metadata.packages_distributions()
+    undeclared = set()
+    for name in list_imports("rlctl") | list_imports("plugins"):
+        top = name.partition(".")[0]
+        distributions = providers.get("google.protobuf" if name.startswith("google.protobuf") else top, [])
+        if name.startswith("google.protobuf"):
+            distributions = ["protobuf"]
+        of_rlctl = top in ("rlctl", "rlctl_manipulation", "rlctl_locomotion")
+        if of_rlctl or top in sys.stdlib_module_names or top in OF_USERS:
+            continue
+        if not declared & {normalize(distribution) for distribution in distributions}:
+            undeclared.add(name)
+    assert undeclared == set()
+
+
+def test_no_folder_of_the_sdist_has_a_readme_alone():
+    packed = [Path(file.relative_path) for file in SdistBuilder(str(ROOT)).recurse_included_files()]
+    assert {"README.md", "CHANGELOG.md", "constraints.txt", "docs/run.md", "examples/my_task/pyproject.toml"} <= {
+        path.as_posix() for path in packed
+    }
+    folders = {path.parent for path in packed if path.name == "README.md"} - {Path()}
+    full = {path.parent for path in packed if path.suffix != ".md"}
+    assert {folder for folder in folders if not any(place.is_relative_to(folder) for place in full)} == set()
+
+
+@pytest.mark.parametrize("file", [".github/workflows/ci.yml", ".github/workflows/nightly.yml", "examples/ci/rlctl.yml"])
+def test_what_pins_the_packages_is_in_the_key_of_the_cache(file):
+    workflow = yaml.safe_load((ROOT / file).read_text())
+    steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
+    caches = [step["with"] for step in steps if "setup-python" in step.get("uses", "")]
+    assert caches
+    for cache in caches:
+        assert "constraints.txt" in cache["cache-dependency-path"]
+        assert "pyproject.toml" in cache["cache-dependency-path"]
+
+
+def test_what_an_extra_needs_is_named_without_an_index_that_has_rlctl():
+    text = explain_missing_package("rlctl serve", "aiohttp", "serve")
+    assert text.startswith("rlctl serve needs aiohttp: pip install 'aiohttp<4,>=3.11' 'msgpack>=1.1'")
+    assert ";" not in text
+    assert explain_missing_package("rlctl fly", "wings", "fly") == "rlctl fly needs wings: pip install wings"
