@@ -13,7 +13,7 @@
     storage       atomic files, tables, YAML, and reading what others may have written
     errors        every error that a user can cause, with its exit code
 
-From Python: `rlctl.make`, `train`, `evaluate`, `load_policy`; `docs/architecture.md` has the whole picture.
+From Python: `rlctl.make`, `check_env`, `train`, `evaluate`, `load_policy`. `docs/architecture.md` is a tour.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ from typing import TYPE_CHECKING, Any
 from rlctl.version import __version__
 
 if TYPE_CHECKING:
-    from rlctl.api import evaluate, load_policy, train
+    from rlctl.api import check_env, evaluate, load_policy, train
     from rlctl.environments.spec import make
 
-__all__ = ["__version__", "evaluate", "load_policy", "make", "train"]
+__all__ = ["__version__", "check_env", "evaluate", "load_policy", "make", "train"]
 
 _DEFINED_IN = {
+    "check_env": "rlctl.api",
     "evaluate": "rlctl.api",
     "load_policy": "rlctl.api",
     "make": "rlctl.environments.spec",

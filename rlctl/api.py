@@ -1,15 +1,46 @@
-"""`rlctl.train` and `rlctl.evaluate`: the verbs from Python, with the keys of a recipe."""
+"""The verbs from Python: `rlctl.check_env`, `train`, `evaluate` and `load_policy`."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rlctl.checking.finding import RuleFinding
     from rlctl.evaluation.evaluate import Evaluation
     from rlctl.policy.policy import Policy
     from rlctl.training.request import TrainResult
+
+
+def check_env(
+    task: str,
+    /,
+    *,
+    select: Sequence[str] = (),
+    ignore: Sequence[str] = (),
+    env_timeout_s: float = 10.0,
+    **parameters: Any,
+) -> list[RuleFinding]:
+    """Check an environment as `rlctl check-env` does, in processes of its own, and return the findings, worst first.
+
+    Keywords are parameters of the task. `select` and `ignore` are beginnings of rule ids: `ignore=["RL5"]`. A finding
+    has `rule`, `severity` ("error", "warning", "info"), `message`, `fix` and `evidence`; `str(finding)` is one line.
+    Raises `UsageError` for a task or a parameter that does not exist.
+    """
+    from rlctl.checking.check import check
+    from rlctl.checking.finding import choose_rules
+    from rlctl.environments.spec import EnvSpec
+    from rlctl.errors import RlctlError
+
+    rules = choose_rules(select, ignore)
+    spec = EnvSpec(task, parameters)
+    report = check(spec, rules=rules, env_timeout_s=env_timeout_s, show_progress=False)
+    if report.verdict.crashed:
+        names, details = ", ".join(report.verdict.crashed), "\n".join(report.verdict.crashed.values())
+        raise RlctlError(f"check_env: a bug in rlctl: {names} crashed on {task}; please report it", details=details)
+    return sorted(report.verdict.findings, key=lambda finding: (finding.severity.rank, finding.rule))
 
 
 def train(
@@ -48,7 +79,8 @@ def evaluate(
     run: str | os.PathLike[str] | None = None,
     /,
     *,
-    other_task: str | None = None,
+    task: str | None = None,
+    parameters: Mapping[str, Any] | None = None,
     checkpoint: str = "best",
     episodes: int = 100,
     seed: int = 0,
@@ -57,23 +89,26 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate as `rlctl eval` does, and return the numbers with every episode.
 
-    `run` is a run's folder, a policy file, a task's name or None for the latest run; `other_task` a task to evaluate
-    on instead of the one it was trained on. Further keywords are those keys of a recipe that are about the environment:
-    `task` (its parameters), `reward_weights`, `randomize`, `events`.
+    `run` is a run's folder, a policy file, a task's name or None for the latest run; `task` a task to evaluate on
+    instead of the one it was trained on; `parameters` are those of its constructor. Further keywords are the other
+    keys of a recipe that are about the environment: `reward_weights`, `randomize`, `events`.
+    `pandas.DataFrame(result.episodes)` is a table of the episodes.
     """
     from rlctl.errors import UsageError
     from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
     from rlctl.recipe.sources import check_changes
 
+    if task is not None and not isinstance(task, str):
+        raise UsageError(f"evaluate: task is the name of a task, got {task!r}; its parameters are parameters={{...}}")
     if episodes < 1 or seed < 0:
         raise UsageError(f"evaluate: episodes={episodes}, seed={seed}: one episode or more, and a seed from 0 on")
     request = EvalRequest(
         run=None if run is None else os.fspath(run),
-        task=other_task,
+        task=task,
         checkpoint=checkpoint,
         episodes=episodes,
         seed=seed,
-        changes=check_changes(recipe, "evaluate"),
+        changes=check_changes({**recipe, **({"task": parameters} if parameters else {})}, "evaluate"),
         deterministic=deterministic,
     )
     return run_evaluation(request, Gates())

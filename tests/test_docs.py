@@ -208,12 +208,16 @@ def test_the_worked_robot_learns(tmp_path, rlctl):
     assert rlctl("eval", "Balance", "--min-success", "0.95", timeout=300).returncode == 0
 
 
+def needs_run(block):
+    return "runs/latest" in block.text or "rlctl.train(" in block.text
+
+
 @pytest.mark.slow
 def test_python_that_uses_a_run(tmp_path, rlctl, monkeypatch):
     small = ["--set", "eval.episodes=2", "--set", "algo_kwargs.n_steps=16", "--set", "algo_kwargs.batch_size=32"]
     assert rlctl("train", "reach", "-n", "64", "--n-envs", "4", *small, timeout=300).returncode == 0
     monkeypatch.chdir(tmp_path)
-    blocks = [block for block in find_blocks("python") if "runs/latest" in block.text]
+    blocks = [block for block in find_blocks("python") if needs_run(block)]
     assert blocks
     for block in blocks:
         exec(compile(block.text, str(block), "exec"), {})
@@ -221,7 +225,7 @@ def test_python_that_uses_a_run(tmp_path, rlctl, monkeypatch):
 
 def test_python_that_needs_no_run():
     named = {text for page in PAGES for _, _, text in NAMED_FILE.findall(page.read_text())}
-    blocks = [each for each in find_blocks("python") if each.text not in named and "runs/latest" not in each.text]
+    blocks = [block for block in find_blocks("python") if block.text not in named and not needs_run(block)]
     assert blocks
     for block in blocks:
         exec(compile(block.text, str(block), "exec"), {})

@@ -17,6 +17,19 @@ def test_make_by_id():
     env.close()
 
 
+def test_the_time_limit_is_in_the_spec():
+    import rlctl
+
+    for env in (rlctl.make("reach"), gymnasium.make("rlctl.gym:rlctl/reach-v0")):
+        assert env.spec.max_episode_steps == env.unwrapped.max_steps == 120
+        assert env.spec.id == "rlctl/reach-v0"
+        env.close()
+    again = rlctl.make("reach", tolerance=0.02).spec.make()
+    assert again.unwrapped.task.tolerance == 0.02
+    again.close()
+    assert rlctl.make("Pendulum-v1").spec.max_episode_steps == 200
+
+
 def test_it_is_the_same_environment():
     import rlctl
 

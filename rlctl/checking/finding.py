@@ -76,6 +76,9 @@ class RuleFinding:
         self.rule, self.message, self.evidence = rule, message, evidence or {}
         self.severity, self.fix = Severity(severity or RULES[rule].severity), fix or RULES[rule].fix
 
+    def __str__(self) -> str:
+        return f"{self.rule} {self.severity} ({self.name}): {self.message}"
+
     @property
     def name(self) -> str:
         """The rule's name."""

@@ -13,7 +13,7 @@ from annotated_types import Ge, Le
 
 from rlctl.environments import named_task
 from rlctl.environments.plugin_code import call_plugin
-from rlctl.environments.registry import is_task, load
+from rlctl.environments.registry import is_task, load, make_slug
 from rlctl.errors import RecipeError, TaskError, did_you_mean, short_repr
 
 if TYPE_CHECKING:
@@ -172,7 +172,20 @@ def make(
     `randomize` lets all events of the task act, `events` those that it names, with the parameters it gives:
     `events={"mass": {"factor": (0.9, 1.1)}}`.
     """
-    return EnvSpec(task, parameters, randomize=randomize, events=events or {}).make(render_mode)
+    env = EnvSpec(task, parameters, randomize=randomize, events=events or {}).make(render_mode)
+    if is_task(load(task)):
+        env.unwrapped.spec = _make_gymnasium_spec(task, render_mode, randomize, events, parameters)
+    return env
+
+
+def _make_gymnasium_spec(task: str, render_mode: str | None, randomize: bool, events: Any, parameters: Any) -> Any:
+    """Return what Gymnasium and other libraries read an environment's id and time limit off."""
+    from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
+
+    kwargs = {"task": task, "render_mode": render_mode, "randomize": randomize, "events": events, **parameters}
+    return GymnasiumSpec(
+        f"rlctl/{make_slug(task)}-v0", "rlctl.environments.spec:make", kwargs=kwargs, disable_env_checker=True
+    )
 
 
 def make_several(spec: EnvSpec, count: int) -> list[gymnasium.Env[Any, Any]]:

@@ -24,6 +24,7 @@ from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable, load_policy
 from rlctl.policy.players.player import Exploration
 from rlctl.rollout.collect import Episode, play_episodes
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import lookup
@@ -68,7 +69,7 @@ class Evaluation:
     """The events that the task offers, and whether each acted."""
     seed: int
     deterministic: bool
-    episodes: list[Episode]
+    played: list[Episode]
     success_rate: float | None
     success_interval: tuple[float, float] | None
     returns: Spread
@@ -84,6 +85,28 @@ class Evaluation:
     """The same episodes without limits."""
     action_change: float | None = None
     """Mean of |action - action before|, over elements and steps; None if it was not measured."""
+
+    @property
+    def episodes(self) -> list[dict[str, Any]]:
+        """A flat row per episode, for a table: `pandas.DataFrame(evaluation.episodes)`."""
+        return [_make_row(index, episode.result) for index, episode in enumerate(self.played)]
+
+    def __repr__(self) -> str:
+        rate = "" if self.success_rate is None else f"success {self.success_rate:.1%}, "
+        return f"Evaluation({self.spec.task}, {len(self.played)} episodes: {rate}return {self.returns.mean:.4g})"
+
+
+def _make_row(index: int, result: EpisodeResult) -> dict[str, Any]:
+    return {
+        "index": index,
+        "seed": result.seed,
+        "success": result.success,
+        "return": result.total_reward,
+        "length": result.length,
+        "final_distance": result.final_distance,
+        **{f"terms.{name}": value for name, value in result.terms.items()},
+        **{f"metrics.{name}": value for name, value in result.metrics.items()},
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,7 +271,7 @@ def _summarize(
         events=info.events,
         seed=request.seed,
         deterministic=request.deterministic,
-        episodes=[dataclasses.replace(episode, trajectory=None) for episode in episodes],
+        played=[dataclasses.replace(episode, trajectory=None) for episode in episodes],
         success_rate=success_rate(results),
         success_interval=success_interval(results),
         returns=Spread.of([result.total_reward for result in results]),

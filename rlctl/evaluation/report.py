@@ -31,7 +31,7 @@ def show(result: Evaluation, json: str | None) -> None:
     rows += [(f"term {name}", f"{mean:.4g}") for name, mean in result.terms.items() if name not in result.metrics]
     rows += [(f"metric {name}, per step", f"{mean:.4g}") for name, mean in result.metrics.items()]
     output.print_table(("", "mean", "IQM", "std", "min", "max"), rows, left=("",))
-    reports = [episode.result.report for episode in result.episodes]
+    reports = [episode.result.report for episode in result.played]
     if held := sum(report.get("not_running", 0) for report in reports):
         answers = sum(len(report["round_trips_s"]) for report in reports)
         out.print(f"the server was holding or stopped in {held:,} of {answers:,} answers: not the policy's own actions")
@@ -48,7 +48,7 @@ def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
         success = f"success rate {without:.1%} without them, {now:.1%} with them; "
     returns = f"return {unlimited.returns.mean:.4g} without them, {result.returns.mean:.4g} with them"
     out.print(f"limits of {result.limited_by}: {success}{returns}")
-    steps = sum(episode.result.length for episode in result.episodes)
+    steps = sum(episode.result.length for episode in result.played)
     rows = [(name, f"{1000 * count / steps:.4g}") for name, count in count_interventions(result).most_common()]
     if rows:
         output.print_table(("stepped in", "per 1,000 steps"), rows, left=("stepped in",))
@@ -59,7 +59,7 @@ def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
 def count_interventions(result: Evaluation) -> collections.Counter[str]:
     """Return how often each limit stepped in and each fault occurred, over all episodes."""
     counts: collections.Counter[str] = collections.Counter()
-    for episode in result.episodes:
+    for episode in result.played:
         counts.update(episode.result.report.get("interventions", {}))
     return counts
 
@@ -70,7 +70,7 @@ def _show_head(result: Evaluation) -> None:
     trained = "" if info is None else f" ({info.algo}, step {info.training_steps:,})"
     out.print(f"{result.spec.task}: {'policy ' if info is None else ''}{result.name}{trained}")
     randomization = describe_randomization(result.events)
-    episodes = output.format_count(len(result.episodes), "episode")
+    episodes = output.format_count(len(result.played), "episode")
     out.print(f"{episodes}, seed {result.seed}{mode}{randomization and f', {randomization}'}")
 
 
@@ -109,7 +109,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
                 "metrics": each.metrics,
                 "final_distance": each.final_distance,
             }
-            for index, each in enumerate(episode.result for episode in result.episodes)
+            for index, each in enumerate(episode.result for episode in result.played)
         ],
     }
     if result.spec.stage:

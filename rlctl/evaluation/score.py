@@ -12,7 +12,7 @@ from rlctl.policy.shipped import MeasuredScore
 def measure_score(request: EvalRequest) -> MeasuredScore:
     """Play the episodes of a request and summarise them, with how much actions change."""
     evaluation = run_evaluation(dataclasses.replace(request, measure_actions=True))
-    results = [episode.result for episode in evaluation.episodes]
+    results = [episode.result for episode in evaluation.played]
     limit = evaluation.max_steps
     return MeasuredScore(
         episodes=len(results),

@@ -95,7 +95,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
     finally:
         loop.call_soon_threadsafe(end.set)
         thread.join(5.0)
-    reports = [episode.result.report for episode in served.episodes]
+    reports = [episode.result.report for episode in served.played]
     times = np.concatenate([np.asarray(each["round_trips_s"]) for each in reports])
     p50, p99 = np.quantile(times, (0.5, 0.99)).tolist()
     return SelfTest(
@@ -116,7 +116,7 @@ def show(result: SelfTest, json: str | None) -> None:
     if json is not None and output.write_result_json(json, as_json(result)):
         return
     out, direct, served = output.out(), result.direct, result.served
-    episodes = output.format_count(len(served.episodes), "episode")
+    episodes = output.format_count(len(served.played), "episode")
     out.print(f"{direct.spec.task}: {direct.name}, {episodes}, through a server")
     if served.success_rate is not None:
         out.print(f"success rate {served.success_rate:.1%}, {direct.success_rate:.1%} without the server")

@@ -23,6 +23,10 @@ class Policy(abc.ABC):
             key: (space.shape or (), space.dtype) for key, space in split_space(self.observation_space).items()
         }
 
+    def __repr__(self) -> str:
+        info = self.info
+        return f"{type(self).__name__}({info.spec.task}, {info.algo}, {info.training_steps:,} steps)"
+
     @abc.abstractmethod
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
         """Return the action for one observation, as the environment takes it.

@@ -40,7 +40,7 @@ class EvaluatedRun:
 
     def values(self, quantity: Quantity) -> NDArray[np.float64]:
         """Return the success (0 or 1) or return of each episode, shape (episodes,); NaN where it is not reported."""
-        results = [episode.result for episode in self.evaluation.episodes]
+        results = [episode.result for episode in self.evaluation.played]
         values = [each.success if quantity == "success" else each.total_reward for each in results]
         return np.array([np.nan if value is None else value for value in values], np.float64)
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
 from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean, short_repr
 from rlctl.task.events import Event, EventSettings
@@ -45,6 +46,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / task.control_dt)}
         if render_mode not in (None, "human", "rgb_array"):
             raise RecipeError(f"render_mode {render_mode!r} is not one of: human, rgb_array")
+        self._spec: EnvSpec | None = None
         self.render_mode = render_mode
         self.reward_weights = _merge_weights(task, reward_weights or {})
         self.events = (events or EventSettings()).apply(task.events)
@@ -117,6 +119,18 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             name: self.sim.add_marker((0, 0, -10), radius=0.03, color=(0.1, 0.8, 0.3, 0.8)) for name in names
         }
         self.sim.save()
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium and other libraries read the id and the time limit off; None unless `make` has set it."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None and spec.max_episode_steps is None:
+            spec = copy.deepcopy(spec)
+            spec.max_episode_steps = self.max_steps
+        self._spec = spec
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -33,6 +33,9 @@ class TrainResult:
     recordings: list[Path] = dataclasses.field(default_factory=list)
     note: str = ""
 
+    def __repr__(self) -> str:
+        return f"TrainResult({self.task}, {self.recipe.algo}, {self.steps:,} steps, run {str(self.run.path)!r})"
+
 
 def run_training(request: TrainRequest) -> TrainResult:
     """Train, or go on with a run; returns when it is done.

@@ -69,10 +69,10 @@ def test_through_a_server_it_is_the_same(reach_server):
     served = run_evaluation(
         EvalRequest("reach", baseline=f"ws://{reach_server.address}", episodes=2, n_envs=1), Gates()
     )
-    assert [each.result.total_reward for each in served.episodes] == [
+    assert [each.result.total_reward for each in served.played] == [
         each.result.total_reward for each in direct.episodes
     ]
-    assert len(served.episodes[0].result.report["round_trips_s"]) == served.episodes[0].result.length
+    assert len(served.played[0].result.report["round_trips_s"]) == served.played[0].result.length
 
 
 def test_a_server_that_does_not_run_its_policy_is_said_to(reach_server, rlctl):
@@ -139,7 +139,7 @@ def test_self_test(tmp_path):
     server = make_server(find_policy("reach", PRETRAINED).file, ServerSettings(port=0, watchdog=False))
     result = run_self_test(server, EvalRequest("reach", checkpoint=PRETRAINED, episodes=2, n_envs=1))
     assert result.served.returns == result.direct.returns
-    assert result.requests == sum(each.result.length for each in result.served.episodes)
+    assert result.requests == sum(each.result.length for each in result.served.played)
     assert result.round_trip_p50_s > 0
     assert [each for each in result.list_problems() if "success" in each or "holding" in each] == []
 

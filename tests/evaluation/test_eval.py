@@ -81,10 +81,10 @@ def test_mean_terms_add_up():
 
 def test_an_episode_does_not_depend_on_what_runs_beside_it(reach_run, evaluation):
     alone = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, n_envs=1), Gates())
-    assert [episode.result.total_reward for episode in alone.episodes] == [
-        episode.result.total_reward for episode in evaluation.episodes
+    assert [episode.result.total_reward for episode in alone.played] == [
+        episode.result.total_reward for episode in evaluation.played
     ]
-    assert len({episode.result.seed for episode in evaluation.episodes}) == 6
+    assert len({episode.result.seed for episode in evaluation.played}) == 6
 
 
 def test_evaluations_of_a_training_say_how_far_bodies_overlap(reach_run):
@@ -92,7 +92,7 @@ def test_evaluations_of_a_training_say_how_far_bodies_overlap(reach_run):
 
 
 def test_terms_add_up_to_the_return(evaluation):
-    for episode in evaluation.episodes:
+    for episode in evaluation.played:
         assert sum(episode.result.terms.values()) == pytest.approx(episode.result.total_reward)
     assert evaluation.final_distance is not None
     assert evaluation.final_distance.min > 0
@@ -120,8 +120,8 @@ def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
     assert as_json(evaluation)["randomized"] is False
     assert as_json(shaken)["randomized"] is True
     assert as_json(shaken)["events"] == dict.fromkeys(offered, True)
-    assert [each.result.total_reward for each in shaken.episodes] != [
-        each.result.total_reward for each in evaluation.episodes
+    assert [each.result.total_reward for each in shaken.played] != [
+        each.result.total_reward for each in evaluation.played
     ]
     plain = rlctl("eval", reach_run.path, "--episodes", 2)
     assert "2 episodes, seed 0, not randomised" in plain.stdout

@@ -38,7 +38,7 @@ def test_a_cell_is_the_evaluation_with_its_values(block_run, measured):
     cell = found.cells[3]
     assert (cell.success_rate, cell.success_interval) == (alone.success_rate, alone.success_interval)
     assert cell.mean_return == alone.returns.mean
-    assert cell.return_interval == mean_interval([episode.result.total_reward for episode in alone.episodes])
+    assert cell.return_interval == mean_interval([episode.result.total_reward for episode in alone.played])
 
 
 def test_nominal_and_worst_cells(measured):

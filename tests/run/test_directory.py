@@ -23,9 +23,7 @@ def error(kind, call, *arguments):
 
 def test_a_recipe_that_was_deleted(make_run):
     run = make_run("reach", "2026-01-01_00-00-00_s0")
-    with pytest.raises(
-        ArtifactError, match=r"recipe.yaml: no such file; a run needs the recipe that it was trained with"
-    ):
+    with pytest.raises(ArtifactError, match=r"recipe.yaml: no such file; a run needs the recipe that"):
         run.recipe()
 
 

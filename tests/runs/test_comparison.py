@@ -38,7 +38,7 @@ def test_policies_are_compared_episode_by_episode(root):
     expected = candidate.side.runs[0].values("return") - result.baseline.runs[0].values("return")
     assert difference.mean == pytest.approx(expected.mean())
     sides = (result.baseline, candidate.side)
-    first, second = ([episode.result.seed for episode in side.runs[0].evaluation.episodes] for side in sides)
+    first, second = ([episode.result.seed for episode in side.runs[0].evaluation.played] for side in sides)
     assert first == second
     assert candidate.recipe_changes == {}
     assert result.world_differences == []
