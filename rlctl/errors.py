@@ -42,6 +42,12 @@ class UsageError(RlctlError):
     exit_code = 2
 
 
+class RunTaken(UsageError):
+    """Another process writes this run; the exit code is that of `EX_TEMPFAIL`: what runs trainings tries again."""
+
+    exit_code = 75
+
+
 class NoSuchClassError(UsageError):
     """A module was imported and does not define the class that was asked for."""
 

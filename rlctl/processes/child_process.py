@@ -26,16 +26,17 @@ from rlctl.processes import messages
 
 # Started this way a child finds the modules that its parent finds and no others (-P: none of the current folder), and
 # the caller's script is not run again.
-# Ctrl-C and `kill` may reach a child too, but its parent decides: ignored before anything slow is imported, and held
-# back until then. A handler, not SIG_IGN, because that would be inherited by what an environment starts.
+# Ctrl-C, `kill` and a cluster's warning may reach a child too, but its parent decides: ignored before anything slow is
+# imported, and held back until then. A handler, not SIG_IGN: an environment's own processes would inherit that.
 _BOOTSTRAP = (
-    "import signal; numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP); "
+    "import signal; numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2); "
     "[signal.signal(number, lambda *_: None) for number in numbers]; "
     "signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers); "
     "import json, sys; job = json.loads(sys.argv[1]); sys.path[:] = job['sys_path']; "
     "from rlctl.processes.child_process import run_main; run_main(job)"
 )
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+"""Those that ask a training to stop; clusters send the last two before a job's time is over."""
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 

@@ -7,12 +7,13 @@ import datetime
 import errno
 import fcntl
 import os
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.environments import registry
-from rlctl.errors import ArtifactError, UsageError, short_repr
+from rlctl.errors import ArtifactError, RunTaken, UsageError, short_repr
 from rlctl.storage import files
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ class RunDirectory:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._claim = ""
 
     def __fspath__(self) -> str:
         return str(self.path)
@@ -63,6 +65,8 @@ class RunDirectory:
     """The policy of the best evaluation."""
     last_policy = _Place("policies/last.safetensors")
     """The policy at the end, or at the last checkpoint."""
+    claim_file = _Place(".claim")
+    """The token of the process that may write the run."""
     episodes = _Place("episodes")
     """The folder of recorded episodes and recordings."""
     tensorboard = _Place("tensorboard")
@@ -126,7 +130,8 @@ class RunDirectory:
         return str(self.status().get("id", ""))
 
     def write_status(self, changes: Mapping[str, Any]) -> None:
-        """Put some values into `run.json`."""
+        """Put some values into `run.json`; raises `RunTaken` after another process has claimed the run."""
+        self.check_claim()
         known = files.read_json(self.status_file) if self.status_file.exists() else {}
         files.write_json(self.status_file, {**known, **changes})
 
@@ -154,13 +159,33 @@ class RunDirectory:
     def lock(self) -> RunLock:
         """Claim the folder for writing until the lock is released or the process ends.
 
-        Raises `ArtifactError` for a folder with a link out of it: what is written must stay in the run.
+        Raises `RunTaken` if another process holds it, and `ArtifactError` for a folder with a link out of it: what is
+        written must stay in the run. Where the file system does not keep others out, the last to claim the run has it.
         """
         own = self.path.resolve()
         for place in self.path.rglob("*"):
             if place.is_symlink() and not place.resolve().is_relative_to(own):
                 raise ArtifactError(f"{place}: a link out of the run's folder; nothing is written through it")
-        return RunLock(self.path)
+        lock = RunLock(self.path)
+        with contextlib.suppress(OSError):  # a full disk, which takes nothing else either
+            claim = uuid.uuid4().hex
+            files.write_text(self.claim_file, claim)
+            self._claim = claim
+        return lock
+
+    def check_claim(self) -> None:
+        """Raise `RunTaken` if another process has claimed the run since this object did.
+
+        Called before each write: locks of network file systems may hold on one machine only, or not at all.
+        """
+        if not self._claim:
+            return
+        try:
+            owner = self.claim_file.read_text(encoding="utf-8")
+        except OSError:
+            return
+        if owner != self._claim:
+            raise RunTaken(f"{self.path}: another process has taken over this run; nothing more is written here")
 
 
 class RunLock:
@@ -183,7 +208,7 @@ class RunLock:
         except BlockingIOError:
             owner = os.read(descriptor, 100).decode(errors="replace").strip()
             os.close(descriptor)
-            raise UsageError(
+            raise RunTaken(
                 f"{self._file.parent}: another process is writing this {self._kind} ({owner or 'unknown'})"
             ) from None
         except OSError as error:

@@ -43,10 +43,11 @@ class Saver:
     def attempt(self, what: str, write: Callable[[], object]) -> bool:
         """Write something; False, with a warning, if the disk does not take it.
 
-        Raises `ArtifactError` if somebody has removed the run.
+        Raises `ArtifactError` if somebody has removed the run, `RunTaken` if another process writes it now.
         """
         if not self.run.status_file.exists():
             raise ArtifactError(f"{self.run.path}: was removed while it trained, so nothing can be saved; train anew")
+        self.run.check_claim()
         try:
             write()
         except OSError as error:

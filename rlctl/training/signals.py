@@ -18,14 +18,19 @@ if TYPE_CHECKING:
 
 _SAME_S = 1.0  # equal signals within it are one: `timeout` sends SIGTERM to the process and to its group
 
+_WARNINGS = (signal.SIGUSR1, signal.SIGUSR2)
+
 Handler = Callable[[int, FrameType | None], None]
 
 
 class HandledSignals:
-    """Lets `handle` take SIGINT, SIGTERM and SIGHUP, which a closed terminal sends, as long as it is entered."""
+    """Lets `handle` take the signals that ask to stop, as long as it is entered.
+
+    SIGHUP comes from a closed terminal. SIGUSR1 and SIGUSR2, which a cluster sends as a warning, count as SIGTERM.
+    """
 
     def __init__(self, handle: Handler) -> None:
-        self._handler = handle
+        self._handler = lambda number, frame: handle(signal.SIGTERM if number in _WARNINGS else number, frame)
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -34,9 +39,9 @@ class HandledSignals:
             # Set even where a shell has made SIGINT ignored, as for a command in the background; what `nohup` has made
             # ignored stays so.
             self._before = {
-                each: signal.getsignal(each)
-                for each in STOP_SIGNALS
-                if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN
+                number: signal.getsignal(number)
+                for number in STOP_SIGNALS
+                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN
             }
         self.handle_again()
         return self

@@ -10,7 +10,7 @@ import uuid
 from typing import TYPE_CHECKING, Any
 
 from rlctl.environments.task_version import find_git_commit, identify_task
-from rlctl.errors import DivergedError, Interrupted, RlctlError
+from rlctl.errors import DivergedError, Interrupted, RlctlError, RunTaken
 from rlctl.recipe.recipe import Recipe, find_difference
 from rlctl.recipe.sources import resolve_packaged
 from rlctl.run.directory import RunDirectory
@@ -69,7 +69,7 @@ def find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
 def write_failure(run: RunDirectory, error: BaseException) -> None:
     """Write what ended a training before its time."""
     kind = _STATUS.get(type(error), "failed")
-    if run.status_file.exists():  # else somebody has removed the run
+    if run.status_file.exists() and not isinstance(error, RunTaken):  # else somebody has removed the run
         run.write_status({"status": kind, "error": str(error) or repr(error), "ended": _now()})
 
 

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from rlctl.errors import ArtifactError, UsageError
+from rlctl.errors import ArtifactError, RunTaken, UsageError
 from rlctl.recipe.recipe import Recipe
 from rlctl.run import directory
 
@@ -116,3 +116,19 @@ def test_a_lock_ends_with_its_process(root, make_run):
         assert f"(pid {writer.pid} on " in error(UsageError, run.lock)
         writer.kill()
     run.lock().release()
+
+
+def test_the_last_process_to_claim_a_run_has_it_where_locks_keep_nobody_out(monkeypatch, root, make_run):
+    def flock(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    first = make_run("reach", "2026-01-01_10-00-00_s0")
+    second = directory.RunDirectory(first.path)
+    first.lock()
+    first.write_status({"steps": 1})
+    second.lock()
+    message = error(RunTaken, lambda: first.write_status({"steps": 2}))
+    assert message == f"{first.path}: another process has taken over this run; nothing more is written here"
+    second.write_status({"steps": 3})
+    assert first.status()["steps"] == 3

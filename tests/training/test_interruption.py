@@ -75,7 +75,8 @@ def start(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)]
+    ("number", "code"),
+    [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143), (signal.SIGUSR1, 143)],
 )
 def test_a_signal_saves_a_checkpoint_and_leaves_no_child(start, rlctl, tmp_path, number, code):
     training = start(tmp_path)
@@ -84,6 +85,8 @@ def test_a_signal_saves_a_checkpoint_and_leaves_no_child(start, rlctl, tmp_path,
     assert children
     training.process.send_signal(number)
     training.process.send_signal(number)  # as `timeout` does; the same within a second counts once
+    for child in children:  # a cluster sends it to every process
+        child.send_signal(number)
     returned, stdout, stderr = training.wait()
     assert returned == code
     assert stdout == ""
@@ -119,8 +122,29 @@ def test_two_processes_cannot_write_one_run(start, rlctl, tmp_path):
     second = rlctl("train", "--resume", "latest")
     training.process.terminate()
     training.wait()
-    assert second.returncode == 2
+    assert second.returncode == 75
     assert f"another process is writing this run (pid {training.process.pid} on " in second.stderr
+
+
+def test_a_process_that_has_lost_its_run_writes_nothing_more(start, rlctl, tmp_path):
+    training = start(tmp_path, "--set", "eval.every_steps=64")
+    wait_for(lambda: list(tmp_path.glob("runs/*/*/checkpoints/0*")))
+    (run,) = tmp_path.glob("runs/Line/*")
+    # As the lock of another machine's process, on a file system whose locks hold on one machine only.
+    (run / ".lock").unlink()
+    steps = max(int(folder.name) for folder in (run / "checkpoints").iterdir() if folder.name.isdigit())
+    resumed = rlctl("train", "--resume", run, "-n", steps + 4096, "--json", "-")
+    code, _, stderr = training.wait()
+    assert code == 75
+    assert (
+        stderr.strip()
+        .splitlines()[-1]
+        .endswith("another process has taken over this run; nothing more is written here")
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    steps = [int(line.partition(",")[0]) for line in (run / "metrics.csv").read_text().splitlines()[1:]]
+    assert steps == list(range(64, steps[-1] + 1, 64))
+    assert json.loads((run / "run.json").read_text())["status"] == "finished"
 
 
 @pytest.fixture

@@ -62,5 +62,5 @@ def test_a_run_that_another_process_writes(train, resume):
         pytest.raises(UsageError, match=r"another process is writing this run \(pid \d+ on \S+\)$") as caught,
     ):
         resume(run, total_timesteps=160)
-    assert caught.value.exit_code == 2
+    assert caught.value.exit_code == 75
     resume(run, total_timesteps=160)
