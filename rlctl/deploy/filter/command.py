@@ -16,14 +16,16 @@ from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.safety_events import Intervention
 
 Array = NDArray[np.float64]
+_MOST_STEPS = 1e9
 
 
-class OutsideLimits(Exception):
-    """A joint is outside its limits before it is moved for the first time: no command is safe."""
+class UnsafeCommand(Exception):
+    """No command is safe: a joint is outside its limits at the start, or a result does not keep a limit."""
 
-    def __init__(self, joint: str, value: float, limit: float) -> None:
-        super().__init__(f"{joint} is outside its limits at the start")
-        self.joint, self.value, self.limit = joint, value, limit
+    def __init__(self, text: str, limit: str, value: float | str = "", bound: float | None = None) -> None:
+        super().__init__(text)
+        self.limit, self.value, self.bound = limit, value, bound
+        """Name of the limit (`elbow.position`), the value, and what it may be."""
 
 
 class Command:
@@ -39,7 +41,7 @@ class Command:
         self._space = fitted.space
         self._safe, self._home = fitted.safe, fitted.home
         self._is_position = limits.command == "position"
-        self._blend_steps = round(limits.blend_in_s / bounds.dt)
+        self._blend_steps = round(min(limits.blend_in_s / bounds.dt, _MOST_STEPS))
         cutoff = limits.lowpass_hz
         self._alpha = 1.0 if cutoff is None else 1.0 - math.exp(-2.0 * math.pi * cutoff * bounds.dt)
         self._is_action = bool((bounds.factor == 1.0).all() and not bounds.offset.any())
@@ -58,6 +60,8 @@ class Command:
         """Where the last command led: its value, or the measured positions."""
         self._before = self._zeros
         """The motion of the last step."""
+        self._sent: NDArray[Any] | None = None
+        """The last action."""
         self._smooth: Array | None = None
         self._blend_from: Array | None = None
         self.begin_blend()
@@ -78,12 +82,20 @@ class Command:
         """Return the largest difference between where a joint is and where the last command should have brought it."""
         if self._expected is None or self.position is None:
             return math.nan
-        return float(np.abs(self._expected - self.position).max())
+        with np.errstate(over="ignore"):
+            return float(np.abs(self._expected - self.position).max())
 
     def follow(self, action: Array) -> NDArray[Any]:
-        """Return the action closest to a wanted one. Raises `OutsideLimits` at the first step."""
-        start = self._present(action)
-        target = action if self._is_action else self._bounds.offset + action * self._bounds.factor
+        """Return the action closest to a wanted one. Raises `UnsafeCommand`."""
+        with np.errstate(over="ignore"):  # a policy may want anything
+            start = self._present(action)
+            target = action if self._is_action else self._bounds.offset + action * self._bounds.factor
+            if self._alpha < 1.0 or self._blend_left:
+                target = self._smoothe(self._bounds.clip_ends(target, self._note), start)
+            return self._move(target)
+
+    def _smoothe(self, target: Array, start: Array) -> Array:
+        """Apply low-pass and blend to a command within its bounds, so that neither overflows nor winds up."""
         if self._alpha < 1.0:
             before = start if self._smooth is None else self._smooth
             self._smooth = target = before + self._alpha * (target - before)
@@ -93,19 +105,33 @@ class Command:
             if self._blend_from is None:
                 self._blend_from = start
             target = target + part * (self._blend_from - target)
-        return self._move(target)
+        return target
 
     def rest(self, go_home: bool) -> NDArray[Any]:
-        """Return the action that brakes the robot and keeps it where it is, or brings it home."""
+        """Return the action that brakes the robot and keeps it where it is, or brings it home.
+
+        Raises `UnsafeCommand`.
+        """
         self._smooth = None
         present = self._present(None)
+        home = self._home if go_home else None
+        with np.errstate(over="ignore"):
+            if self._bounds.is_value:
+                return self._move(self._safe if not self._is_position else present if home is None else home)
+            return self._move(self._zeros if home is None or self.position is None else home - self.position)
+
+    def stand_still(self) -> NDArray[Any]:
+        """Return the action of the last command that kept its limits: its value, or no motion. Forgets all smoothing.
+
+        This is what a stopped robot gets where even braking is not safe.
+        """
+        self._smooth = self._blend_from = None
+        self._blend_left, self._before = 0, self._zeros
         if not self._bounds.is_value:
-            if go_home and self._home is not None and self.position is not None:
-                return self._move(self._home - self.position)
-            return self._move(self._zeros)
-        if not self._is_position:
-            return self._move(self._safe)
-        return self._move(self._home if go_home and self._home is not None else present)
+            return self._as_action(self._zeros)
+        if self._sent is not None:
+            return self._sent.copy()
+        return self._as_action(self._safe if self._reference is None else self._reference)
 
     def _present(self, action: Array | None) -> Array:
         """Return what the command is now: a value, or a motion. At the first step the robot says where it is."""
@@ -126,26 +152,35 @@ class Command:
         away = np.abs(self._reference - start)
         if self.position is not None and away.max(initial=0.0) > 1e-6:
             index = int(away.argmax())
-            raise OutsideLimits(self._bounds.names[index], float(start[index]), float(self._reference[index]))
+            joint, value, bound = self._bounds.names[index], float(start[index]), float(self._reference[index])
+            raise UnsafeCommand(f"{joint} is outside its limits at the start", f"{joint}.position", value, bound)
         return self._reference
 
     def _move(self, target: Array) -> NDArray[Any]:
-        """Return the action for a value or motion that is wanted, within the bounds."""
-        bounds, reference = self._bounds, self._reference
+        """Return the action for a value or motion that is wanted, within the bounds. Raises `UnsafeCommand`."""
+        bounds, reference, before = self._bounds, self._reference, self._before
+        x = self._zeros
         if not bounds.is_value:
-            command = self._before = bounds.bound(target, self._before, reference, self._note)
-        elif reference is None:
+            command = x = bounds.bound(target, before, reference, self._note)
+        elif reference is None or (bounds.change is None and bounds.speed is None and bounds.keeps_ends(target)):
             command = target
-        elif bounds.change is None and bounds.speed is None and bounds.keeps_ends(target):
-            command = self._reference = target
         else:
-            self._before = bounds.bound(target - reference, self._before, reference, self._note)
-            command = np.minimum(np.maximum(reference + self._before, bounds.low), bounds.high)
+            x = bounds.bound(target - reference, before, reference, self._note)
+            command = np.minimum(np.maximum(reference + x, bounds.low), bounds.high)
+        action = self._as_action(command)
+        sent = action.ravel().astype(np.float64)
+        sent = sent if self._is_action else bounds.offset + sent * bounds.factor
+        if not bounds.keeps_limits(sent, before, reference):
+            raise UnsafeCommand("no command within the limits was found", "limits", str(sent.tolist()))
+        self._before, self._sent = x, action.copy()  # the caller may write into its own
+        if bounds.is_value and reference is not None:
             self._reference = command
-        action = command if self._is_action else (command - bounds.offset) / bounds.factor
-        action = action.astype(self._space.dtype)
-        if action.ndim != len(self._space.shape):
-            action = action.reshape(self._space.shape)
+        return action
+
+    def _as_action(self, command: Array) -> NDArray[Any]:
+        """Return the action of a command, of the space's shape and type."""
+        action = command if self._is_action else (command - self._bounds.offset) / self._bounds.factor
+        action = action.astype(self._space.dtype).reshape(self._space.shape)
         if self._is_action:
             return action
         result: NDArray[Any] = np.minimum(np.maximum(action, self._space.low), self._space.high)  # rounding

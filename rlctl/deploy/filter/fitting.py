@@ -26,6 +26,7 @@ _CAN_BE_LIMITED = {
     "torque": ("torque", "rate", "action"),
     "action": ("rate", "action"),
 }
+_SMALLEST = 1e-100  # step [unit of the command]; squares of smaller ones vanish
 _NO_CONTROL_DT = "limits: this policy does not say its control_dt; write control_dt: SECONDS"
 
 
@@ -46,10 +47,13 @@ class FittedLimits:
     """The command that is given while holding or stopped, where it is a value."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # such numbers are refused
 def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     """Return what limits mean for a policy; raises `RecipeError` for limits that it cannot have."""
     layout = ObservationLayout(info)
     control_dt = limits.control_dt or info.control_dt
+    if control_dt is not None and not 1e-9 <= control_dt <= 1e9:
+        raise RecipeError(f"limits: control_dt is {control_dt:g} s; from 1e-9 to 1e9 s can be controlled")
     _, space = info.spaces()
     count = math.prod(space.shape or ())
     bounds: Bounds | None = None
@@ -94,8 +98,9 @@ def _make_bounds(
     if not is_value and offset.any():
         raise RecipeError(f"limits: offset: with command: {limits.command} action 0 is to keep still; leave it out")
     factor = scale * (dt if limits.command == "speed" else 1.0)
-    low = offset + factor * np.maximum(space.low.ravel(), _gather(each, "action", -np.inf, 0))
-    high = offset + factor * np.minimum(space.high.ravel(), _gather(each, "action", np.inf, 1))
+    largest, digits = _describe_numbers(space.dtype)
+    low = offset + factor * np.maximum(np.maximum(space.low.ravel(), -largest), _gather(each, "action", -np.inf, 0))
+    high = offset + factor * np.minimum(np.minimum(space.high.ravel(), largest), _gather(each, "action", np.inf, 1))
     position = np.array([_gather(each, "position", -np.inf, 0), _gather(each, "position", np.inf, 1)])
     if is_value:
         torque = np.array([joint.torque or np.inf for joint in each])
@@ -107,6 +112,10 @@ def _make_bounds(
     if (low > high).any():
         name = names[int(np.argmax(low > high))]
         raise RecipeError(f"limits: {name}: no action keeps these limits and the policy's own action bounds")
+    speed = np.array([joint.speed or joint.rate or np.inf for joint in each]) * dt
+    change = np.array([joint.acceleration or np.inf for joint in each]) * dt**2
+    if not (np.isfinite([low, high]).all() and min(factor.min(), speed.min(), change.min()) > _SMALLEST):
+        raise RecipeError("limits: scale, offset, a limit or control_dt is too large or too small to calculate with")
     return Bounds(
         names,
         dt,
@@ -116,11 +125,23 @@ def _make_bounds(
         low,
         high,
         position,
-        speed=_drop_infinite(np.array([joint.speed or joint.rate or np.inf for joint in each]) * dt),
-        change=_drop_infinite(np.array([joint.acceleration or np.inf for joint in each]) * dt**2),
+        _drop_infinite(speed),
+        _drop_infinite(change),
+        precision=8.0 * digits,
+        resolution=factor * (digits if space.dtype.kind == "f" else 1.0),
         position_name=limits.command if limits.command in ("torque", "action") else "position",
         speed_name="rate" if limits.command in ("torque", "action") else "speed",
     )
+
+
+def _describe_numbers(dtype: Any) -> tuple[float, float]:
+    """Return the largest number that an action may be and the relative precision of its type.
+
+    Actions without bounds get these: differences of two commands stay finite.
+    """
+    if np.dtype(dtype).kind == "f":
+        return min(float(np.finfo(dtype).max), 1e30), float(np.finfo(dtype).eps)
+    return min(float(np.iinfo(dtype).max), 2.0**53), float(np.finfo(np.float64).eps)
 
 
 def _drop_infinite(values: Array) -> Array | None:

@@ -12,13 +12,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.deploy.filter.command import Command, OutsideLimits
+from rlctl.deploy.filter.command import Command, UnsafeCommand
 from rlctl.deploy.filter.fitting import fit_limits
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.deploy.filter.safety_events import Intervention, Kind, SafetyEvent
 from rlctl.deploy.filter.sensors import SensorChecks
 from rlctl.environments.info import EnvInfo
-from rlctl.errors import UsageError
+from rlctl.errors import UsageError, short_repr
 
 Array = NDArray[Any]
 State = Literal["idle", "running", "holding", "stopped"]
@@ -114,13 +114,10 @@ class SafetyFilter:
         Raises `ValueError` for what is not an action of this policy.
         """
         if action is not None:
-            action = np.asarray(action, np.float64).ravel()
-            if action.shape != self._zeros.shape or not np.isfinite(action).all():
-                raise ValueError(f"an action by hand has {len(self._zeros)} finite numbers")
-            if self._command is None:
-                choice = self._choose(action)
-                if not self._space.contains(choice) or (choice.ravel() != action).any():
-                    raise ValueError(f"an action by hand is one of {self._space}, not {action.tolist()}")
+            action, fault = self._read_action(action)
+            if action is None:
+                wanted = f"has {len(self._zeros)} finite numbers" if self._command else f"is one of {self._space}"
+                raise ValueError(f"an action by hand {wanted}, not {fault}")
         if (action is None) != (self._manual is None):
             self.begin_blend()
             self._record("state", "policy" if action is None else "override")
@@ -198,11 +195,8 @@ class SafetyFilter:
     def limit(self, action: Any | None) -> Array:
         """Return the action that the robot gets for one that the policy wants; None: it could not act."""
         self.steps += 1
-        wanted = self._manual if self._manual is not None else action
-        if wanted is not None and self._command is not None:
-            # A copy: a policy may write the next one into the same memory.
-            wanted = np.array(wanted, np.float64).ravel()
-        fault = self._fault or self._find_fault(wanted)
+        wanted, problem = (self._manual, "") if self._manual is not None else self._read_action(action)
+        fault = self._fault or self._find_fault(wanted, problem)
         if self.state != "stopped" and not self._ordered:
             self._follow(fault)
         if self._command is None:
@@ -211,26 +205,42 @@ class SafetyFilter:
             if self.state == "running" and wanted is not None:
                 return self._command.follow(wanted)
             return self._command.rest(self._goes_home and self.state == "holding")
-        except OutsideLimits as outside:
-            self._record("limit", f"{outside.joint}.position", outside.value, outside.limit)
-            self._enter("stopped", str(outside))
-            return self._command.rest(False)
+        except UnsafeCommand as unsafe:
+            self._record("limit", unsafe.limit, unsafe.value, unsafe.bound)
+            self._enter("stopped", str(unsafe))
+            return self._command.stand_still()
 
-    def _find_fault(self, wanted: Any | None) -> str:
+    def _read_action(self, action: Any | None) -> tuple[Array | None, str]:
+        """Return an action as numbers, or None and why it is not one of this policy."""
+        if action is None:
+            return None, ""
+        try:
+            # A copy: a policy may write the next one into the same memory.
+            numbers = np.array(action, np.float64).ravel()
+        except (TypeError, ValueError, OverflowError):
+            return None, "no numbers"
+        if numbers.shape != self._zeros.shape:
+            return None, f"shape {numbers.shape}"
+        if np.isfinite(numbers).tobytes() != self._all_finite:
+            return None, "not finite"
+        if self._command is None:
+            with np.errstate(invalid="ignore"):
+                choice = self._choose(numbers)
+            if not self._space.contains(choice) or (choice.ravel() != numbers).any():
+                return None, f"{short_repr(numbers.tolist())}"
+        return numbers, ""
+
+    def _find_fault(self, wanted: Array | None, problem: str) -> str:
         """Say why an action cannot be taken; empty if it can."""
-        fault, value = "", ""
-        if wanted is None:
+        fault = ""
+        if problem:
+            fault = "action"
+        elif wanted is None:
             fault = "" if self.state == "stopped" or self._ordered else "no action"
-        elif self._command is None:
-            return ""
-        elif wanted.shape != self._zeros.shape:
-            fault, value = "action", f"shape {wanted.shape}"
-        elif np.isfinite(wanted).tobytes() != self._all_finite:
-            fault, value = "action", "not finite"
-        elif self._measured is not None and self._command.position is None:
+        elif self._measured is not None and self._command is not None and self._command.position is None:
             fault = "no position"
         if fault:
-            self._record("fault", fault, value)
+            self._record("fault", fault, problem)
         return fault
 
     def _follow(self, fault: str) -> None:

@@ -36,7 +36,7 @@ class SensorChecks:
                         f"limits: sensors.{name}.frozen_s: this policy does not say its control_dt; "
                         "write control_dt: SECONDS"
                     )
-                self._frozen.append((name, place, max(2, round(sensor.frozen_s / control_dt))))
+                self._frozen.append((name, place, max(2, round(min(sensor.frozen_s / control_dt, 1e9)))))
         self._all_finite = b"\x01" * layout.size
         self._has_range = bool(np.isfinite(self._low).any())
         self.reset()

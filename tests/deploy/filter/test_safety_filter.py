@@ -173,7 +173,7 @@ def test_a_hand_takes_over_gradually_and_within_limits(arm):
     for _ in range(3):
         run_filter(safety, REST, [0.5, 0.5])
     safety.override([3.0, 0.5])
-    assert run_filter(safety, REST, [0.5, 0.5])[0] == pytest.approx(1.0)  # half of the way is 1.75
+    assert run_filter(safety, REST, [0.5, 0.5])[0] == pytest.approx(0.75)  # the bound is 1, half of the way 0.75
     assert run_filter(safety, REST, [0.5, 0.5])[0] == pytest.approx(1.0)
     safety.override(None)
     assert [run_filter(safety, REST, [0.5, 0.5])[0] for _ in range(2)] == pytest.approx([0.75, 0.5])
@@ -205,6 +205,9 @@ def test_choices_are_held_too():
     safety = SafetyFilter(info)
     assert run_filter(safety, np.zeros(2), 7) == 7
     assert run_filter(safety, np.array([np.nan, 0.0]), 7) == 5
+    for wrong in (8, 6.5, np.nan, 1e300, "no", 10**400):
+        assert run_filter(safety, np.zeros(2), wrong) == 5
+        assert (safety.state, safety.reason) == ("holding", "action")
     with pytest.raises(UsageError, match="choices"):
         SafetyFilter(info, Limits.model_validate({"limits": {"all": {"action": [0, 1]}}}))
 
