@@ -75,7 +75,8 @@ class Command:
         """Take the measured positions of the joints."""
         self._expected = self._reference if self._bounds.is_value else None
         if self._reference is not None and not self._bounds.is_value:
-            self._expected = self._reference + self._before
+            with np.errstate(over="ignore"):
+                self._expected = self._reference + self._before
         self.position = position.copy()
 
     def find_error(self) -> float:

@@ -218,7 +218,7 @@ class SafetyFilter:
             # A copy: a policy may write the next one into the same memory.
             numbers = np.array(action, np.float64).ravel()
         except (TypeError, ValueError, OverflowError):
-            return None, "no numbers"
+            return None, "a value that is no float64 number"
         if numbers.shape != self._zeros.shape:
             return None, f"shape {numbers.shape}"
         if np.isfinite(numbers).tobytes() != self._all_finite:

@@ -6,7 +6,7 @@ import asyncio
 import hmac
 import tempfile
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,29 +15,29 @@ from aiohttp import web
 from aiohttp.typedefs import Middleware
 
 from rlctl.deploy.server import messages
+from rlctl.deploy.server.connections import Answer, Connections
 from rlctl.deploy.server.serve import LOOPBACK
 from rlctl.deploy.server.server import PolicyServer
 from rlctl.errors import RlctlError
 
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 _LARGEST_POLICY = 64 * 2**20  # [bytes]
 _BODY_TIMEOUT_S = 10.0
 _ORDERS = ("stop", "home", "hold", "resume")
 
 
-def make_app(server: PolicyServer) -> web.Application:
+def make_app(server: PolicyServer, connections: Connections) -> web.Application:
     """Return the web application of a server."""
-    return _Routes(server).make_app()
+    return _Routes(server, connections).make_app()
 
 
 class _Routes:
-    def __init__(self, server: PolicyServer) -> None:
-        self.server = server
+    def __init__(self, server: PolicyServer, connections: Connections) -> None:
+        self.server, self.connections = server, connections
         self.page = (Path(__file__).parent / "page.html").read_text("utf-8")
 
     def make_app(self) -> web.Application:
         check = make_access_check(self.server.settings.host, self.server.api_key, self._note_refused)
-        app = web.Application(middlewares=[check], client_max_size=_LARGEST_POLICY)
+        app = web.Application(middlewares=[self.connections.follow, check], client_max_size=_LARGEST_POLICY)
         app.add_routes(
             [
                 web.get("/", self._serve_root),
@@ -58,7 +58,8 @@ class _Routes:
         self.server.measurements.refused += 1
 
     async def _watch(self, app: web.Application) -> Any:
-        tasks = [asyncio.create_task(self.server.check_watchdogs()), asyncio.create_task(self.server.write_recording())]
+        work = (self.server.check_watchdogs(), self.server.write_recording(), self.connections.close_slow())
+        tasks = [asyncio.create_task(task) for task in work]
         yield
         for task in tasks:
             task.cancel()
@@ -151,7 +152,7 @@ def make_access_check(host: str, key: str | None, on_refused: Callable[[], None]
     """Return what refuses requests without the key (`Authorization: Api-Key KEY`), and those of other sites' pages."""
 
     @web.middleware
-    async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def check(request: web.Request, handler: Answer) -> web.StreamResponse:
         if (problem := _find_problem(request, host in LOOPBACK, key)) is None:
             return await handler(request)
         on_refused()
@@ -161,12 +162,15 @@ def make_access_check(host: str, key: str | None, on_refused: Callable[[], None]
 
 
 def _find_problem(request: web.Request, is_local: bool, key: str | None) -> tuple[int, str] | None:
-    host = request.headers.get("Host", "")
+    host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+    try:
+        name, page_host = urlsplit(f"//{host}").hostname, urlsplit(origin or "").netloc
+    except ValueError:  # `[::1`
+        return 400, "Host or Origin is not an address"
     # A name that somebody lets point to this machine would open it to the pages of that name.
-    if is_local and urlsplit(f"//{host}").hostname not in LOOPBACK:
+    if is_local and name not in LOOPBACK:
         return 403, "this server answers to localhost only"
-    origin = request.headers.get("Origin")
-    if origin is not None and urlsplit(origin).netloc != host:
+    if origin is not None and page_host != host:
         return 403, "requests of other sites are refused"
     page = request.path == "/" and request.headers.get("Upgrade", "").lower() != "websocket"
     if key is None or request.path == "/healthz" or page:

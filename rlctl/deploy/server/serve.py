@@ -92,15 +92,22 @@ async def serve_until(
     """Serve until `end` is set."""
     from aiohttp import web
 
+    from rlctl.deploy.server.connections import BACKLOG, Connections, count_allowed_connections
     from rlctl.deploy.server.routes import make_app
 
-    runner = web.AppRunner(make_app(server), access_log=None, shutdown_timeout=1.0)
-    await runner.setup()
     settings = server.settings
+    connections = Connections(count_allowed_connections(settings.max_clients))
+    runner = web.AppRunner(make_app(server, connections), access_log=None, shutdown_timeout=1.0)
+    await runner.setup()
+    web_server = runner.server
+    assert web_server is not None
+    loop = asyncio.get_running_loop()
+    listener: asyncio.Server | None = None
     try:
-        site = web.TCPSite(runner, settings.host, settings.port)
         try:
-            await site.start()
+            listener = await loop.create_server(
+                lambda: connections.accept(web_server()), settings.host, settings.port, backlog=BACKLOG
+            )
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 hint = "give another one, or --port 0 for any that is free"
@@ -111,11 +118,13 @@ async def serve_until(
             _handle_signals(server, end)
         gc.collect()
         gc.freeze()  # what is there now stays; collections need not look at it again
-        port = runner.addresses[0][1]
+        port = listener.sockets[0].getsockname()[1]
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         on_start(f"{host}:{port}")
         await end.wait()
     finally:
+        if listener is not None:
+            listener.close()
         await runner.cleanup()
 
 

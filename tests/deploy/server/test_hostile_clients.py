@@ -1,15 +1,20 @@
 """Clients that flood, send gigabytes, half a frame or die neither block nor end the others."""
 
+import contextlib
 import os
 import socket
 import struct
+import subprocess
+import sys
 import threading
+import urllib.request
 
 import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 
-from rlctl.deploy.server import messages
+from rlctl.deploy.server import connections, messages
+from rlctl.deploy.server.client import PolicyClient
 from rlctl.deploy.server.measurements import read_memory
 from tests.deploy.conftest import REPEATABLE
 from tests.deploy.server.serving import OBSERVATION, RunningServer, write_policy
@@ -71,7 +76,7 @@ def test_half_a_frame_and_death(server):
 
 def test_a_flood_that_reads_nothing(server):
     content = frame(messages.pack(OBSERVATION)) * 200
-    connections = [open_socket(server)[0] for _ in range(3)]
+    flooding = [open_socket(server)[0] for _ in range(3)]
     done = threading.Event()
 
     def flood(connection):
@@ -82,7 +87,7 @@ def test_a_flood_that_reads_nothing(server):
         except OSError:  # the server reads no more
             done.wait(30)
 
-    threads = [threading.Thread(target=flood, args=(each,)) for each in connections]
+    threads = [threading.Thread(target=flood, args=(connection,)) for connection in flooding]
     for thread in threads:
         thread.start()
     before = read_memory()
@@ -90,7 +95,7 @@ def test_a_flood_that_reads_nothing(server):
     done.set()
     for thread in threads:
         thread.join()
-    for connection in connections:
+    for connection in flooding:
         connection.close()
     assert read_memory() - before < 50e6
 
@@ -105,8 +110,70 @@ def test_two_hundred_connections(server):
         answers = [first.split(b"\r\n")[0] for _, first in opened]
         assert answers.count(b"HTTP/1.1 101 Switching Protocols") <= 7
         assert answers.count(b"HTTP/1.1 503 Service Unavailable") >= 93
-        for connection in [*idle, *(each for each, _ in opened)]:
+        for connection in [*idle, *(connection for connection, _ in opened)]:
             connection.close()
+
+
+def test_request_heads_that_never_end_are_timed_out(server, monkeypatch):
+    monkeypatch.setattr(connections, "_FIRST_REQUEST_S", 0.1)
+    with server.client() as client:
+        slow = socket.create_connection(("127.0.0.1", server.port), timeout=30)
+        slow.sendall(b"GET /metadata HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
+        with contextlib.suppress(ConnectionResetError):
+            assert slow.recv(1000) == b""  # closed
+        assert client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]  # robots stay
+
+
+def test_a_stop_is_served_with_few_file_descriptors_and_many_connections(tmp_path):
+    file = write_policy(tmp_path / "policy.safetensors")
+    command = f"ulimit -n 256; exec {sys.executable} -m rlctl serve {file} --port 0 --max-clients 8"
+    process = subprocess.Popen(["bash", "-c", command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        port = int(process.stdout.readline().partition("ws://127.0.0.1:")[2].partition(",")[0])
+        robot = PolicyClient(f"ws://127.0.0.1:{port}")
+        opened = []
+        half_head = b"GET / HTTP/1.1\r\nX-Slow: "
+        half_body = b"POST /act HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
+        for sent in [half_head] * 400 + [half_body] * 400:
+            opened.append(socket.create_connection(("127.0.0.1", port), timeout=30))
+            with contextlib.suppress(ConnectionResetError):
+                opened[-1].sendall(sent)
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/stop", b"", timeout=5) as answer:
+            assert answer.status == 200
+        assert robot.act(OBSERVATION)["state"] == "stopped"
+        robot.close()
+        for connection in opened:
+            connection.close()
+        process.terminate()
+        assert process.communicate(timeout=30)[1] == ""
+    finally:
+        process.kill()
+
+
+def test_too_few_file_descriptors(tmp_path):
+    file = write_policy(tmp_path / "policy.safetensors")
+    command = f"ulimit -n 128; exec {sys.executable} -m rlctl serve {file} --port 0"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert (
+        "--max-clients 64: this process may open 128 files, which is too few; raise the limit, ulimit -n" in done.stderr
+    )
+
+
+@pytest.mark.parametrize("headers", [{"Host": "[::1"}, {"Origin": "http://["}, {"Host": "[]"}, {"Origin": "[x]://"}])
+def test_addresses_that_are_none(server, headers, capfd):
+    assert server.get("/metadata", headers=headers)[0] in (400, 403)
+    assert capfd.readouterr().err == ""
+
+
+def test_numbers_of_401_digits(server, capfd):
+    number = "1" * 401
+    assert server.post("/override", f'{{"action": [{number}, 0]}}'.encode())[0] == 400
+    assert server.post("/override", b'{"action": ["a", {}]}')[0] == 400
+    assert server.post("/act", f'{{"observation": [{number}, 0, 0, 0, 0]}}'.encode())[0] == 400
+    assert server.post("/act", f'{{"observation": [0, 0, 0, 0, 0], "age_s": {number}}}'.encode())[0] == 400
+    assert server.post("/act", f'{{"observation": [0, 0, 0, 0, 0], "reset": {number}}}'.encode())[0] == 200
+    assert capfd.readouterr().err == ""
 
 
 @settings(REPEATABLE, max_examples=100)

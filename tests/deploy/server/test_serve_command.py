@@ -83,7 +83,8 @@ def test_starts_without_what_takes_long_to_import(tmp_path):
         "import pathlib, sys\n"
         "from rlctl.deploy.server.serve import ServerSettings, make_server\n"
         "from rlctl.deploy.server.routes import make_app\n"
-        f"make_app(make_server(pathlib.Path({str(file)!r}), ServerSettings()))\n"
+        "from rlctl.deploy.server.connections import Connections\n"
+        f"make_app(make_server(pathlib.Path({str(file)!r}), ServerSettings()), Connections(100))\n"
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
