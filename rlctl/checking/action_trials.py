@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ class OutOfTime(Exception):
     """Raised where an experiment's time is over in the middle of a comparison."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class ActionNumber:
     """One number of the action."""
 
@@ -100,16 +100,16 @@ class Trials:
         frames = self._plain[seed, steps] = self.play(seed, self.actions(seed, steps))
         return frames
 
-    def with_value(
-        self, seed: int, steps: int, dimension: ActionNumber, value: Any, at: int | None = None
+    def with_values(
+        self, seed: int, steps: int, values: Mapping[ActionNumber, Any], at: int | None = None
     ) -> list[Frame]:
-        """Play an episode with one number of the action set to a value, in one step or in all."""
+        """Play an episode with some numbers of the action set to values, in one step or in all."""
 
         def change(action: Any, leaf: Leaf) -> Any:
-            part = pick(action, leaf.path)
-            if leaf.path == dimension.leaf.path:
-                part = np.array(part)
-                part.flat[dimension.index] = value
+            part = np.array(pick(action, leaf.path))
+            for dimension, value in values.items():
+                if dimension.leaf.path == leaf.path:
+                    part.flat[dimension.index] = value
             return part
 
         space, chosen = self.instance.env.action_space, self.actions(seed, steps)
@@ -117,10 +117,14 @@ class Trials:
             chosen[step] = build_action(space, functools.partial(change, chosen[step]))
         return self.play(seed, chosen)
 
-    def play(self, seed: int, chosen: Sequence[Any]) -> list[Frame]:
+    def play(self, seed: int, chosen: Sequence[Any], after_reset: Callable[[], None] = lambda: None) -> list[Frame]:
         """Play an episode with given actions, to its end at most; the first frame is that of reset."""
         episode = EpisodePlayer(self.instance, seed, given=chosen, max_steps=len(chosen), deadline=self.deadline)
-        frames = [to_frame(moment) for moment in episode]
+        frames = []
+        for moment in episode:
+            frames.append(to_frame(moment))
+            if moment.step == 0:
+                after_reset()
         if episode.ended == "time":
             raise OutOfTime
         if episode.ended == "raised":

@@ -6,13 +6,14 @@ import contextlib
 import dataclasses
 import inspect
 import linecache
+import math
 import re
 import sys
 import types
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType, FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 LIBRARIES = ("gymnasium", "numpy", "torch", "pybullet", "pybullet_utils", "rlctl", "builtins", "stable_baselines3")
 """Packages that are not part of an environment; rlctl's own tasks are in packages of their own."""
@@ -45,11 +46,48 @@ class BulletCall:
         return f"{Path(self.file).name}:{self.line}"
 
 
+MOTORS = ("setJointMotorControl2", "setJointMotorControlArray", "resetJointState")
+"""Functions that set a joint's position, or the target of its motor."""
+RECORDED = (*MOTORS, "getContactPoints")
+POSITION = 2
+"""PyBullet's POSITION_CONTROL."""
+FULL_TURN = 2 * math.pi
+MOST_FAR = 1_000
+
+
+class Target(NamedTuple):
+    """A position that a joint was given [rad], [m]."""
+
+    client: int
+    body: int
+    joint: int
+    value: float
+    call: BulletCall
+
+
+@dataclasses.dataclass
+class ContactQuery:
+    """The calls of getContactPoints at one line with the same arguments."""
+
+    call: BulletCall
+    client: int
+    bodies: tuple[int, int]
+    """Of both sides; -1 where the call leaves it out."""
+    links: tuple[int | None, int | None]
+    calls: int = 0
+    contacts: int = 0
+
+
 class BulletCalls:
     """What was recorded."""
 
     def __init__(self) -> None:
         self.without_client: set[BulletCall] = set()
+        self.targets: dict[tuple[int, int, int], Target] = {}
+        """The last motor target per client, body and joint."""
+        self.far_targets: list[Target] = []
+        """Positions of more than a full turn."""
+        self.queries: dict[tuple[Any, ...], ContactQuery] = {}
         self._known: set[tuple[CodeType, int]] = set()
 
     def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
@@ -61,6 +99,43 @@ class BulletCalls:
             has_client = bool(arguments) if name in FIRST_IS_CLIENT else CLIENT_WORDS.search(_read_arguments(frame))
             if not is_library and not has_client:
                 self.without_client.add(BulletCall(frame.f_code.co_filename, frame.f_lineno, name))
+
+    def note_result(
+        self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any], result: Any
+    ) -> None:
+        """Note what a call set or returned, if it moves joints or asks for contacts."""
+        call = BulletCall(frame.f_code.co_filename, frame.f_lineno, name)
+        client = int(keywords.get("physicsClientId", 0))
+        if name == "getContactPoints":
+            names = ("bodyA", "bodyB", "linkIndexA", "linkIndexB")
+            one, two, link, other = ({**dict(zip(names, arguments, strict=False)), **keywords}.get(n) for n in names)
+            key = (call, client, one, two, link, other)
+            bodies = tuple(-1 if body is None else int(body) for body in (one, two))
+            query = self.queries.setdefault(key, ContactQuery(call, client, bodies, (link, other)))  # type: ignore[arg-type]
+            query.calls, query.contacts = query.calls + 1, query.contacts + len(result or ())
+            return
+        for body, joint, value in _read_positions(name, arguments, keywords):
+            target = Target(client, body, joint, value, call)
+            if name != "resetJointState":
+                self.targets[client, body, joint] = target
+            if abs(value) > FULL_TURN and len(self.far_targets) < MOST_FAR:
+                self.far_targets.append(target)
+
+
+def _read_positions(name: str, arguments: Sequence[Any], keywords: dict[str, Any]) -> list[tuple[int, int, float]]:
+    """Return body, joint and position of each joint that a call moves by a position; empty for other modes."""
+    many = name.endswith("Array")
+    names = ["bodyUniqueId", "jointIndices" if many else "jointIndex"]
+    names += ["targetValue"] if name == "resetJointState" else ["controlMode", "targetPosition" + "s" * many]
+    given = {**dict(zip(names, arguments, strict=False)), **keywords}
+    body, joints, values = given.get("bodyUniqueId", given.get("bodyIndex")), given.get(names[1]), given.get(names[-1])
+    if body is None or joints is None or values is None or given.get("controlMode", POSITION) != POSITION:
+        return []
+    pairs = zip(joints, values, strict=False) if many else [(joints, values)]
+    try:
+        return [(int(body), int(joint), float(value)) for joint, value in pairs]
+    except (TypeError, ValueError):  # PyBullet itself has refused or converted it
+        return []
 
 
 def _read_arguments(frame: FrameType) -> str:
@@ -90,8 +165,12 @@ class _RecordedFunction(_Replacement):
         self._name, self._function, self._calls = name, function, calls
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        self._calls.note_call(self._name, sys._getframe(1), arguments, keywords)
-        return self._function(*arguments, **keywords)
+        frame = sys._getframe(1)
+        self._calls.note_call(self._name, frame, arguments, keywords)
+        result = self._function(*arguments, **keywords)
+        if self._name in RECORDED:
+            self._calls.note_result(self._name, frame, arguments, keywords, result)
+        return result
 
 
 @contextlib.contextmanager

@@ -20,6 +20,8 @@ MOST_CLIENTS = 1024
 MOST_BODIES = 20
 """So many bodies of a world are read, robots and free ones first."""
 MOST_JOINTS = 60
+MOST_LINKS = 30
+"""So many links of a robot are read for their orientation."""
 WIDEST_RANGE = 1e3
 """Limits farther apart are none: some models write 1e16 for a joint without limits."""
 
@@ -124,11 +126,7 @@ def _body(client: int, body: int) -> WorldBody:
     infos = [
         p.getJointInfo(body, i, physicsClientId=client) for i in range(p.getNumJoints(body, physicsClientId=client))
     ]
-    joints = [
-        Joint(info[0], info[1].decode(errors="replace"), info[2] == p.JOINT_REVOLUTE, info[8], info[9])
-        for info in infos
-        if info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)
-    ]
+    joints = [_joint(info) for info in infos if info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)]
     links = [base, *(info[12].decode(errors="replace") for info in infos)]
     base_mass, *masses = (p.getDynamicsInfo(body, i, physicsClientId=client)[0] for i in range(-1, len(infos)))
     has_heavy_links = bool(joints) and any(mass > 0 for mass in masses)
@@ -159,6 +157,38 @@ def read_states(world: World) -> list[NDArray[np.float64]]:
         parts = [position, *p.getBaseVelocity(body.id, physicsClientId=client), numbers]
         states.append(np.concatenate(parts))
     return states
+
+
+def read_orientations(world: World) -> dict[Link, list[float]]:
+    """Return the quaternion (x, y, z, w) of each base that is free, and of each link of a robot."""
+    p, client = bullet(), world.client
+    orientations = {}
+    for body in world.bodies:
+        if body.is_free:
+            orientations[body.id, -1] = list(p.getBasePositionAndOrientation(body.id, physicsClientId=client)[1])
+        links = range(min(MOST_LINKS, len(body.links) - 1)) if body.joints else ()
+        for link, state in zip(
+            links,
+            p.getLinkStates(body.id, links, computeForwardKinematics=1, physicsClientId=client) or (),
+            strict=False,
+        ):
+            orientations[body.id, link] = list(state[5])
+    return orientations
+
+
+def find_joint(client: int, body: int, index: int) -> Joint | None:
+    """Return a joint that a client holds now; None where there is none of one degree of freedom."""
+    p = bullet()
+    try:
+        info = p.getJointInfo(body, index, physicsClientId=client)
+    except p.error:
+        return None
+    is_single = info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)
+    return _joint(info) if is_single else None
+
+
+def _joint(info: Any) -> Joint:
+    return Joint(info[0], info[1].decode(errors="replace"), info[2] == bullet().JOINT_REVOLUTE, info[8], info[9])
 
 
 def read_gravity(client: int) -> list[float]:

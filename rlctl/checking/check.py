@@ -92,7 +92,7 @@ def check(
     or a hang of more than `env_timeout_s` seconds in a call included, is in the report.
     """
     started = time.monotonic()
-    records = Records(spec.task, normalizes_rewards=lambda: _normalizes_rewards(spec.task))
+    records = Records(spec.task, normalizes=lambda what: _normalizes(spec.task, what))
     mistakes: list[UsageError] = []
 
     def receive(message: ChildMessage) -> None:
@@ -118,12 +118,12 @@ def check(
     return CheckReport(spec.task, judge(records, rules), records, time.monotonic() - started, budget_s, strict)
 
 
-def _normalizes_rewards(task: str) -> bool:
+def _normalizes(task: str, what: str) -> bool:
     if registry.find_recipe_file(task) is None:
         return False
 
     normalize = sources.resolve(task, None, {}).normalize
-    return normalize is not None and normalize.reward
+    return normalize is not None and bool(getattr(normalize, what))
 
 
 @contextlib.contextmanager

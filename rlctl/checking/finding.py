@@ -63,6 +63,8 @@ class RuleFinding:
     """Numbers and names that JSON can hold: seed, episode, step, value, expected."""
     severity: Severity
     fix: str
+    where: tuple[str, int] | None
+    """File and line of the code that causes it, where they are known."""
 
     def __init__(
         self,
@@ -71,10 +73,12 @@ class RuleFinding:
         evidence: Mapping[str, Any] | None = None,
         severity: Severity | None = None,
         fix: str = "",
+        where: tuple[str, int] | None = None,
     ) -> None:
         """Severity and fix are the rule's where left out."""
         self.rule, self.message, self.evidence = rule, message, evidence or {}
         self.severity, self.fix = Severity(severity or RULES[rule].severity), fix or RULES[rule].fix
+        self.where = where
 
     def __str__(self) -> str:
         return f"{self.rule} {self.severity} ({self.name}): {self.message}"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import inspect
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
+from rlctl.checking.attributes import GeneratorWatch, find_author, is_task
 from rlctl.checking.clock import read_clock
 from rlctl.checking.failures import EnvironmentRaised, describe, describe_failure
 from rlctl.checking.leaves import find_leaves
@@ -111,6 +111,7 @@ class Context:
         self.progress = progress or CallProgress()
         self.budget = Budget(read_clock())
         """What the experiment that is running may use."""
+        self.generators = GeneratorWatch()
         self._instance: Instance | None = None
 
     def build(self, render_mode: Literal["rgb_array"] | None = None) -> Instance:
@@ -167,18 +168,6 @@ def _accepts(env: Any, name: str) -> bool:
     except ValueError:  # not written in Python
         return True
     return any(parameter.name == name or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
-
-
-def find_author(env: Any) -> Any:
-    """Return the object whose class the environment's author wrote: not rlctl's environment of a task, but the task."""
-    inner = getattr(env, "unwrapped", env)
-    return inner.task if is_task(env) else inner
-
-
-def is_task(env: Any) -> bool:
-    """Say whether it is an environment of a task of rlctl."""
-    task_env = sys.modules.get("rlctl.task.env")
-    return task_env is not None and isinstance(getattr(env, "unwrapped", env), task_env.TaskEnv)
 
 
 def find_longest_episode(env: Any) -> int | None:

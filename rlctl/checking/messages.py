@@ -18,6 +18,8 @@ SECOND_SEED = 1001
 
 MOST_INFOS = 100
 """So many numbers of info are recorded per episode, by name."""
+SUCCESS = "is_success"
+"""The name of success in info."""
 ENDS = ("terminated", "truncated", "both")
 
 

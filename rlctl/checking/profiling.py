@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.checking import bullet_calls
+from rlctl.checking.attributes import find_author
 from rlctl.checking.clock import read_waited_s
-from rlctl.checking.instance import find_author
 from rlctl.version import PACKAGE_FOLDER
 
 _BUILTIN = re.compile(

@@ -41,8 +41,8 @@ class Records:
     """Rules that an experiment found nothing to look at for, and why."""
     finished: dict[str, Finished] = dataclasses.field(default_factory=dict)
     """Per experiment that was run and did not end its process."""
-    normalizes_rewards: Callable[[], bool] = lambda: False
-    """Says whether there is a packaged recipe, and it normalises rewards."""
+    normalizes: Callable[[str], bool] = lambda _: False
+    """Says whether there is a packaged recipe, and it normalises the `reward`, or the `observation`."""
     printed_lines: int = 0
     """Lines that the environment of the first process wrote to stdout."""
     printed_first: str = ""

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.bullet_calls import BulletCalls, Target
 from rlctl.checking.bullet_worlds import (
     ANGULAR,
     JOINTS,
     VELOCITY,
     Jump,
+    Link,
     Pair,
     World,
     WorldBody,
@@ -24,6 +26,7 @@ from rlctl.checking.bullet_worlds import (
     measure_thickness,
     read_contacts,
     read_gravity,
+    read_orientations,
     read_states,
     read_world,
     weight_matters,
@@ -31,6 +34,7 @@ from rlctl.checking.bullet_worlds import (
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.finding import NotApplicable
 from rlctl.checking.instance import Instance
+from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.messages import FIRST_SEED
 
 MOST_WORLDS = 4
@@ -55,17 +59,29 @@ class WorldLog:
     """Per look, per body, as `read_states` returns them."""
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)
     """Depth and limit of what is too far inside each other [m]."""
+    touching: list[set[Pair]] = dataclasses.field(default_factory=list)
+    """Links that touch."""
+    orientations: list[dict[Link, list[float]]] = dataclasses.field(default_factory=list)
+    """Quaternions of links, as `read_orientations` returns them."""
+    observed: list[NDArray[np.float64]] = dataclasses.field(default_factory=list)
+    """The numbers of the observation, flat."""
+    first_targets: dict[tuple[int, int, int], Target] = dataclasses.field(default_factory=dict)
+    """Motor targets that the first step sets, with the zero action only."""
 
-    def look(self, place: Place) -> bool:
+    def look(self, place: Place, observation: Any) -> bool:
         """Add what is there now; False where the world has gone, or has other bodies."""
         client = self.world.client
         try:
             states, contacts = read_states(self.world), read_contacts(client)
+            orientations = read_orientations(self.world)
             deep = {pair: (-d, _limit(client, pair)) for pair, d in contacts.items() if d < -LEAST_LIMIT}
         except bullet().error:
             return False
         self.places.append(place)
         self.states.append(states)
+        self.touching.append(set(contacts))
+        self.orientations.append(orientations)
+        self.observed.append(flatten_numbers(observation))
         self.deep.append({pair: depth for pair, depth in deep.items() if depth[0] > depth[1]})
         return True
 
@@ -108,12 +124,14 @@ class LoggedWorld:
 
 
 class WorldLogger:
-    """Logs the worlds of one instance. `older`: the clients that were connected before it was built."""
+    """Logs the worlds of one instance. `older`: the clients that were connected before it was built; `calls` records
+    how it calls PyBullet."""
 
-    def __init__(self, instance: Instance, older: set[int]) -> None:
+    def __init__(self, instance: Instance, older: set[int], calls: BulletCalls) -> None:
         if "pybullet" not in sys.modules:
             raise NotApplicable("no PyBullet world")
         self.instance = instance
+        self.calls = calls
         self.resets = 0
         self._older = older
         self._worlds: dict[int, LoggedWorld] = {}
@@ -131,7 +149,13 @@ class WorldLogger:
         logs: list[WorldLog] = []
         for moment in EpisodePlayer(self.instance, seed, kind, number=number, max_steps=steps, deadline=deadline):
             place = {"seed": seed, "episode": number, "actions": kind, "step": moment.step}
-            logs = [log for log in (logs if moment.step else self._begin()) if log.look(place)]
+            logs = logs if moment.step else self._begin()
+            logs = [log for log in logs if log.look(place, moment.observation)]
+            if moment.step == 0:
+                self.calls.targets.clear()
+            elif moment.step == 1 and kind == "zero":
+                for log in logs:
+                    log.first_targets = dict(self.calls.targets)
             if not logs:
                 return
 

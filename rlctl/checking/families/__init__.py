@@ -51,6 +51,7 @@ from rlctl.checking.families import (
     search,
     seeding,
     speed,
+    state,
     variants,
 )
 from rlctl.checking.finding import RULES
@@ -77,6 +78,7 @@ PROCESSES = {
             episodes.record_episodes,
             incentives.record_starts,
             search.search,
+            episodes.find_unseeded,
             rewards.recompute_rewards,
             isolation.count_after_resets,
         )
@@ -87,6 +89,8 @@ PROCESSES = {
             seeding.compare_unseeded,
             physics.watch_worlds,
             actions.compare_actions,
+            state.change_attributes,
+            actions.give_nan,
             variants.play_variants,
             interface.render,
         ),
@@ -97,7 +101,7 @@ PROCESSES = {
 
 MODULES = (
     *(loading, observations, features, interface, determinism, seeding, isolation, episodes),
-    *(rewards, incentives, actions, physics, speed, variants),
+    *(rewards, incentives, actions, physics, speed, state, variants),
 )
 
 CHECKS = {var.rule: var for module in MODULES for var in vars(module).values() if isinstance(var, Check)}

@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Literal
+import contextlib
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
 
 from rlctl.checking.action_trials import (
     REPEATED_STEPS,
+    REWARD,
     ActionNumber,
     OutOfTime,
     Trials,
+    find_differences,
     find_dimensions,
     find_other_rewards,
     observations_differ,
 )
 from rlctl.checking.experiments import experiment
-from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.failures import EnvironmentRaised
+from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context
 from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage
 
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))
 """Seeds and steps that are compared until a difference shows: most show at once, some need time or another start."""
+DELAY_STEPS = 4
+"""Over so many steps the effect of the first action is looked for."""
+NAN_STEPS = 4
 LONGEST_DELAY = 4
 """Observations may hold so many earlier actions; a penalty on changes of the action reaches as far [steps]."""
 MOST_NAMES = 8
@@ -31,7 +41,7 @@ Effect = Literal["lasting", "cost", "copy", "none"]
 itself in the observation."""
 
 
-@experiment("action effects", "RL701", share=4.0)
+@experiment("action effects", "RL701", "RL115", "RL616", share=4.0)
 def compare_actions(context: Context) -> Iterator[ChildMessage]:
     """Play the same episode with each number of the action at other values."""
     with context.fresh() as instance:
@@ -40,6 +50,7 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
             raise NotJudged("no number of the action can be varied")
         trials = Trials(context, instance)
         trials.require_repeatable()
+        yield from _late_effects(trials, every)
         effects: dict[str, Effect] = {}
         why = f"only {MOST_DIMENSIONS} are compared" if len(every) > MOST_DIMENSIONS else ""
         try:
@@ -53,13 +64,59 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
     yield from _without_effect(effects, len(every), left_out)
 
 
+@experiment("nan action", "RL704", share=0.2)
+def give_nan(context: Context) -> Iterator[ChildMessage]:
+    """Take an action of NaN, and then begin another episode."""
+    with context.fresh() as instance:
+        if not any(leaf.kind == "Box" and leaf.dtype.startswith("float") for leaf in instance.action_leaves):
+            raise NotApplicable("no continuous action")
+        trials = Trials(context, instance)
+        good = trials.actions(FIRST_SEED, NAN_STEPS)
+        numbers = [
+            number for number in find_dimensions(instance.action_leaves) if number.leaf.dtype.startswith("float")
+        ]
+        # A simulator may write a log about it to the working directory: MuJoCo does.
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.suppress(EnvironmentRaised):
+            frames = trials.with_values(FIRST_SEED, NAN_STEPS, dict.fromkeys(numbers, np.nan), at=0)
+            if not all(np.isfinite(frame).all() for frame in frames[1:]):
+                later = trials.play(FIRST_SEED, good)
+                lasts = not all(np.isfinite(frame).all() for frame in later)
+                where = "the observation or the reward" + (", in later episodes too" if lasts else "")
+                evidence = {"seed": FIRST_SEED, "step": 1, "value": "NaN", "expected": "an exception"}
+                severity = Severity.WARNING if lasts else None
+                yield RuleFinding(
+                    "RL704", f"an action of NaN is accepted, and NaN comes back in {where}", evidence, severity
+                )
+
+
+def _late_effects(trials: Trials, dimensions: Sequence[ActionNumber]) -> Iterator[RuleFinding]:
+    """Change the first action, and say whether observation or reward show that one step late, whatever the change."""
+    pairs = []
+    for seed in (FIRST_SEED, SECOND_SEED, SECOND_SEED + 1):
+        plain = trials.plain(seed, DELAY_STEPS)
+        for end in (0, 1):
+            values = {dimension: dimension.ends[end] for dimension in dimensions}
+            pairs.append(find_differences(plain, trials.with_values(seed, DELAY_STEPS, values, at=0)))
+    rewarded = [{step for step, columns in pair.items() if REWARD in columns} for pair in pairs]
+    observed = [{step for step, columns in pair.items() if columns.min() < REWARD} for pair in pairs]
+    evidence: dict[str, Any] = {"seed": FIRST_SEED, "value": 2, "expected": 1}
+    if all(min(steps, default=0) == 2 for steps in observed):
+        message = (
+            "the observation of step 1 does not depend on the first action, that of step 2 does: it is one step old"
+        )
+        yield RuleFinding("RL115", message, {**evidence, "step": 1})
+    elif all(min(steps, default=0) == 1 for steps in observed) and all(min(s, default=0) == 2 for s in rewarded):
+        message = "the first action changes the observation of step 1, and the reward from step 2 on only"
+        yield RuleFinding("RL616", message, {**evidence, "step": 1})
+
+
 def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
     copies = trials.copies(dimension, FIRST_SEED, REPEATED_STEPS, LONGEST_DELAY)
     effect: Effect = "none"
     for seed, steps in STAGES:
         plain = trials.plain(seed, steps)
         for end in dimension.ends:
-            played = trials.with_value(seed, steps, dimension, end)
+            played = trials.with_values(seed, steps, {dimension: end})
             if observations_differ(plain, played, copies):
                 return "lasting"
             if find_other_rewards(plain, played):
@@ -75,7 +132,7 @@ def _lasts(trials: Trials, dimension: ActionNumber) -> bool:
         plain = trials.plain(seed, steps)
         at = (len(plain) - 1) // 4
         for end in dimension.ends:
-            played = trials.with_value(seed, steps, dimension, end, at)
+            played = trials.with_values(seed, steps, {dimension: end}, at)
             # The action of index `at` gives frame `at + 1`.
             if any(step > at + 1 + LONGEST_DELAY for step in find_other_rewards(plain, played)):
                 return True

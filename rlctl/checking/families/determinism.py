@@ -15,11 +15,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.attributes import find_unequal, read_attributes
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments import check, experiment
-from rlctl.checking.finding import NotJudged, RuleFinding, Severity
-from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, Built, ChildMessage, RecordedEpisode, Skipped
+from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.instance import Context, Instance
+from rlctl.checking.messages import (
+    FIRST_SEED,
+    SECOND_SEED,
+    SUCCESS,
+    Built,
+    ChildMessage,
+    Fact,
+    RecordedEpisode,
+    Skipped,
+)
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Records
 
@@ -27,8 +37,13 @@ COMPARED_STEPS = 300
 """How far comparisons go."""
 DIRTY_STEPS = 37
 """How far the other episode goes, at most, that is left unfinished before a repetition."""
+KEPT_STEPS = 10
+"""So many steps are between two resets whose attributes are compared."""
 LATE = 20
 """What an unfinished episode changes only after so many steps is a residue, not the episode's start [steps]."""
+LAST_BITS = 1e-12
+"""Up to this the last bits of a float differ, by the order of additions, and nothing grows out of it."""
+MOST_KEPT = 3
 NEARLY = 1e-5
 """Up to this a first difference is a numerical residue, such as a simulation's that was not reset in full; chaos may
 make it large later. Relative to the larger value or to 1; it is also what Gymnasium's checker tolerates."""
@@ -57,6 +72,18 @@ def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
         recording = Recording(role, episode, budget)
         yield from recording.run()
         steps = min(steps, recording.steps)
+    yield Fact("kept", _find_kept(instance))
+
+
+def _find_kept(instance: Instance) -> list[str]:
+    """Return the attributes that differ after two resets with one seed, with some steps between them."""
+    read = []
+    for _ in range(2):
+        instance.reset(FIRST_SEED)
+        read.append(read_attributes(instance.env))
+        for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=KEPT_STEPS):
+            pass
+    return find_unequal(*read)
 
 
 def compare(records: Records, first: str, second: str) -> tuple[RecordedEpisode, FirstDifference | None]:
@@ -90,30 +117,43 @@ def report(
     trajectory: RecordedEpisode,
     difference: FirstDifference,
     what: str,
+    cause: str = "",
+    fix: str = "",
     *,
     is_mild: bool = False,
 ) -> RuleFinding:
     """Return the finding that two recordings differ; an info where the environment's registration says they may."""
     severity = Severity.WARNING if difference.is_small or is_mild else None
-    if records.require_built().nondeterministic:
+    if records.require_built().nondeterministic or difference.largest < LAST_BITS:
         severity = Severity.INFO
-    return RuleFinding(rule, f"{what}: {difference.text()}", difference.evidence(trajectory), severity)
+    return RuleFinding(rule, f"{what}: {difference.text()}{cause}", difference.evidence(trajectory), severity, fix)
 
 
-@check("RL301", "comparisons")
+def _find_cause(records: Records) -> tuple[str, str]:
+    """Return what explains that an instance differs from itself, for a message, and what to do about it."""
+    fresh = records.role("fresh process")
+    names: list[str] = records.facts.get("kept", [])
+    if not fresh or find_difference(records.require_built(), records.require_role("alone"), fresh[0]) is not None:
+        return "", ""  # a new process differs too: chance
+    shown = f" ({list_names(names, MOST_KEPT)})" if names else ""
+    what = list_names(names, MOST_KEPT) if names else "every attribute that step changes, and the whole simulation"
+    return f"; a new process repeats it, so reset keeps state{shown}", f"Set back in reset: {what}."
+
+
+@check("RL301", "comparisons", "instances")
 def compare_starts(records: Records) -> Iterator[RuleFinding]:
     """Compare the resets of an episode and its repetition."""
     trajectory, difference = compare(records, "alone", "reused")
     if difference is not None and difference.step == 0:
-        yield report("RL301", records, trajectory, difference, "reset twice with one seed")
+        yield report("RL301", records, trajectory, difference, "reset twice with one seed", *_find_cause(records))
 
 
-@check("RL302", "comparisons")
+@check("RL302", "comparisons", "instances")
 def compare_trajectories(records: Records) -> Iterator[RuleFinding]:
     """Compare the steps of an episode and its repetition."""
     trajectory, difference = compare(records, "alone", "reused")
     if difference is not None and difference.step > 0:
-        yield report("RL302", records, trajectory, difference, "played twice by one instance")
+        yield report("RL302", records, trajectory, difference, "played twice by one instance", *_find_cause(records))
 
 
 @check("RL303", "comparisons")
@@ -197,6 +237,9 @@ def find_difference(built: Built, one: RecordedEpisode, two: RecordedEpisode) ->
     differences += _compare(one.rewards, two.rewards, after, lambda _: "reward")
     differences += _compare(one.terminated, two.terminated, after, lambda _: "terminated")
     differences += _compare(one.truncated, two.truncated, after, lambda _: "truncated")
+    if SUCCESS in one.infos and SUCCESS in two.infos:
+        a, b = one.infos[SUCCESS], two.infos[SUCCESS]
+        differences += _compare(a.values, b.values, a.steps, lambda _: SUCCESS)
     if one.has_ended and two.has_ended and one.steps != two.steps:
         differences.append(FirstDifference(min(one.steps, two.steps), "length", one.steps, two.steps, 1.0, 1.0))
     if not differences:

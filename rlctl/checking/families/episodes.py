@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 
+from rlctl.checking.attributes import find_assignment, read_generators
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments import check, experiment
 from rlctl.checking.finding import NotJudged, RuleFinding, Severity
-from rlctl.checking.instance import Context
+from rlctl.checking.instance import Budget, Context, Instance
 from rlctl.checking.messages import ENDS, FIRST_SEED, ChildMessage, RecordedEpisode
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Records
@@ -26,6 +28,8 @@ FEWEST_EPISODES = 6
 SHORTEST_LIMIT = 5
 """Games of fewer steps that always end together are games, not time limits [steps]."""
 FEWEST_TIES = 4
+FEWEST_LENGTHS = 2
+"""With fewer different lengths it may be one that is unlike the others."""
 SHORTEST_TIE = 20
 """The same, where only some episodes end together [steps]."""
 ENOUGH_STEPS = 1_000
@@ -35,7 +39,13 @@ ENOUGH_STEPS = 1_000
 @experiment("episodes", share=6.0)
 def record_episodes(context: Context) -> Iterator[ChildMessage]:
     """Play whole episodes with actions of every kind."""
-    instance, budget = context.instance, context.budget
+    context.instance.reset(FIRST_SEED)
+    context.generators.before = read_generators(context.instance.env)
+    with context.generators.watch():
+        yield from _record_episodes(context.instance, context.budget)
+
+
+def _record_episodes(instance: Instance, budget: Budget) -> Iterator[ChildMessage]:
     cut = 0
     for number, kind in enumerate(EPISODES):
         if budget.why_spent:
@@ -48,6 +58,27 @@ def record_episodes(context: Context) -> Iterator[ChildMessage]:
         recording = Recording("episodes", episode, budget)
         yield from recording.run()
         cut += recording.was_cut
+
+
+@experiment("unseeded generators", "RL311", share=0.1)
+def find_unseeded(context: Context) -> Iterator[ChildMessage]:
+    """Reset with the first seed, and compare the state of all generators with the one that it had at the beginning."""
+    instance, watch = context.instance, context.generators
+    if not instance.accepts_seed:
+        raise NotJudged("reset takes no seed (RL202)")
+    if watch.before is None:  # no other rule needs the episodes
+        with contextlib.suppress(NotJudged):
+            yield from record_episodes.run(context)
+    for file, line in sorted(watch.calls)[:1]:
+        message = "a random generator without a seed is made in reset or step: default_rng()"
+        yield RuleFinding("RL311", message, {"seed": FIRST_SEED}, where=(file, line))
+    instance.reset(FIRST_SEED)
+    after = read_generators(instance.env)
+    moved = [name for name, state in after.items() if (watch.before or {}).get(name, state) != state]
+    for name in moved[:1]:
+        message = f"{name} is drawn from, and reset(seed={FIRST_SEED}) does not set it back"
+        where = find_assignment(instance.env, name)
+        yield RuleFinding("RL311", message, {"element": name, "seed": FIRST_SEED}, where=where)
 
 
 def _require_episodes(records: Records) -> list[RecordedEpisode]:
@@ -103,6 +134,21 @@ def _find_both_flags(records: Records) -> Iterator[RuleFinding]:
     if len(both) >= 2 and not any(episode.ended == "truncated" for episode in episodes):
         message = f"{len(both)} episodes end with terminated=True and truncated=True, none with truncated alone"
         yield RuleFinding("RL502", message, both[0].at(both[0].steps, value=len(both), expected=0))
+
+
+@check("RL507", "episodes")
+def _find_failure_as_truncated(records: Records) -> Iterator[RuleFinding]:
+    episodes = _require_episodes(records)
+    lengths = [episode.steps for episode in episodes if episode.ended == "truncated"]
+    limit = records.require_built().max_steps or max(lengths, default=0)
+    early = [steps for steps in lengths if steps < limit]
+    if any(episode.terminated.any() for episode in episodes) or len(set(early)) < FEWEST_LENGTHS:
+        return
+    message = (
+        f"{len(early)} of {len(episodes)} episodes are truncated before step {limit}, at {len(set(early))} different"
+    )
+    evidence = {"value": sorted(set(early)), "expected": limit}
+    yield RuleFinding("RL507", f"{message} steps, and none is terminated", evidence)
 
 
 @check("RL503", "episodes")

@@ -1,17 +1,15 @@
-"""RL110 and RL114: numbers in an observation that say nothing, or are left out."""
+"""RL110, RL117 and RL118: numbers in an observation that say nothing, jump, or are large."""
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.experiments import check
-from rlctl.checking.families.rewards import WITH_SEARCH, require_rewarded
-from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.families.rewards import WITH_SEARCH
+from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.leaves import Leaf
 from rlctl.checking.records import Records
 
@@ -20,17 +18,11 @@ Numbers = NDArray[np.float64]
 FEWEST_ROWS = 50
 FEWEST_SEEDS = 3
 MOST_NAMED = 8
-NEAR = 0.05
-"""Two steps are alike where each number of both observations is as near as this, in units of its standard deviation
-over everything that was recorded."""
-FEWEST_PAIRS = 30
-FEWEST_ALIKE_SEEDS = 4
-"""Seeds among which alike steps are found: with fewer it may be something special of one episode."""
-LARGE_PART = 0.25
-"""How different the rewards of alike steps of different episodes have to be, against those of all steps (standard
-deviation): half of the pairs at least."""
-TIMES = 10.0
-"""How much larger that has to be than between alike steps of one episode, where a goal is the same but noise is not."""
+NEAR_TURN, SMALL_TURN = 1.0, 1.5
+"""A step of an angle that wraps is 2 pi, give or take the first [rad], or below the second [rad]."""
+FEWEST_JUMPS = 2
+LARGE_SIZE = 100.0
+"""Root mean square from which an element is large: networks begin with inputs around 1."""
 
 
 def _rows(records: Records, index: int) -> Numbers:
@@ -81,77 +73,40 @@ def _constant(rows: Numbers, leaf: Leaf) -> NDArray[np.intp]:
     return np.flatnonzero(still & (low < high))
 
 
-@dataclasses.dataclass(frozen=True)
-class _StartStep:
-    """One of the first steps of an episode."""
-
-    seed: int
-    number: int
-    """1 is the first."""
-    observations: Numbers
-    """The ones before and after it, in units of what is near. Shape (2, elements)."""
-    reward: float
-
-    def is_alike(self, other: _StartStep) -> bool:
-        """Say whether the observations of both are the same, nearly."""
-        return bool((np.abs(self.observations - other.observations) <= 1.0).all())
-
-
-@check("RL114", *WITH_SEARCH)
-def find_hidden_goal(records: Records) -> Iterator[RuleFinding]:
-    """Compare the rewards of steps with the zero action that look alike, of different episodes and of one."""
-    rewards = np.concatenate([episode.rewards for episode in require_rewarded(records)])
-    pairs = [(one, two) for one, two in itertools.combinations(_first_steps(records), 2) if one.is_alike(two)]
-    across = [pair for pair in pairs if pair[0].seed != pair[1].seed]
-    within = [pair for pair in pairs if pair[0].seed == pair[1].seed]  # where chance in the reward would show
-    seeds = {step.seed for pair in across for step in pair}
-    if len(across) < FEWEST_PAIRS or len(within) < FEWEST_PAIRS or len(seeds) < FEWEST_ALIKE_SEEDS:
-        return  # no two episodes came to the same state
-    different, same = (float(np.median([_apart(pair) for pair in group])) for group in (across, within))
-    if different > LARGE_PART * float(rewards.std()) and different > TIMES * same:
-        one, two = max(across, key=_apart)
-        yield RuleFinding(
-            "RL114",
-            f"with {len(seeds)} seeds, steps that look alike have rewards {different:.3g} apart (median of "
-            f"{len(across):,} pairs), within one episode {same:.2g}: {one.reward:.4g} and {two.reward:.4g}, say",
-            {
-                "seed": two.seed,
-                "step": two.number,
-                "value": two.reward,
-                "expected": one.reward,
-                "other_seed": one.seed,
-                "other_step": one.number,
-            },
-        )
+@check("RL117", *WITH_SEARCH)
+def _find_wrapped_angles(records: Records) -> Iterator[RuleFinding]:
+    for index, leaf in enumerate(records.require_built().leaves):
+        if not leaf.supported or np.dtype(leaf.dtype).kind != "f" or _is_image(leaf):
+            continue
+        steps, rows = [np.zeros((0, int(np.prod(leaf.shape))))], _rows(records, index)
+        for _, series in records.series(index):
+            values = series.values.reshape(len(series.values), -1).astype(np.float64)
+            steps.append(np.abs(np.diff(values, axis=0)))
+        changes = np.concatenate(steps)
+        jumps = np.abs(changes - 2 * np.pi) < NEAR_TURN
+        is_angle = (np.abs(rows) <= 2 * np.pi).all(axis=0) & (jumps | (changes < SMALL_TURN)).all(axis=0)
+        for column in np.flatnonzero(is_angle & (jumps.sum(axis=0) >= FEWEST_JUMPS))[:1]:
+            name = records.require_built().element(index, int(column))
+            message = (
+                f"{name} jumps by 2 pi in {int(jumps[:, column].sum())} of {len(changes)} steps: an angle that wraps"
+            )
+            yield RuleFinding("RL117", message, {"element": name, "expected": "sin and cos"})
 
 
-def _apart(pair: tuple[_StartStep, _StartStep]) -> float:
-    return abs(pair[0].reward - pair[1].reward)
-
-
-def _first_steps(records: Records) -> list[_StartStep]:
-    """Return the steps of all starts, but those that end an episode."""
-    leaves = records.require_built().leaves
-    if not leaves or any(not leaf.supported or len(leaf.shape) == 3 for leaf in leaves):
-        raise NotApplicable("a part of the observation is an image or cannot be compared")
-    near = np.concatenate([_near(_rows(records, index)) for index in range(len(leaves))])
-    steps = []
-    for episode in records.role("starts"):
-        series = [episode.observations.get(index) for index in range(len(leaves))]
-        flat = [one.values.reshape(len(one.values), -1) for one in series if one is not None]
-        if [len(one) for one in flat] == [episode.steps + 1] * len(leaves):
-            scaled = np.nan_to_num(np.concatenate(flat, axis=1) / near)
-            steps += [
-                _StartStep(episode.seed, number, scaled[number - 1 : number + 1], float(episode.rewards[number - 1]))
-                for number in range(1, episode.steps + 1 - (episode.ended in ("terminated", "both")))
-            ]
-    return steps
-
-
-def _near(rows: Numbers) -> Numbers:
-    """Return how near two values of each element are that count as alike."""
-    rows = np.where(np.isfinite(rows), rows, 0.0)
-    near = NEAR * rows.std(axis=0)
-    is_whole = (rows == np.round(rows)).all(axis=0)  # places and kinds are alike only if they are equal
-    near[is_whole] = np.minimum(near[is_whole], 0.5)
-    return np.where(near > 0, near, 1.0)
+@check("RL118", *WITH_SEARCH)
+def _find_large_elements(records: Records) -> Iterator[RuleFinding]:
+    built = records.require_built()
+    large: dict[str, float] = {}
+    for index, leaf in enumerate(built.leaves):
+        if leaf.supported and np.dtype(leaf.dtype).kind == "f" and not _is_image(leaf):
+            sizes = np.sqrt(np.mean(np.square(np.nan_to_num(_rows(records, index).astype(np.float64))), axis=0))
+            large |= {built.element(index, int(i)): float(sizes[i]) for i in np.flatnonzero(sizes > LARGE_SIZE)}
+    if large and not records.normalizes("observation"):
+        names = [f"{name} ({size:.3g})" for name, size in sorted(large.items(), key=lambda pair: -pair[1])]
+        message = f"elements of the observation are large (root mean square): {list_names(names, MOST_NAMED)}"
+        evidence = {
+            "value": max(large.values()),
+            "expected": f"up to {LARGE_SIZE:g}",
+            "elements": list(large)[:MOST_NAMED],
+        }
+        yield RuleFinding("RL118", message, evidence)

@@ -11,7 +11,6 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments import check, experiment
 from rlctl.checking.families.rewards import (
     DISCOUNT,
-    SUCCESS,
     WITH_SEARCH,
     discounted_steps,
     discounted_sum,
@@ -28,7 +27,7 @@ from rlctl.checking.families.rewards import (
 )
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, ChildMessage, RecordedEpisode, Skipped
+from rlctl.checking.messages import FIRST_SEED, SUCCESS, ChildMessage, RecordedEpisode, Skipped
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Records
 

@@ -12,11 +12,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rlctl.checking.attributes import find_author, is_task
 from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.experiments import RECORDING, check, experiment
 from rlctl.checking.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
 from rlctl.checking.finding import RuleFinding
-from rlctl.checking.instance import Context, Instance, find_author, find_longest_episode, is_task
+from rlctl.checking.instance import Context, Instance, find_longest_episode
 from rlctl.checking.messages import Built, ChildMessage
 from rlctl.checking.records import Records
 from rlctl.environments import registry

@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.attributes import is_task
 from rlctl.checking.bullet_calls import BulletCall, record_calls
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump, Pair, WorldBody, find_clients
 from rlctl.checking.experiments import experiment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
+from rlctl.checking.families.robots import find_misuses
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, list_names
-from rlctl.checking.instance import Context, is_task
+from rlctl.checking.instance import Context
 from rlctl.checking.messages import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
 
@@ -42,7 +44,7 @@ MOST_CALLS = 20
 """Calls that a finding's evidence has."""
 
 
-@experiment("worlds", *(f"RL80{i}" for i in (1, 3, 4, 5, 7, 8, 9)), share=4.0)
+@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, 8, 9, 10, 11, 12)), share=4.0)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
     """Log the worlds of an instance through a few episodes, then let them fall alone, which changes them."""
     if "pybullet" not in sys.modules:
@@ -55,7 +57,7 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
         with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
             instance.reset(FIRST_SEED)
         yield from _model_faults(instance.env)
-        logger = WorldLogger(instance, older)
+        logger = WorldLogger(instance, older, calls)
         for number, (kind, steps) in enumerate(EPISODES):
             if number and (context.budget.seconds_left < 0 or not logger.worlds):
                 break
@@ -63,6 +65,7 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
                 logger.play(number, kind, steps, context.budget.deadline)
             except EnvironmentRaised as error:
                 yield describe_failure(error, context.progress)
+        yield from find_misuses(logger.worlds, calls)
         if logger.worlds and context.budget.seconds_left > 0:
             with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
                 logger.simulate_alone(len(EPISODES), context.budget.deadline)

@@ -13,14 +13,21 @@ from rlctl.checking.experiments import check, experiment
 from rlctl.checking.failures import EnvironmentRaised, describe
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, ChildMessage, RecordedEpisode
+from rlctl.checking.messages import FIRST_SEED, SUCCESS, ChildMessage, RecordedEpisode
 from rlctl.checking.records import Records
 
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")
 """The experiments that record episodes of the first process's instance: nearly all there are."""
 DISCOUNT = 0.99
 """The usual discount per step: what is more than a few hundred steps away hardly counts."""
-TERMS, SUCCESS = "reward_terms/", "is_success"
+TERMS = "reward_terms/"
+SUM_TOLERANCE = 1e-3
+"""Part of the reward, or of 1, by which terms may miss it: they may be rounded for the log."""
+FEW_WRONG = 0.02
+"""Part of the steps that may be off: the last one of an episode may have a bonus of its own."""
+REST_STEPS = 3
+"""So many steps before and after a jump everything has to stand still."""
+STILL = 1e-6
 ENOUGH_STEPS = 50
 """With fewer steps nothing is said about what never happens."""
 LARGE = 10.0
@@ -179,7 +186,7 @@ def _find_badly_scaled(records: Records) -> Iterator[RuleFinding]:
     else:
         return
     evidence = largest.at(step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
-    yield RuleFinding("RL603", message, evidence, Severity.INFO if records.normalizes_rewards() else Severity.WARNING)
+    yield RuleFinding("RL603", message, evidence, Severity.INFO if records.normalizes("reward") else Severity.WARNING)
 
 
 @check("RL612", *WITH_SEARCH)
@@ -192,6 +199,57 @@ def _find_constant_penalty(records: Records) -> Iterator[RuleFinding]:
         if value < 0 and not MEANT_CONSTANT.search(name):
             message = f"reward term {name!r} is {value:.6g} at every step of {summarize(episodes)}"
             yield RuleFinding("RL612", message, {"term": name, "value": value, "episodes": len(episodes)})
+
+
+@check("RL607", *WITH_SEARCH)
+def _find_wrong_sum(records: Records) -> Iterator[RuleFinding]:
+    episodes = [episode for episode in require_rewarded(records) if has_terms(episode)]
+    if not episodes:
+        raise NotApplicable("no reward_terms in info")
+    wrong, steps, worst = 0, 0, (0.0, episodes[0], 0, 0.0)
+    for episode in episodes:
+        total = np.sum(list(find_terms(episode).values()), axis=0)
+        off = np.abs(total - episode.rewards) / np.maximum(1.0, np.abs(episode.rewards))
+        off = np.nan_to_num(off)  # a step without terms
+        wrong, steps = wrong + int((off > SUM_TOLERANCE).sum()), steps + episode.steps
+        at = int(off.argmax())
+        worst = max(worst, (float(off[at]), episode, at, float(total[at])), key=lambda candidate: candidate[0])
+    if wrong > FEW_WRONG * steps:
+        _, episode, at, total_at = worst
+        reward = float(episode.rewards[at])
+        message = (
+            f"reward_terms do not add up to the reward in {wrong} of {steps} steps: at step {at + 1} their sum is "
+            f"{total_at:.6g} and the reward {reward:.6g}"
+        )
+        yield RuleFinding("RL607", message, episode.at(at + 1, value=total_at, expected=reward))
+
+
+@check("RL615", "episodes", "search")
+def _find_jump_at_rest(records: Records) -> Iterator[RuleFinding]:
+    """Find a reward that jumps from one level to another while the observation stands still under the zero action."""
+    require_rewarded(records)
+    for episode in records.episodes + records.role("search"):
+        size = episode.steps - episode.has_ended
+        if episode.actions != "zero" or size < 2 * REST_STEPS or not episode.observations:
+            continue
+        rewards = episode.rewards[:size]
+        still = np.ones(size, np.bool_)
+        for series in episode.observations.values():
+            if len(series.values) != episode.steps + 1:
+                return
+            values = series.values.reshape(len(series.values), -1).astype(np.float64)
+            still &= np.abs(np.diff(values, axis=0)).max(axis=1, initial=0.0)[:size] <= STILL
+        level = np.asarray(np.abs(np.diff(rewards)) <= STILL * np.maximum(1.0, np.abs(rewards[1:])))
+        for at in np.flatnonzero(~level).tolist():
+            before, after = slice(max(0, at - REST_STEPS), at), slice(at + 1, at + 1 + REST_STEPS)
+            calm = level[before].all() and level[after].all() and still[before].all() and still[at : after.stop].all()
+            if len(rewards[before]) == REST_STEPS == len(level[after]) and calm:
+                message = (
+                    f"the reward jumps from {rewards[at]:.4g} to {rewards[at + 1]:.4g} at step {at + 2}, and nothing"
+                )
+                evidence = episode.at(at + 2, value=float(rewards[at + 1]), expected=float(rewards[at]))
+                yield RuleFinding("RL615", f"{message} that is observed moves", evidence)
+                return
 
 
 @experiment("hindsight", "RL614", share=0.3)

@@ -26,6 +26,7 @@ from rlctl.checking.families.rewards import (
     has_succeeded,
     reports_success,
 )
+from rlctl.checking.families.state import play_after_ends
 from rlctl.checking.finding import NotJudged, RuleFinding
 from rlctl.checking.instance import Context, find_longest_episode
 from rlctl.checking.messages import FIRST_SEED, ChildMessage, RecordedEpisode, Skipped
@@ -75,7 +76,7 @@ class _Attempt:
         return float(rewards.sum() / LONGEST + rewards.max()) if rewards.size else -np.inf
 
 
-@experiment("search", "RL605", share=3.0)
+@experiment("search", "RL605", share=4.0)
 def search(context: Context) -> Iterator[ChildMessage]:
     """Look for action sequences with a high return, and stop one that finished shortly before its end."""
     leaves = context.instance.action_leaves
@@ -87,6 +88,10 @@ def search(context: Context) -> Iterator[ChildMessage]:
     yield from searcher.cross_entropy_search()
     yield from searcher.perturb_best()
     yield from searcher.stop_early()
+    succeeded = [
+        attempt.sequence[: attempt.played.steps] for attempt in searcher.attempts if has_succeeded(attempt.played)
+    ]
+    yield from play_after_ends(context, succeeded[0] if succeeded else None)
     if context.budget.why_spent:
         yield Skipped("search", f"{len(searcher.attempts)} episodes were searched: {context.budget.why_spent}")
 

@@ -1,0 +1,203 @@
+"""RL116 and RL810 to RL812: how an environment drives and reads the robots of a PyBullet world."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.bullet_calls import FULL_TURN, BulletCalls, ContactQuery
+from rlctl.checking.bullet_worlds import JOINTS, bullet, find_joint
+from rlctl.checking.finding import RuleFinding, Severity
+from rlctl.checking.world_logs import LoggedWorld, WorldLog
+
+FAR_RANGES = 3.0
+"""A target so many ranges outside of a joint's limits is no target that the joint may just not reach."""
+FEWEST_JOINTS = 3
+NEAR = 0.05
+"""Targets are the positions in another order where both differ by no more, once sorted [rad], [m]."""
+APART = 0.2
+"""And where a motor's target differs by so much from its own joint's position [rad], [m]."""
+FEWEST_QUERIES = 50
+MOSTLY = 0.3
+"""Part of all looks in which bodies have to touch, so that a query should have seen it."""
+SAME = 2e-4
+"""An element of the observation is an angle if it differs by no more in any look [rad]."""
+LEAST_MOTION = 0.02
+"""An angle that stays the same within this standard deviation may be equal to another by chance [rad]."""
+FEWEST_LOOKS = 30
+ORDERS = {"w, x, y, z": (1, 2, 3, 0), "w first, passed on as x, y, z, w": (3, 0, 1, 2)}
+"""Where a wrong reader takes x, y, z and w from, by the name of the mistake."""
+ANGLES = ("roll", "pitch", "yaw")
+
+
+def find_far_targets(calls: BulletCalls) -> Iterator[RuleFinding]:
+    """Yield the first position for a joint that can only be in degrees."""
+    for target in calls.far_targets:
+        joint = find_joint(target.client, target.body, target.joint)
+        if joint is None or not joint.is_angle or not joint.has_limits:
+            continue
+        outside = max(joint.low - target.value, target.value - joint.high)
+        if outside > FAR_RANGES * (joint.high - joint.low) and abs(target.value) > FULL_TURN:
+            message = (
+                f"{target.call.name} gives joint {joint.name} the position {target.value:.4g} rad; its limits are "
+                f"[{joint.low:.3g}, {joint.high:.3g}] rad: degrees?"
+            )
+            evidence = {"element": joint.name, "value": target.value, "expected": [joint.low, joint.high]}
+            yield RuleFinding("RL810", message, evidence, where=(target.call.file, target.call.line))
+            return
+
+
+def find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
+    """Yield a body whose motor targets, with the zero action, are its joint positions at reset in another order."""
+    for log in world.logs:
+        for body, states in log.bodies if log.first_targets else ():
+            targets = {
+                j: log.first_targets.get((world.world.client, body.id, joint.index))
+                for j, joint in enumerate(body.joints)
+            }
+            driven = {j: target for j, target in targets.items() if target is not None}
+            if len(driven) < FEWEST_JOINTS:
+                continue
+            positions = states[0, [JOINTS + j for j in driven]]
+            given = np.array([target.value for target in driven.values()])
+            order = np.argsort(given, kind="stable")
+            is_sorted_same = np.abs(given[order] - np.sort(positions)).max() <= NEAR
+            wrong = np.flatnonzero(np.abs(given - positions) > APART)
+            if is_sorted_same and wrong.size >= 2:
+                joint, target = body.joints[list(driven)[wrong[0]]], list(driven.values())[wrong[0]]
+                message = (
+                    f"with the zero action the {len(driven)} motor targets of {body.name} are its joint positions at "
+                    f"reset in another order: {joint.name} is at {positions[wrong[0]]:.3g} and gets {target.value:.3g}"
+                )
+                evidence = {"element": joint.name, "value": target.value, "expected": float(positions[wrong[0]])}
+                yield RuleFinding("RL811", message, evidence, where=(target.call.file, target.call.line))
+                return
+
+
+def find_empty_queries(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFinding]:
+    """Yield the first line whose contact queries never returned a contact although the bodies touched."""
+    key = lambda query: (query.call, query.client)  # noqa: E731
+    for (call, client), group in itertools.groupby(sorted(calls.queries.values(), key=key), key):
+        queries = list(group)
+        total = sum(query.calls for query in queries)
+        if client != world.world.client or total < FEWEST_QUERIES or any(query.contacts for query in queries):
+            continue
+        for query in queries:
+            if why := _explain_empty(world, query):
+                text, severity = why
+                message = f"{total} calls of getContactPoints returned no contact: {text}"
+                evidence = {"element": f"bodies {query.bodies}, links {query.links}", "value": 0}
+                yield RuleFinding("RL812", message, evidence, severity, where=(call.file, call.line))
+                return
+
+
+def _explain_empty(world: LoggedWorld, query: ContactQuery) -> tuple[str, Severity] | None:
+    """Return why a query is empty, and how sure that is; None where the bodies hardly touched."""
+    names = {body.id: body for body in world.world.bodies}
+    for body, link in zip(query.bodies, query.links, strict=True):
+        if body >= 0 and not _exists(query.client, body):
+            return f"there is no body {body}", Severity.WARNING
+        if body in names and link is not None and not _has_shape(world, body, link):
+            name = world.world.link_name((body, link))
+            return f"{name} (link {link}) has no collision shape", Severity.WARNING
+    touched = [_find_touching(log, query) for log in world.logs]
+    looks = [links for log in touched for links in log]
+    others = {link for links in looks for link in links}
+    if not looks or sum(bool(links) for links in looks) < MOSTLY * len(looks) or query.links == (None, None):
+        return None
+    asked = next((body, link) for body, link in zip(query.bodies, query.links, strict=True) if link is not None)
+    other = sorted(others)[0]
+    text = f"{world.world.link_name(asked)} (link {asked[1]}) never touched, but {world.world.link_name(other)} did"
+    is_next = any(_are_joined(query.client, asked, link) for link in others)
+    return f"{text} (link {other[1]})", Severity.WARNING if is_next else Severity.INFO
+
+
+def _exists(client: int, body: int) -> bool:
+    p = bullet()
+    return body in {p.getBodyUniqueId(i, physicsClientId=client) for i in range(p.getNumBodies(physicsClientId=client))}
+
+
+def _has_shape(world: LoggedWorld, body: int, link: int) -> bool:
+    """Say whether anything can touch a link: any other body is at some distance from it."""
+    p, client = bullet(), world.world.client
+    for other in world.world.bodies:
+        if other.id != body and p.getClosestPoints(other.id, body, 1e3, linkIndexB=link, physicsClientId=client):
+            return True
+    return len(world.world.bodies) < 2
+
+
+def _find_touching(log: WorldLog, query: ContactQuery) -> list[set[tuple[int, int]]]:
+    """Return, for each look, the links of the asked body that touch the other one, or anything where none is named."""
+    asked = 0 if query.links[0] is not None else 1
+    one, other = query.bodies[asked], query.bodies[1 - asked]
+    looks = []
+    for pairs in log.touching:
+        both = [*pairs, *((b, a) for a, b in pairs)]
+        looks.append({a for a, b in both if a[0] == one and a[0] != b[0] and other in (-1, b[0])})
+    return looks
+
+
+def _are_joined(client: int, one: tuple[int, int], two: tuple[int, int]) -> bool:
+    """Say whether one of two links of a body is the other's parent."""
+    p = bullet()
+    return any(
+        link >= 0 and p.getJointInfo(body, link, physicsClientId=client)[16] == parent
+        for (body, link), (_, parent) in ((one, two), (two, one))
+    )
+
+
+def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
+    """Yield an element of the observation that is an angle of a quaternion whose numbers are in the wrong order."""
+    logs = [log for log in world.logs if log.observed and len({row.size for row in log.observed}) == 1]
+    if sum(len(log.observed) for log in logs) < FEWEST_LOOKS or len({log.observed[0].size for log in logs}) != 1:
+        return
+    observed = np.concatenate([np.stack(log.observed) for log in logs]).astype(np.float64)
+    moving = np.flatnonzero(observed.std(axis=0) > LEAST_MOTION)
+    links = set.intersection(*(set(orientations) for log in logs for orientations in log.orientations))
+    right, wrong = [], []
+    for link in sorted(links):
+        quaternions = np.array([orientations[link] for log in logs for orientations in log.orientations])
+        right.append(find_angles(quaternions))
+        wrong += [(link, name, find_angles(quaternions[:, order])) for name, order in ORDERS.items()]
+    for column in moving:
+        values = observed[:, column, None]
+        if any((np.abs(np.abs(values) - np.abs(angles)).max(axis=0) <= SAME).any() for angles in right):
+            continue
+        for link, order, angles in wrong:
+            is_same = (np.abs(values - angles).max(axis=0) <= SAME) & (angles.std(axis=0) > LEAST_MOTION)
+            for which in np.flatnonzero(is_same)[:1]:
+                what = (
+                    f"{('', 'the sine of ', 'the cosine of ')[which // 3]}{ANGLES[which % 3]}"
+                    if which < 9
+                    else "gravity"
+                )
+                name = f"observation[{column}]"
+                message = f"{name} is {what} of {world.world.link_name(link)} with its quaternion read as {order}"
+                yield RuleFinding("RL116", message, {"element": name, "value": order, "expected": "x, y, z, w"})
+                return
+
+
+def find_angles(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return roll, pitch and yaw, their sines and cosines, and the direction of gravity in the body's frame.
+
+    `quaternions` are x, y, z, w. Shape (n, 4); of the result (n, 12).
+    """
+    x, y, z, w = quaternions.T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    angles = np.stack([roll, pitch, yaw], axis=1)
+    down = -np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    return np.concatenate([angles, np.sin(angles), np.cos(angles), down], axis=1)
+
+
+def find_misuses(worlds: Sequence[LoggedWorld], calls: BulletCalls) -> Iterator[RuleFinding]:
+    """Yield what is wrong with how the robots of some worlds are driven and read; the worlds have to be there still."""
+    yield from find_far_targets(calls)
+    for world in worlds:
+        yield from find_wrong_order(world)
+        yield from find_empty_queries(world, calls)
+        yield from find_misread_quaternions(world)

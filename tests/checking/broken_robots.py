@@ -1,0 +1,299 @@
+"""Robots with one mistake each, next to the twin that does the same thing right where the robot itself does not."""
+
+import numpy as np
+import pybullet as p
+from robots import Arm, Boat, Crawler, Tank
+
+
+class BoatHiddenBuoy(Boat):
+    def observe(self):
+        c, s = np.cos(self.heading), np.sin(self.heading)
+        return np.array([*self.place, s, c, *self.speed], np.float32)
+
+
+class TankHiddenWish(Tank):
+    def size(self):
+        return 2
+
+    def observe(self):
+        return np.array([self.temperature, self.rate], np.float32)
+
+
+class BoatOldObservation(Boat):
+    def step(self, action):
+        observation = self.observe()
+        _, *rest = super().step(action)
+        return observation, *rest
+
+
+class ArmOldObservation(Arm):
+    def move(self, action):
+        self.before = super().observe()
+        super().move(action)
+
+    def observe(self):
+        return super().observe() if self.steps == 0 else self.before
+
+
+class CrawlerQuaternion(Crawler):
+    def angles(self):
+        _, (x, y, z, w) = p.getBasePositionAndOrientation(self.robot, physicsClientId=self.client)
+        return p.getEulerFromQuaternion((w, x, y, z))
+
+
+class ArmQuaternion(Arm):
+    def size(self):
+        return 9
+
+    def angles(self):
+        w, x, y, z = self.hand()[5]
+        return p.getEulerFromQuaternion((x, y, z, w))
+
+    def observe(self):
+        return np.array([*super().observe(), *self.angles()], np.float32)
+
+
+class ArmRightQuaternion(ArmQuaternion):
+    def angles(self):
+        return p.getEulerFromQuaternion(self.hand()[5])
+
+
+class BoatWraps(Boat):
+    def observe(self):
+        heading = (self.heading + np.pi) % (2 * np.pi) - np.pi
+        return np.array([*(self.buoy - self.place), heading, 0.1 * heading**2, *self.speed], np.float32)
+
+
+class CrawlerWraps(Crawler):
+    def angles(self):
+        self.turn = 0.0 if self.steps == 0 else self.turn + 0.3
+        return [*super().angles()[:2], np.arctan2(np.sin(self.turn), np.cos(self.turn))]
+
+
+class BoatMillimetres(Boat):
+    def observe(self):
+        observation = super().observe()
+        observation[:2] *= 1000  # [mm]
+        return observation
+
+
+class CrawlerDegrees(Crawler):
+    def observe(self):
+        return np.rad2deg(super().observe() + 2.0).astype(np.float32)
+
+
+class BoatStaysAtBuoy(Boat):
+    arrived = False
+
+    def is_success(self):
+        self.arrived = self.arrived or self.distance() < 0.2
+        return self.arrived
+
+
+class BoatArrives(BoatStaysAtBuoy):
+    def start(self):
+        super().start()
+        self.arrived = False
+
+
+class TankCountsOn(Tank):
+    failures = 0
+
+    def has_failed(self):
+        failed = super().has_failed()
+        self.failures += failed
+        return failed
+
+    def reward(self):
+        return super().reward() - 0.5 * self.failures
+
+
+class TankCountsAnew(TankCountsOn):
+    def start(self):
+        super().start()
+        self.failures = 0
+
+
+class BoatGusts(Boat):
+    def __init__(self):
+        super().__init__()
+        self.gusts = np.random.default_rng()
+
+    def move(self, action):
+        if self.distance() > 2.0:
+            self.speed[0] += self.gusts.normal(0.0, 0.1)
+        super().move(action)
+
+
+class BoatSeededGusts(BoatGusts):
+    def start(self):
+        super().start()
+        self.gusts = self.np_random
+
+
+class TankSpills(Tank):
+    def move(self, action):
+        if self.temperature > 0.8:
+            self.temperature -= np.random.default_rng().uniform(0.0, 0.1)
+        super().move(action)
+
+
+class TankSeededSpills(Tank):
+    def move(self, action):
+        if self.temperature > 0.8:
+            self.temperature -= self.np_random.uniform(0.0, 0.1)
+        super().move(action)
+
+
+class TankFailsAsTruncated(Tank):
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, False, terminated or truncated, info
+
+
+class CrawlerFallsAsTruncated(Crawler):
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        fell = abs(self.angles()[1]) > 0.06
+        return observation, reward, False, bool(truncated or fell), info
+
+
+class CrawlerFalls(Crawler):
+    def has_failed(self):
+        return bool(abs(self.angles()[1]) > 0.06)
+
+
+class BoatTermsOff(Boat):
+    def info(self, success):
+        terms = {"distance": -self.distance(), "speed": 0.1 * self.speed[0]}
+        return {"is_success": success, "reward_terms": terms}
+
+
+class BoatTerms(Boat):
+    def info(self, success):
+        terms = {"distance": -self.distance(), "arrival": 2.0 * success}
+        return {"is_success": success, "reward_terms": terms}
+
+
+class CrawlerTermsOff(Crawler):
+    def info(self, success):
+        return {**super().info(success), "reward_terms": {"forward": 0.5 * self.forward()}}
+
+
+class CrawlerTerms(Crawler):
+    def info(self, success):
+        return {**super().info(success), "reward_terms": {"forward": self.forward()}}
+
+
+class BoatMovingBuoy(Boat):
+    def observe(self):
+        return np.array([*self.place, 0.0, 1.0, *self.speed], np.float32)
+
+    def start(self):
+        super().start()
+        self.heading = 0.0
+
+    def move(self, action):
+        super().move(action)
+        if self.steps % 20 == 0:
+            self.buoy = self.draw_buoy()
+
+
+class BoatFixedBuoy(BoatMovingBuoy):
+    def draw_buoy(self):
+        return np.array([0.5, 0.5])
+
+
+class TankOtherWish(Tank):
+    def start(self):
+        super().start()
+        self.temperature, self.wanted = 0.0, 0.5
+
+    def observe(self):
+        return np.array([self.temperature, self.rate, 0.1 * self.rate], np.float32)
+
+    def move(self, action):
+        super().move(action)
+        if self.steps == 30:
+            self.wanted = 0.2
+
+
+class TankOneWish(TankOtherWish):
+    def move(self, action):
+        Tank.move(self, action)
+
+
+class BoatLateReward(Boat):
+    def step(self, action):
+        reward = self.reward()
+        observation, _, *rest = super().step(action)
+        return observation, reward, *rest
+
+
+class ArmLateReward(Arm):
+    def step(self, action):
+        height = self.hand()[4][2]
+        observation, _, *rest = super().step(action)
+        return observation, height - 0.8, *rest
+
+
+class BoatNan(Boat):
+    def step(self, action):
+        self.steps += 1
+        self.move(np.clip(action, -1.0, 1.0).astype(float))
+        return self.observe(), self.reward(), False, self.steps >= self.limit, {"is_success": self.is_success()}
+
+
+class TankNan(Tank):
+    def step(self, action):
+        self.steps += 1
+        self.move(np.clip(action, -1.0, 1.0).astype(float))
+        return self.observe(), self.reward(), False, self.steps >= self.limit, self.info(False)
+
+
+class ArmDegrees(Arm):
+    def target(self, action):
+        return np.rad2deg(self.home + 0.4 * action)
+
+
+class CrawlerStartsInDegrees(Crawler):
+    def start(self):
+        super().start()
+        p.resetJointState(self.robot, 0, np.rad2deg(0.3), physicsClientId=self.client)
+
+
+class ArmOrder(Arm):
+    def target(self, action):
+        return super().target(action)[[1, 2, 0]]
+
+
+class CrawlerOrder(Crawler):
+    def target(self, action):
+        wrist, *others = super().target(action)
+        return [*others, wrist]
+
+
+class ArmTouchesNothing(Arm):
+    home = np.array([1.6, 0.6, 0.0])
+
+    def reward(self):
+        return super().reward() - 1.0 * self.touches(3)
+
+
+class ArmTouches(ArmTouchesNothing):
+    def reward(self):
+        return Arm.reward(self) - 1.0 * self.touches(2)
+
+
+class CrawlerOtherFloor(Crawler):
+    def touches(self, link):
+        floor = self.robot + 1
+        return len(p.getContactPoints(self.robot, floor, link, -1, physicsClientId=self.client) or ()) > 0
+
+    def reward(self):
+        return super().reward() + 0.1 * self.touches(0)
+
+
+class CrawlerFloor(Crawler):
+    def reward(self):
+        return super().reward() + 0.1 * self.touches(0)
