@@ -216,19 +216,22 @@ def _print_lines(table: list[list[Text]], names: list[str], left: Collection[str
     out().print(lines, end="", soft_wrap=True)
 
 
-def write_result_json(target: str, content: Any) -> bool:
-    """Write a result, of plain data, dataclasses and paths, as JSON to a file, or to stdout for `-`.
+def present(content: Any, json_target: str | None) -> bool:
+    """Write a result as JSON where `--json` asks for it: to a file, or to stdout for `-`.
 
-    Return whether stdout has it: then nothing else belongs there.
+    `content` is plain data, dataclasses and paths. Return whether stdout has it; then nothing else belongs there.
+    Without a target nothing is written.
     """
+    if json_target is None:
+        return False
     from pydantic_core import to_jsonable_python
 
     content = to_jsonable_python(content)
-    if target == "-":
+    if json_target == "-":
         results().write(json.dumps(content, indent=2, allow_nan=False) + "\n")
         results().flush()
         return True
     from rlctl.storage import files
 
-    files.write_json(Path(target), content)
+    files.write_json(Path(json_target), content)
     return False

@@ -172,7 +172,7 @@ def _accepts(env: Any, name: str) -> bool:
 
 def find_longest_episode(env: Any) -> int | None:
     """Return after how many steps an environment says that its episodes end; None where it does not."""
-    from rlctl.environments.time_limit import find_time_limit
+    from rlctl.environments.wrappers import find_time_limit
 
     return int(env.unwrapped.max_steps) if is_task(env) else find_time_limit(env)
 

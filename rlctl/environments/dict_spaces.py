@@ -1,4 +1,4 @@
-"""Dict spaces taken apart: a space and observations of it as parts by key; any other space has one part."""
+"""Spaces and observations as parts by key: those of a Dict space; any other space has one part."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 Observations = NDArray[Any] | dict[str, NDArray[Any]]
 """Observations of several rows: environments, or steps."""
+
+LARGEST_SPACE = 10_000_000
+"""Elements that the observations or the actions of an environment may have: a full-HD picture has 6 million."""
 
 SINGLE = ""
 """The key of the only part of a space that is not a Dict."""
@@ -43,7 +46,7 @@ def take_row(observations: Any, row: int) -> Any:
 
 def stack(observations: Sequence[Any]) -> Observations:
     """Return observations as rows, shape (len(observations), ...)."""
-    rows = [split(each) for each in observations]
+    rows = [split(observation) for observation in observations]
     stacked: Observations = join({key: np.stack([row[key] for row in rows]) for key in rows[0]})
     return stacked
 

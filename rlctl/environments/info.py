@@ -11,8 +11,7 @@ import numpy as np
 import pydantic
 from gymnasium import spaces
 
-from rlctl.environments.dict_spaces import format_space
-from rlctl.environments.spec import LARGEST_SPACE
+from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
 from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.task.joints import Joints
 
@@ -58,8 +57,7 @@ class EnvInfo(pydantic.BaseModel):
 
 def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
     """Describe an environment; for a task with its names, units and timing."""
-    from rlctl.environments.time_feature import find_time_feature
-    from rlctl.environments.time_limit import find_time_limit
+    from rlctl.environments.wrappers import find_time_feature, find_time_limit
     from rlctl.task.env import TaskEnv
 
     inner = env.unwrapped

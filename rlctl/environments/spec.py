@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
-import math
 import os
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Le
+from pydantic import AfterValidator, PlainSerializer
 
 from rlctl.environments import named_task
+from rlctl.environments.parameters import check_fields, check_keywords
 from rlctl.environments.plugin_code import call_plugin
 from rlctl.environments.registry import is_task, load, make_slug
-from rlctl.errors import RecipeError, TaskError, did_you_mean, short_repr
+from rlctl.errors import RecipeError, TaskError
 
 if TYPE_CHECKING:
     import gymnasium
-
-
-LARGEST_SPACE = 10_000_000
-"""Elements that the observations or the actions of an environment may have: a full-HD picture has 6 million."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,10 +66,14 @@ class EnvSpec:
             env = self._make_plain_env(constructor, render_mode)
         try:
             if self.time_feature:
-                from rlctl.environments.time_feature import TimeFeature
+                from rlctl.environments.wrappers import TimeFeature
 
                 env = TimeFeature(env)
-            return _stack_frames(env, self.frame_stack) if self.frame_stack > 1 else env
+            if self.frame_stack > 1:
+                from rlctl.environments.wrappers import stack_frames
+
+                env = stack_frames(env, self.frame_stack)
+            return env
         except RecipeError:
             env.close()
             raise
@@ -84,7 +84,7 @@ class EnvSpec:
         from rlctl.task.task import check_parameters
 
         check_parameters(constructor)
-        parameters = _check_parameters(constructor, self.parameters)
+        parameters = check_fields(constructor, self.parameters)
         env: TaskEnv = call_plugin(
             self.task,
             lambda: TaskEnv(
@@ -101,11 +101,11 @@ class EnvSpec:
         import gymnasium
 
         parameters = dict(self.parameters)
-        _check_keywords(self.task, constructor, parameters)
+        check_keywords(self.task, constructor, parameters)
         if render_mode is not None:
             parameters["render_mode"] = render_mode
             try:
-                _check_keywords(self.task, constructor, parameters)
+                check_keywords(self.task, constructor, parameters)
             except RecipeError:
                 raise RecipeError(f"{self.task} takes no render_mode") from None
         env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
@@ -199,86 +199,17 @@ def make_several(spec: EnvSpec, count: int) -> list[gymnasium.Env[Any, Any]]:
     return envs
 
 
-def _check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
-    known = read_parameters(constructor) if parameters else None
-    if known is None or any(each.kind is each.VAR_KEYWORD for each in known.values()):
-        return
-    for key in parameters:
-        is_of_gymnasium = key == "max_episode_steps" and hasattr(constructor, "gymnasium_id")
-        if key not in known and not is_of_gymnasium:
-            raise _unknown_parameter(task, key, list(known))
+def _name_by(kind: str) -> Callable[[EnvSpec], EnvSpec]:
+    return lambda spec: dataclasses.replace(spec, named_by=kind)
 
 
-def read_parameters(constructor: Any) -> Mapping[str, inspect.Parameter] | None:
-    """Return the parameters of a plain environment by name, of a Gymnasium id those of what it stands for.
-
-    None where they are not known.
-    """
-    if hasattr(constructor, "gymnasium_id"):
-        import gymnasium
-        from gymnasium.envs.registration import load_env_creator
-
-        spec = gymnasium.registry.get(constructor.gymnasium_id)
-        if spec is None or spec.entry_point is None:
-            return None
-        constructor = spec.entry_point if callable(spec.entry_point) else load_env_creator(spec.entry_point)
-    return inspect.signature(constructor).parameters
+def _dump(spec: EnvSpec) -> dict[str, Any]:
+    content = dataclasses.asdict(spec)
+    del content["named_by"]
+    return content
 
 
-def _unknown_parameter(task: str, key: str, known: list[str]) -> RecipeError:
-    return RecipeError(
-        f"task.{key}: {task} has no parameter {key!r}.{did_you_mean(key, known)} It has: {', '.join(known) or 'none'}."
-    )
-
-
-def _check_parameters(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Check the parameters of a `Task` against its fields: names and types."""
-    import typing
-
-    import pydantic
-
-    fields = task.parameters()
-    hints = call_plugin(task.__name__, lambda: typing.get_type_hints(task)) if given else {}
-    checked = {}
-    for key, value in given.items():
-        if key not in fields:
-            raise _unknown_parameter(task.__name__, key, list(fields))
-        _check_number(key, hints[key], value)
-        try:
-            checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
-        except pydantic.ValidationError as error:
-            problem = error.errors()[0]["msg"].removeprefix("Input ")
-            raise RecipeError(f"task.{key}: {problem}, got {short_repr(repr(value))}") from None
-    return checked
-
-
-def _check_number(key: str, hint: Any, value: Any) -> None:
-    """Raise `RecipeError` for what pydantic would make a number of: text and bools; and for what is none."""
-    if hint in (int, float) and isinstance(value, bool | str):
-        raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
-    if isinstance(value, float) and math.isnan(value):
-        raise RecipeError(f"task.{key}: expected a number, got nan")
-
-
-def _stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any, Any]:
-    """Observe the last `frames` observations, oldest first, along the last axis."""
-    import numpy as np
-    from gymnasium import spaces
-    from gymnasium.wrappers import FrameStackObservation, TransformObservation
-
-    space = env.observation_space
-    if not isinstance(space, spaces.Box) or len(space.shape) not in (1, 3):
-        raise RecipeError(f"frame_stack: only flat and image observations can be stacked, this task has {space}")
-    if (count := math.prod(space.shape) * frames) > LARGEST_SPACE:
-        raise RecipeError(f"frame_stack: {frames:,} makes {count:,} elements; at most {LARGEST_SPACE:,} are supported")
-    # Gymnasium stacks along a new first axis; networks want vectors and images of the same rank.
-    stacked = spaces.Box(
-        np.concatenate([space.low] * frames, axis=-1),
-        np.concatenate([space.high] * frames, axis=-1),
-        dtype=space.dtype.type,
-    )
-    wrapped = FrameStackObservation(env, frames)
-    flat: gymnasium.Env[Any, Any] = TransformObservation(
-        wrapped, lambda stack: np.concatenate(list(stack), axis=-1), stacked
-    )
-    return flat
+PolicySpec = Annotated[EnvSpec, AfterValidator(_name_by(named_task.POLICY)), PlainSerializer(_dump)]
+"""The `EnvSpec` in a policy file that somebody may have sent: its task is named by that file."""
+EpisodeSpec = Annotated[EnvSpec, AfterValidator(_name_by(named_task.EPISODE)), PlainSerializer(_dump)]
+"""The `EnvSpec` in a recorded episode."""

@@ -85,7 +85,7 @@ def _evaluate_seed(group: Group, seed: int, request: EvalRequest) -> SeedScore:
 
 def show(result: GroupScore, json: str | None) -> None:
     """Print a row per seed and what they have in common, or JSON alone for `-`."""
-    if json is not None and output.write_result_json(json, as_json(result)):
+    if output.present(as_json(result), json):
         return
     out = output.out()
     scores = [each.score for each in result.seeds if each.score is not None]

@@ -16,7 +16,7 @@ from rlctl.version import collect_versions
 
 def show(result: Evaluation, json: str | None) -> None:
     """Print the numbers, or JSON alone for `-`."""
-    if json is not None and output.write_result_json(json, as_json(result)):
+    if output.present(as_json(result), json):
         return
     out = output.out()
     _show_head(result)

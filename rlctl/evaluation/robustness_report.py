@@ -19,7 +19,7 @@ _NOMINAL, _WORST = "*", "<"
 
 def show(result: Robustness, target: str | None) -> None:
     """Print the maps and the push, or JSON alone for `-`."""
-    if target is not None and output.write_result_json(target, result.model_dump(mode="json")):
+    if output.present(result.model_dump(mode="json"), target):
         return
     out = output.out()
     out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})")

@@ -113,7 +113,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
 
 def show(result: SelfTest, json: str | None) -> None:
     """Print a self-test, or JSON alone for `-`."""
-    if json is not None and output.write_result_json(json, as_json(result)):
+    if output.present(as_json(result), json):
         return
     out, direct, served = output.out(), result.direct, result.served
     episodes = output.format_count(len(served.played), "episode")

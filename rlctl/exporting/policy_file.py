@@ -74,7 +74,7 @@ def _find_origin(source: FoundPolicy) -> dict[str, Any]:
 
 def show(report: PolicyFileReport, json: str | None) -> None:
     """Print a report, or JSON alone for `-`."""
-    if json is not None and output.write_result_json(json, as_json(report)):
+    if output.present(as_json(report), json):
         return
     out, info, provenance = output.out(), report.info, report.provenance
     out.print(f"exported {report.path} ({format_bytes(report.size)}): the actor of {provenance.run}")

@@ -68,10 +68,9 @@ def show(reports: list[ExportReport], json: str | None) -> None:
 
     The JSON of one format is an object; of several it is one object per format, by the suffix of its file.
     """
-    if json is not None:
-        by_format = {report.path.suffix[1:]: report.as_json() for report in reports}
-        if output.write_result_json(json, by_format if len(reports) > 1 else reports[0].as_json()):
-            return
+    by_format = {report.path.suffix[1:]: report.as_json() for report in reports}
+    if output.present(by_format if len(reports) > 1 else reports[0].as_json(), json):
+        return
     from rich.text import Text
 
     for number, report in enumerate(reports):

@@ -165,9 +165,7 @@ def show(result: ImportedPolicy, json: str | None) -> None:
             "normalizes": normalizes,
             "time_feature": info.spec.time_feature,
         }
-        if output.write_result_json(
-            json, {**content, "training_steps": info.training_steps, "versions": info.versions}
-        ):
+        if output.present({**content, "training_steps": info.training_steps, "versions": info.versions}, json):
             return
     out = output.out()
     normalization = "with" if normalizes else "without"

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rlctl.environments.info import EnvInfo
-from rlctl.environments.named_spec import PolicySpec
 from rlctl.environments.named_task import POLICY
-from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
+from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec, PolicySpec
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.policy.shipped import Provenance
 from rlctl.storage import files, untrusted

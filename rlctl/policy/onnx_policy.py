@@ -10,8 +10,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from rlctl.environments.dict_spaces import Observations, split
-from rlctl.environments.spec import LARGEST_SPACE
+from rlctl.environments.dict_spaces import LARGEST_SPACE, Observations, split
 from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.policy import onnx_file
 from rlctl.policy.file import PolicyInfo, parse_info

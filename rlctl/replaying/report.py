@@ -77,7 +77,7 @@ class ReplayResult:
 
 def show(result: ReplayResult, json: str | None) -> None:
     """Print the episodes and the command that opens them, or write them as JSON."""
-    if json is not None and output.write_result_json(json, as_json(result)):
+    if output.present(as_json(result), json):
         return
     if result.verification is not None:
         _show_verification(result, result.verification)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rlctl.environments.dict_spaces import Observations, split
-from rlctl.environments.named_spec import EpisodeSpec
+from rlctl.environments.spec import EpisodeSpec
 from rlctl.errors import ArtifactError
 from rlctl.storage import files, untrusted
 

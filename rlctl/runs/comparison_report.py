@@ -24,7 +24,7 @@ from rlctl.runs.significance import (
 
 def show(result: Comparison, json: str | None) -> None:
     """Print which question is answered, the scores, the differences and the verdicts; or JSON alone for `-`."""
-    if json is not None and output.write_result_json(json, as_json(result)):
+    if output.present(as_json(result), json):
         return
     out = output.out()
     if result.of_recipes:

@@ -49,7 +49,7 @@ def list_runs(
 
 def show(runs: list[RunSummary], json: str | None) -> None:
     """Print the table, or JSON alone for `-`."""
-    if json is not None and output.write_result_json(json, {"runs": [as_json(run) for run in runs]}):
+    if output.present({"runs": [as_json(run) for run in runs]}, json):
         return
     out = output.out()
     if not runs:

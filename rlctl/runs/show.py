@@ -87,7 +87,7 @@ def show(run: RunDescription, json: str | None) -> None:
         content = {**as_json(summary), "evaluations": run.evaluations, "metrics": run.metrics}
         found = {"warnings": run.warnings, "findings": run.findings}
         measured = None if run.robustness is None else run.robustness.model_dump(mode="json")
-        if output.write_result_json(json, {**content, **found, "robustness": measured, "bytes": sizes}):
+        if output.present({**content, **found, "robustness": measured, "bytes": sizes}, json):
             return
     what = f": {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}"
     out.print(Text.assemble((summary.name, "bold"), what))

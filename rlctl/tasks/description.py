@@ -77,7 +77,7 @@ def _convert(value: Any) -> Any:
 
 
 def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
-    from rlctl.environments.time_limit import find_time_limit
+    from rlctl.environments.wrappers import find_time_limit
     from rlctl.task.env import TaskEnv
 
     built = env.unwrapped

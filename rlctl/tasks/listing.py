@@ -109,7 +109,7 @@ def _read_score(entry: installed.TaskEntry) -> dict[str, Any]:
 
 def show(listed: list[ListedTask], json: str | None) -> None:
     """Print the table, or JSON alone for `-`."""
-    if json is not None and output.write_result_json(json, {"tasks": listed}):
+    if output.present({"tasks": listed}, json):
         return
     if not listed:
         output.out().print("no tasks are installed")

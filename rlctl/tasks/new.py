@@ -65,11 +65,10 @@ def show(plugin: NewPlugin, json: str | None) -> None:
     """Print what was written and what to type next, or JSON alone for `-`."""
     from rlctl import output
 
-    if json is not None:
-        files = [str(plugin.folder / file) for file in plugin.files]
-        content = {"name": plugin.name, "folder": str(plugin.folder), "target": plugin.target, "files": files}
-        if output.write_result_json(json, content):
-            return
+    files = [str(plugin.folder / file) for file in plugin.files]
+    content = {"name": plugin.name, "folder": str(plugin.folder), "target": plugin.target, "files": files}
+    if output.present(content, json):
+        return
     out = output.out()
     for file in plugin.files:
         out.print(f"wrote {plugin.folder / file}")

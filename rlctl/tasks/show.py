@@ -20,7 +20,7 @@ _LONGEST_SPACE = 100  # [characters]; JSON has all of it
 def show(description: Description, json: str | None) -> None:
     """Print a description, or JSON alone for `-`."""
     content = description.content
-    if json is not None and output.write_result_json(json, content):
+    if output.present(content, json):
         return
     from rich.text import Text
 

@@ -14,7 +14,7 @@ from rlctl.training.request import TrainResult
 def show(result: TrainResult, json: str | None) -> None:
     """Print the result, what the training's records show, and what to type next; for `--json -` JSON instead."""
     findings = diagnose(result.run)
-    if json is not None and output.write_result_json(json, _to_json(result, findings)):
+    if output.present(_to_json(result, findings), json):
         return
     run = shlex.quote(str(result.run.path))
     lines = [result.note] if result.note else []

@@ -15,7 +15,7 @@ from rlctl.tuning.tuning import Trial, Tuning
 def show(tuning: Tuning, json: str | None) -> None:
     """Print the trials, best first, and what to do with the best; or JSON alone for `-`."""
     runs = {each.number: summarize(run.path) for each in tuning.trials if (run := tuning.find_run(each)) is not None}
-    if json is not None and output.write_result_json(json, as_json(tuning, runs)):
+    if output.present(as_json(tuning, runs), json):
         return
     out = output.out()
     keys = list(dict.fromkeys(dimension.key for step in tuning.steps for dimension in step))

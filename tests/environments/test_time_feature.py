@@ -100,7 +100,7 @@ def zoo_agent(tmp_path_factory):
 def test_the_zoos_agents_play_as_they_did(zoo_agent):
     model, env, imported = zoo_agent
     assert imported.info.spec.time_feature
-    evaluated = run_evaluation(EvalRequest(str(imported.file), episodes=2), Gates()).episodes
+    evaluated = run_evaluation(EvalRequest(str(imported.file), episodes=2), Gates()).played
     for seed, episode in zip(episode_seeds(0, Stream.EVAL, 2), evaluated, strict=True):
         env.seed(seed)
         observation, total, done = env.reset(), 0.0, [False]

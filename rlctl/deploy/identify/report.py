@@ -17,7 +17,7 @@ _PLOT_POINTS = 400
 
 def show(result: Identification, json: str | None) -> None:
     """Print the values with their intervals, or write them as JSON to a file or, for `-`, to stdout."""
-    if json is not None and output.write_result_json(json, {**dataclasses.asdict(result), "events": result.events()}):
+    if output.present({**dataclasses.asdict(result), "events": result.events()}, json):
         return
     out = output.out()
     out.print(f"{result.task}: {result.log}, {result.rows:,} rows, {result.seconds:.1f} s", highlight=False)
@@ -65,7 +65,7 @@ def draw_curves(result: Identification) -> str:
 
 def show_excitation(result: Excitation, json: str | None) -> None:
     """Print where a trajectory is and how it was bounded."""
-    if json is not None and output.write_result_json(json, result):
+    if output.present(result, json):
         return
     lines = [
         f"{result.path}: {result.seconds:g} s for {result.task}, {result.amplitude:.0%} of the actions' range",

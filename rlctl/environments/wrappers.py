@@ -1,14 +1,16 @@
-"""The time feature: a policy observes how much of the episode is left, as the locomotion agents of rl-zoo3 do."""
+"""Wrappers around an environment: time left as an observation, stacked frames, and time limits found in them."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import FrameStackObservation, TimeLimit, TransformObservation
 
-from rlctl.environments.time_limit import find_time_limit
+from rlctl.environments.dict_spaces import LARGEST_SPACE
 from rlctl.errors import RecipeError
 from rlctl.task.env import TaskEnv
 
@@ -18,9 +20,10 @@ _KEY = "observation"  # of a Dict space: the entry that has it
 
 
 class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Appends the part of the time limit that is left to a flat observation: 1 at the reset, 0 at the limit.
+    """Appends the fraction of the time limit that is left to a flat observation: 1 at the reset, 0 at the limit.
 
-    Of a Dict space, to its entry `observation`. Equal to sb3-contrib's `TimeFeatureWrapper`, which imports torch.
+    A policy observes it, as the locomotion agents of rl-zoo3 do. Of a Dict space it is appended to the entry
+    `observation`. Equal to sb3-contrib's `TimeFeatureWrapper`, which imports torch.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -79,3 +82,37 @@ def find_time_feature(env: gymnasium.Env[Any, Any]) -> TimeFeature | None:
             return env
         env = env.env
     return None
+
+
+def find_time_limit(env: Any) -> int | None:
+    """Return after how many steps an environment's episodes are truncated, by a `TimeLimit` or its registration.
+
+    None where neither says so; what an environment does by itself is not known.
+    """
+    spec = getattr(env, "spec", None)
+    limits = [spec.max_episode_steps] if spec and spec.max_episode_steps else []
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, TimeLimit):
+            limits.append(env._max_episode_steps)  # Gymnasium offers no other way
+        env = env.env
+    return min(limits, default=None)
+
+
+def stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any, Any]:
+    """Observe the last `frames` observations, oldest first, along the last axis."""
+    space = env.observation_space
+    if not isinstance(space, spaces.Box) or len(space.shape) not in (1, 3):
+        raise RecipeError(f"frame_stack: only flat and image observations can be stacked, this task has {space}")
+    if (count := math.prod(space.shape) * frames) > LARGEST_SPACE:
+        raise RecipeError(f"frame_stack: {frames:,} makes {count:,} elements; at most {LARGEST_SPACE:,} are supported")
+    # Gymnasium stacks along a new first axis; networks want vectors and images of the same rank.
+    stacked = spaces.Box(
+        np.concatenate([space.low] * frames, axis=-1),
+        np.concatenate([space.high] * frames, axis=-1),
+        dtype=space.dtype.type,
+    )
+    wrapped = FrameStackObservation(env, frames)
+    flat: gymnasium.Env[Any, Any] = TransformObservation(
+        wrapped, lambda stack: np.concatenate(list(stack), axis=-1), stacked
+    )
+    return flat

@@ -5,7 +5,7 @@ import pytest
 from gymnasium.wrappers import TimeLimit
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.environments.time_limit import find_time_limit
+from rlctl.environments.wrappers import find_time_limit
 
 
 class Endless(gymnasium.Env):

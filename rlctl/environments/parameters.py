@@ -1,0 +1,73 @@
+"""Parameters of a task's or an environment's constructor: which there are, and whether values fit."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from rlctl.environments.plugin_code import call_plugin
+from rlctl.errors import RecipeError, did_you_mean, short_repr
+
+
+def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
+    """Raise `RecipeError` for a parameter that a plain environment does not have."""
+    known = read_parameters(constructor) if parameters else None
+    if known is None or any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
+        return
+    for key in parameters:
+        is_of_gymnasium = key == "max_episode_steps" and hasattr(constructor, "gymnasium_id")
+        if key not in known and not is_of_gymnasium:
+            raise _unknown_parameter(task, key, list(known))
+
+
+def read_parameters(constructor: Any) -> Mapping[str, inspect.Parameter] | None:
+    """Return the parameters of a plain environment by name, of a Gymnasium id those of what it stands for.
+
+    None where they are not known.
+    """
+    if hasattr(constructor, "gymnasium_id"):
+        import gymnasium
+        from gymnasium.envs.registration import load_env_creator
+
+        spec = gymnasium.registry.get(constructor.gymnasium_id)
+        if spec is None or spec.entry_point is None:
+            return None
+        constructor = spec.entry_point if callable(spec.entry_point) else load_env_creator(spec.entry_point)
+    return inspect.signature(constructor).parameters
+
+
+def _unknown_parameter(task: str, key: str, known: list[str]) -> RecipeError:
+    return RecipeError(
+        f"task.{key}: {task} has no parameter {key!r}.{did_you_mean(key, known)} It has: {', '.join(known) or 'none'}."
+    )
+
+
+def check_fields(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters of a `Task` in the types of its fields; raises `RecipeError` for what does not fit."""
+    import typing
+
+    import pydantic
+
+    fields = task.parameters()
+    hints = call_plugin(task.__name__, lambda: typing.get_type_hints(task)) if given else {}
+    checked = {}
+    for key, value in given.items():
+        if key not in fields:
+            raise _unknown_parameter(task.__name__, key, list(fields))
+        _check_number(key, hints[key], value)
+        try:
+            checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
+        except pydantic.ValidationError as error:
+            problem = error.errors()[0]["msg"].removeprefix("Input ")
+            raise RecipeError(f"task.{key}: {problem}, got {short_repr(repr(value))}") from None
+    return checked
+
+
+def _check_number(key: str, hint: Any, value: Any) -> None:
+    """Raise `RecipeError` for what pydantic would make a number of: text and bools; and for what is none."""
+    if hint in (int, float) and isinstance(value, bool | str):
+        raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
+    if isinstance(value, float) and math.isnan(value):
+        raise RecipeError(f"task.{key}: expected a number, got nan")
