@@ -16,7 +16,7 @@ from stable_baselines3 import SAC
 from rlctl.training.updates.batches import Batch, sample_batches
 from rlctl.training.updates.mlp import Floats, is_mlp
 from rlctl.training.updates.side_by_side import SideBySide
-from rlctl.training.updates.squashed_actor import Sample, SquashedActor
+from rlctl.training.updates.squashed_actor import Sample, SquashedGaussianActor
 
 _LOSS_EVERY = 8
 """Of so many updates in a row the first computes the losses, which are only logged."""
@@ -30,7 +30,7 @@ class SacUpdate:
     def __init__(self, model: Any) -> None:
         self._model = model
         self._policy_delay = getattr(model, "policy_delay", 1)  # models of SB3 alone have none
-        self._actor = SquashedActor(model.actor)
+        self._actor = SquashedGaussianActor(model.actor)
         self._side_by_side = SideBySide(list(model.critic.q_networks), model.batch_size)
         self._critics = self._side_by_side.make_stacks(model.critic.q_networks)
         self._targets = self._side_by_side.make_stacks(model.critic_target.q_networks)
@@ -45,7 +45,7 @@ class SacUpdate:
         actor, critic = model.actor, model.critic
         extractors = (actor.features_extractor, critic.features_extractor)
         return (
-            SquashedActor.supports(actor)
+            SquashedGaussianActor.supports(actor)
             and all(is_mlp(network) for network in critic.q_networks)
             and not any(list(extractor.parameters()) for extractor in extractors)
         )

@@ -39,7 +39,7 @@ class Sample:
     """Shape (batch, 1)."""
 
 
-class SquashedActor:
+class SquashedGaussianActor:
     """A normal distribution, with or without gSDE, of actions that tanh squashes."""
 
     def __init__(self, actor: Any) -> None:
