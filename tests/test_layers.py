@@ -14,7 +14,7 @@ LAYERS = [
     {"__main__"},
     {"cli"},
     {"__init__"},  # loads `rlctl.train` and the others on their first use
-    {"api", "gym"},
+    {"api", "gym", "pytest_plugin"},
     {"tuning"},
     {"training"},
     {"runs"},

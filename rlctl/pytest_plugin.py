@@ -1,0 +1,65 @@
+"""A pytest plugin: `check_env(task)` in a test fails with what `rlctl check-env` finds. Imports pytest alone.
+
+def test_my_robot(check_env):
+    check_env("my_robots.arm:Arm", ignore=["RL106"])
+
+@pytest.mark.rlctl_tasks("my-robots")  # every task that a distribution installs
+def test_tasks(task, check_env):
+    check_env(task)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+CheckEnv = Callable[..., None]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Declare the marker."""
+    config.addinivalue_line(
+        "markers", "rlctl_tasks(distribution): run the test once for each task that a distribution installs, as `task`"
+    )
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Give a marked test the tasks of the distributions."""
+    names = [name for marker in metafunc.definition.iter_markers("rlctl_tasks") for name in marker.args]
+    if not names:
+        return
+    from rlctl.environments import registry
+
+    tasks = [entry.name for entry in registry.list_installed() if entry.distribution in names]
+    if not tasks:
+        raise pytest.UsageError(f"rlctl_tasks: {', '.join(map(str, names))} installs no task; see `rlctl tasks`")
+    metafunc.parametrize("task", tasks)
+
+
+@pytest.fixture
+def check_env() -> CheckEnv:
+    """Return a function that checks an environment and fails the test with the findings as its message.
+
+    It takes what `rlctl.check_env` takes, and `strict`: whether warnings fail the test too.
+    """
+
+    def check(task: str, *, strict: bool = False, select: Sequence[str] = (), **options: Any) -> None:
+        import rlctl
+        from rlctl.errors import RlctlError
+
+        wrong = ("error", "warning") if strict else ("error",)
+        try:
+            findings = [
+                finding for finding in rlctl.check_env(task, select=select, **options) if finding.severity in wrong
+            ]
+        except RlctlError as error:
+            pytest.fail(str(error), pytrace=False)
+        failures = [finding for finding in findings if finding.severity in wrong]
+        if failures:
+            lines = [f"{finding}\n  fix: {finding.fix}" for finding in failures]
+            explain = f"rlctl check-env --explain {failures[0].rule} says more"
+            pytest.fail("\n".join([f"{task}: {len(failures)} of rlctl's rules broken", *lines, explain]), pytrace=False)
+
+    return check

@@ -1,0 +1,85 @@
+"""The pytest plugin: findings fail a test, tasks of a distribution become tests."""
+
+import textwrap
+
+import pytest
+
+pytest_plugins = "pytester"
+
+ENV = """
+    import gymnasium, numpy as np
+    from gymnasium.spaces import Box
+
+    class Sound(gymnasium.Env):
+        observation_space, action_space = Box(-1, 1, (2,)), Box(-1, 1, (1,))
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.state, self.steps = self.np_random.uniform(-0.5, 0.5, 2).astype(np.float32), 0
+            return self.state.copy(), {}
+        def step(self, action):
+            self.steps += 1
+            self.state = (0.9 * self.state + 0.05 * np.float32(action[0])).clip(-1, 1).astype(np.float32)
+            return self.state.copy(), -float(abs(self.state).sum()), False, self.steps >= 50, {}
+
+    class NotFinite(Sound):
+        def step(self, action):
+            state, _, *rest = super().step(action)
+            return state, float("nan"), *rest
+"""
+
+
+@pytest.fixture
+def robots(pytester):
+    pytester.path.joinpath("robots.py").write_text(textwrap.dedent(ENV))
+    return pytester
+
+
+def run(pytester, test):
+    pytester.makepyfile(textwrap.dedent(test))
+    return pytester.runpytest_inprocess("-p", "no:randomly", "-p", "no:cacheprovider")
+
+
+def test_findings_fail_a_test(robots):
+    result = run(
+        robots,
+        """
+        def test_sound(check_env):
+            check_env("robots.py:Sound", select=["RL6"])
+
+        def test_not_finite(check_env):
+            check_env("robots.py:NotFinite", select=["RL601"])
+
+        def test_missing(check_env):
+            check_env("robots.py:Sownd", select=["RL6"])
+        """,
+    )
+    result.assert_outcomes(passed=1, failed=2)
+    result.stdout.fnmatch_lines(["*robots.py:NotFinite: 1 of rlctl's rules broken", "*RL601*", "*fix: *"])
+    result.stdout.fnmatch_lines(["*Did you mean 'Sound'*"])
+
+
+def test_tasks_of_a_distribution(pytester):
+    result = run(
+        pytester,
+        """
+        import pytest
+
+        @pytest.mark.rlctl_tasks("rlctl")
+        def test_names(task):
+            assert task != "reach"
+        """,
+    )
+    result.assert_outcomes(passed=13, failed=1)
+
+
+def test_a_distribution_without_tasks(pytester):
+    result = run(
+        pytester,
+        """
+        import pytest
+
+        @pytest.mark.rlctl_tasks("numpy")
+        def test_names(task): ...
+        """,
+    )
+    result.stderr.fnmatch_lines(["*rlctl_tasks: numpy installs no task; see `rlctl tasks`"])
