@@ -27,12 +27,13 @@ def check_env(
 
     Keywords are parameters of the task. `select` and `ignore` are beginnings of rule ids: `ignore=["RL5"]`. A finding
     has `rule`, `severity` ("error", "warning", "info"), `message`, `fix` and `evidence`; `str(finding)` is one line.
-    Raises `UsageError` for a task or a parameter that does not exist.
+    Raises `UsageError` for a task or a parameter that does not exist, and `TaskError` where no instance can be built
+    and `select` leaves out the rules that say why.
     """
     from rlctl.checking.check import check
     from rlctl.checking.finding import choose_rules
     from rlctl.environments.spec import EnvSpec
-    from rlctl.errors import RlctlError
+    from rlctl.errors import RlctlError, TaskError
 
     rules = choose_rules(select, ignore)
     spec = EnvSpec(task, parameters)
@@ -40,6 +41,8 @@ def check_env(
     if report.verdict.crashed:
         names, details = ", ".join(report.verdict.crashed), "\n".join(report.verdict.crashed.values())
         raise RlctlError(f"check_env: a bug in rlctl: {names} crashed on {task}; please report it", details=details)
+    if report.records.built is None and not report.verdict.findings:
+        raise TaskError(f"{task}: no instance could be built, so nothing was judged; rlctl check-env {task} says why")
     return sorted(report.verdict.findings, key=lambda finding: (finding.severity.rank, finding.rule))
 
 

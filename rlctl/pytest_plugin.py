@@ -30,9 +30,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     names = [name for marker in metafunc.definition.iter_markers("rlctl_tasks") for name in marker.args]
     if not names:
         return
-    from rlctl.environments import registry
+    from rlctl.environments import installed
 
-    tasks = [entry.name for entry in registry.list_installed() if entry.distribution in names]
+    tasks = [entry.name for entry in installed.list_installed() if entry.distribution in names]
     if not tasks:
         raise pytest.UsageError(f"rlctl_tasks: {', '.join(map(str, names))} installs no task; see `rlctl tasks`")
     metafunc.parametrize("task", tasks)

@@ -18,6 +18,7 @@ def test_every_cell_runs(tmp_path):
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     shown = str(outputs)
     assert "RL301" in shown
+    assert notebook.cells[6].outputs[0].data["text/plain"] == "[]"  # mended
     assert "image/png" in shown  # the learning curve
     assert "video/mp4" in shown
     assert (tmp_path / "reach.onnx").is_file()

@@ -36,7 +36,8 @@ def robots(pytester):
 
 def run(pytester, test):
     pytester.makepyfile(textwrap.dedent(test))
-    return pytester.runpytest_inprocess("-p", "no:randomly", "-p", "no:cacheprovider")
+    # By its module, not by its entry point: an installation of before has none.
+    return pytester.runpytest_inprocess("-p", "no:rlctl", "-p", "rlctl.pytest_plugin", "-p", "no:cacheprovider")
 
 
 def test_findings_fail_a_test(robots):
@@ -55,7 +56,7 @@ def test_findings_fail_a_test(robots):
     )
     result.assert_outcomes(passed=1, failed=2)
     result.stdout.fnmatch_lines(["*robots.py:NotFinite: 1 of rlctl's rules broken", "*RL601*", "*fix: *"])
-    result.stdout.fnmatch_lines(["*Did you mean 'Sound'*"])
+    result.stdout.fnmatch_lines(["*no instance could be built*"])
 
 
 def test_tasks_of_a_distribution(pytester):
@@ -82,4 +83,4 @@ def test_a_distribution_without_tasks(pytester):
         def test_names(task): ...
         """,
     )
-    result.stderr.fnmatch_lines(["*rlctl_tasks: numpy installs no task; see `rlctl tasks`"])
+    result.stdout.fnmatch_lines(["*rlctl_tasks: numpy installs no task; see `rlctl tasks`"])
