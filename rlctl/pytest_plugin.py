@@ -46,14 +46,11 @@ def check_env() -> CheckEnv:
     """
 
     def check(task: str, *, strict: bool = False, select: Sequence[str] = (), **options: Any) -> None:
-        import rlctl
         from rlctl.errors import RlctlError
 
         wrong = ("error", "warning") if strict else ("error",)
         try:
-            findings = [
-                finding for finding in rlctl.check_env(task, select=select, **options) if finding.severity in wrong
-            ]
+            findings = run_check(task, select=select, **options)
         except RlctlError as error:
             pytest.fail(str(error), pytrace=False)
         failures = [finding for finding in findings if finding.severity in wrong]

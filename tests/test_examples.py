@@ -39,7 +39,7 @@ def findings(task: str, cwd: Path, *options: str) -> set[str]:
 
 def test_broken_env_has_the_mistakes_that_its_text_names(tmp_path: Path) -> None:
     source = (EXAMPLES / "broken_env/pushed_ball.py").read_text()
-    first = {"RL204", "RL301", "RL309", "RL501", "RL609", "RL808"}
+    first = {"RL204", "RL301", "RL309", "RL501", "RL609", "RL704", "RL808"}
     assert findings(f"{EXAMPLES}/broken_env/pushed_ball.py:PushedBall", tmp_path) == first
     drawn = "np.random.uniform(-0.5, 0.5, 2)  # noqa: NPY002"
     assert drawn in source

@@ -14,7 +14,8 @@ LAYERS = [
     {"__main__"},
     {"cli"},
     {"__init__"},  # loads `rlctl.train` and the others on their first use
-    {"api", "gym", "pytest_plugin"},
+    {"pytest_plugin"},
+    {"api", "gym"},
     {"tuning"},
     {"training"},
     {"runs"},
