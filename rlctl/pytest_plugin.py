@@ -46,6 +46,7 @@ def check_env() -> CheckEnv:
     """
 
     def check(task: str, *, strict: bool = False, select: Sequence[str] = (), **options: Any) -> None:
+        from rlctl.api import check_env as run_check
         from rlctl.errors import RlctlError
 
         wrong = ("error", "warning") if strict else ("error",)
