@@ -54,6 +54,12 @@ def test_bare_env_is_clean(tmp_path: Path) -> None:
     assert findings(f"{EXAMPLES}/bare_env/pointmass.py:PointMass", tmp_path) == set()
 
 
+def test_reacher_of_mujoco_trains(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    recipe = EXAMPLES / "mujoco/reacher.yaml"
+    rlctl("train", "Reacher-v5", "--config", str(recipe), "-n", "1600", "--set", "eval.episodes=2", cwd=tmp_path)
+
+
 def test_bare_env_trains_by_path(tmp_path: Path) -> None:
     small = ["--set", "algo_kwargs.n_steps=25", "--set", "algo_kwargs.batch_size=100", "--set", "eval.episodes=4"]
     task = f"{EXAMPLES}/bare_env/pointmass.py:PointMass"

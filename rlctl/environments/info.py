@@ -57,6 +57,7 @@ class EnvInfo(pydantic.BaseModel):
 
 def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
     """Describe an environment; for a task with its names, units and timing."""
+    from rlctl.environments.mujoco_model import describe_model
     from rlctl.environments.wrappers import find_time_feature, find_time_limit
     from rlctl.task.env import TaskEnv
 
@@ -82,7 +83,7 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
             robot=task.robot,
             joints=task.describe_joints(),
         )
-    return EnvInfo(**common, max_steps=find_time_limit(env))
+    return EnvInfo(**common, **describe_model(env), max_steps=find_time_limit(env))
 
 
 def describe_randomization(events: Mapping[str, bool]) -> str:

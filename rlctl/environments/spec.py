@@ -103,6 +103,8 @@ class EnvSpec:
         parameters = dict(self.parameters)
         check_keywords(self.task, constructor, parameters)
         if render_mode is not None:
+            if render_mode == "rgb_array" and not os.environ.get("DISPLAY"):
+                os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's choice needs a display
             parameters["render_mode"] = render_mode
             try:
                 check_keywords(self.task, constructor, parameters)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rlctl.replaying.curves import Timelines
-from rlctl.replaying.mjcf import Shape, ShapeKind
+from rlctl.replaying.mjcf import Mesh, Shape, ShapeKind
 from rlctl.replaying.scene import BodyMotion, Scene, Warn
 
 _MARKER_COLORS = [(40, 200, 90), (70, 150, 255), (240, 120, 200), (250, 180, 40)]
@@ -166,7 +166,8 @@ def _archetype(shape: Shape) -> rr.AsComponents | None:
     if shape.kind == ShapeKind.BOX:
         return rr.Boxes3D(half_sizes=[[extent / 2 for extent in shape.size]], colors=[color], fill_mode=solid)
     if shape.kind == ShapeKind.SPHERE:
-        return rr.Ellipsoids3D(half_sizes=[[shape.size[0]] * 3], colors=[color], fill_mode=solid)
+        half_sizes = shape.size if len(shape.size) == 3 else shape.size[:1] * 3
+        return rr.Ellipsoids3D(half_sizes=[half_sizes], colors=[color], fill_mode=solid)
     if shape.kind == ShapeKind.CYLINDER:
         return rr.Cylinders3D(lengths=shape.size[0], radii=shape.size[1], colors=[color], fill_mode=solid)
     if shape.kind == ShapeKind.CAPSULE:
@@ -174,6 +175,21 @@ def _archetype(shape: Shape) -> rr.AsComponents | None:
         # Rerun's capsules start at the centre of one end; PyBullet's are centred.
         half = [[0.0, 0.0, -length / 2]]
         return rr.Capsules3D(lengths=length, radii=radius, translations=half, colors=[color], fill_mode=solid)
+    if isinstance(shape.mesh, Mesh):
+        return _draw_mesh(shape.mesh, color)
     if shape.mesh and shape.mesh.is_file() and shape.mesh.suffix.lower() in _MESHES:
         return rr.Asset3D(path=shape.mesh, albedo_factor=color)
     return None
+
+
+def _draw_mesh(mesh: Mesh, color: list[int]) -> rr.Mesh3D:
+    normals = np.zeros_like(mesh.vertices)
+    first, second, third = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
+    for corner in range(3):  # the viewer draws a flat silhouette of a mesh without normals
+        np.add.at(normals, mesh.triangles[:, corner], np.cross(second - first, third - first))
+    return rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.triangles,
+        vertex_normals=normals,
+        albedo_factor=color,
+    )

@@ -30,14 +30,24 @@ class ShapeKind(enum.Enum):
 
 
 @dataclasses.dataclass(frozen=True)
+class Mesh:
+    """A mesh in memory."""
+
+    vertices: np.ndarray
+    """[m], shape (vertices, 3)."""
+    triangles: np.ndarray
+    """Indices of vertices, shape (triangles, 3)."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Shape:
     """One visual shape of a link: a kind, sizes [m], a pose in the frame of its link, a colour."""
 
     link: str
     kind: ShapeKind
     size: tuple[float, ...]
-    """Box: full extents; sphere: radius; cylinder and capsule: length and radius; mesh: scale per axis."""
-    mesh: Path | None
+    """Box: full extents; sphere: radius, or one per axis; cylinder, capsule: length, radius; mesh: scale per axis."""
+    mesh: Path | Mesh | None
     position: tuple[float, ...]
     orientation: tuple[float, ...]
     color: tuple[float, ...]

@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 
 from rlctl.environments import dict_spaces, registry
 from rlctl.environments.info import EnvInfo, describe
+from rlctl.environments.mujoco_model import find_mujoco
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
-from rlctl.replaying.scene import Env, Scene, Warn, make_reader
+from rlctl.replaying.mujoco_scene import MujocoReader
+from rlctl.replaying.scene import Camera, Env, Scene, SceneReader, Warn
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
+from rlctl.task.env import TaskEnv
 from rlctl.version import collect_versions
 
 Choose = Callable[[Any, int], Any]
@@ -75,6 +78,14 @@ def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
         return env
 
 
+def _make_reader(env: Env, warn: Warn) -> SceneReader | MujocoReader | Camera:
+    """Return what reads the world of a task or of MuJoCo, or takes the pictures of any other environment."""
+    inner = env.unwrapped
+    if isinstance(inner, TaskEnv):
+        return SceneReader(inner)
+    return MujocoReader(env) if find_mujoco(env) else Camera(env, warn)
+
+
 class _Step(NamedTuple):
     # What an environment returned for an action; what it may go on writing into is copied.
     action: Any
@@ -103,7 +114,7 @@ def play_episode(
     seed and step, for whatever the environment raises.
     """
     about, space = describe(env), env.observation_space
-    reader = make_reader(env, draw) if draw is not None else None
+    reader = _make_reader(env, draw) if draw is not None else None
     looks = [watch] if reader is None else [reader.read, watch]
     steps: list[_Step] = []
     terminated = truncated = False

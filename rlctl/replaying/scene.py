@@ -79,12 +79,6 @@ class Scene:
         return [body for body in self.bodies if body.joint_names]
 
 
-def make_reader(env: Env, warn: Warn) -> SceneReader | Camera:
-    """Return what reads the world of a task, or takes the pictures of any other environment."""
-    inner = env.unwrapped
-    return SceneReader(inner) if isinstance(inner, TaskEnv) else Camera(env, warn)
-
-
 def find_bounds(bodies: Sequence[Body], markers: Sequence[Array] = ()) -> tuple[Array, Array]:
     """Return the lowest and the highest corner [m] now of bodies that are not the ground, and of markers."""
     corners = list(markers)

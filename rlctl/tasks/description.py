@@ -77,6 +77,7 @@ def _convert(value: Any) -> Any:
 
 
 def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    from rlctl.environments.mujoco_model import describe_model, find_mujoco, total_mass
     from rlctl.environments.wrappers import find_time_limit
     from rlctl.task.env import TaskEnv
 
@@ -85,6 +86,7 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
     cls = type(task_env.task if task_env else built)
     target = f"{cls.__module__}:{cls.__qualname__}"
     distribution, version = _find_origin(task, target)
+    model, simulated = describe_model(env), find_mujoco(env)
     # Gymnasium's constructor of an id takes anything; the class behind it does not.
     called = cls if task_env or hasattr(constructor, "gymnasium_id") else constructor
     return {
@@ -100,6 +102,9 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
         "actions": _list_quantities(env.action_space),
         "parameters": [] if task_env and not dataclasses.is_dataclass(cls) else _list_parameters(called),
         "max_steps": task_env.max_steps if task_env else find_time_limit(env),
+        "control_dt": task_env.task.control_dt if task_env else model.get("control_dt"),
+        "joints": task_env.task.describe_joints() if task_env else model.get("joints"),
+        "mass": total_mass(simulated[0]) if simulated else None,
         "definition": _describe_definition(task_env) if task_env else None,
     }
 

@@ -31,6 +31,7 @@ def show(description: Description, json: str | None) -> None:
     parts = _list_quantities(content["observations"])
     _print_section(f"observation  {_shorten(content['observation_space'])}", parts)
     _print_section(f"action  {_shorten(content['action_space'])}", _list_actions(content))
+    _print_section("joints", _list_joints(content["joints"]))
     parameters = _list_parameters(content["parameters"], recipe.task)
     _print_section("parameters  --set task.NAME=VALUE", parameters, none="none")
     if definition is not None:
@@ -81,7 +82,9 @@ def _list_facts(content: Json) -> list[Row]:
     definition, steps = content["definition"], content["max_steps"]
     if definition is None:
         limit = f"truncated after {steps:,} steps" if steps else "no time limit that Gymnasium knows of"
-        return [*facts, ("episode", limit)]
+        model = [("mass", f"{content['mass']:.4g} kg")] if content["mass"] is not None else []
+        control = [("control", f"{content['control_dt']:.6g} s per action")] if content["control_dt"] else []
+        return [*facts, *model, *control, ("episode", limit)]
     if definition["robot"]:
         facts.append(("robot", definition["robot"]))
     control_dt, substeps = _format_value(definition["control_dt"]), definition["substeps"]
@@ -119,6 +122,18 @@ def _format_bounds(low: float | None, high: float | None) -> str:
 def _list_actions(content: Json) -> list[Row]:
     meaning = content["definition"]["action_meaning"] if content["definition"] else ""
     return [(meaning,)] if meaning else _list_quantities(content["actions"])
+
+
+def _list_joints(joints: Json | None) -> list[Row]:
+    """Return the joints that the action moves: position limits, top speed, largest torque, where they are known."""
+    if joints is None:
+        return []
+    columns = [
+        [f"{low:.4g} to {high:.4g}" for low, high in zip(joints["low"], joints["high"], strict=True)],
+        [f"speed {value:.4g}" for value in joints["max_speed"]],
+        [f"torque {value:.4g}" for value in joints["max_torque"]],
+    ]
+    return list(zip(joints["names"], *(column for column in columns if column), strict=True))
 
 
 def _list_parameters(parameters: list[Json], trained: Mapping[str, Any]) -> list[Row]:

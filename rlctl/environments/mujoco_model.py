@@ -1,0 +1,68 @@
+"""What is known of any environment that MuJoCo simulates, such as Gymnasium's: its model has names, limits and masses.
+
+MuJoCo itself is not imported here: an environment that uses it has done so.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlctl.task.joints import Joints
+
+if TYPE_CHECKING:
+    import gymnasium
+    import mujoco
+
+
+def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
+    """Return `model` and `data` of an environment that has them, None of any other."""
+    library = sys.modules.get("mujoco")
+    model, data = (getattr(env.unwrapped, name, None) for name in ("model", "data"))
+    if library is None or not isinstance(model, library.MjModel) or not isinstance(data, library.MjData):
+        return None
+    return model, data
+
+
+def describe_model(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Return `control_dt` [s] and `joints` of an environment that MuJoCo simulates; empty for any other."""
+    found = find_mujoco(env)
+    if found is None:
+        return {}
+    dt = getattr(env.unwrapped, "dt", None)  # frames per second are rounded: 67 for a step of 0.015 s
+    step = {"control_dt": float(dt)} if isinstance(dt, float | int) and dt > 0 else {}
+    size = int(np.prod(env.action_space.shape or ()))
+    return {**step, "joints": _describe_joints(found[0]) if size == found[0].nu else None}
+
+
+def _describe_joints(model: mujoco.MjModel) -> Joints | None:
+    """Describe the joints that the actuators move, in their order; None where one moves something else."""
+    import mujoco
+
+    joint_kind, no_bias = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtBias.mjBIAS_NONE)
+    if not model.nu or any(int(kind) != joint_kind for kind in model.actuator_trntype):
+        return None
+    moved = model.actuator_trnid[:, 0]
+    ranges, limited = model.jnt_range[moved], model.jnt_limited[moved].astype(bool).all()
+    strengths = np.abs(model.actuator_gainprm[:, 0] * model.actuator_gear[:, 0]) * np.abs(model.actuator_ctrlrange).max(
+        axis=1
+    )
+    motors = all(int(kind) == no_bias for kind in model.actuator_biastype) and model.actuator_ctrllimited.all()
+    return Joints(
+        names=[joint_name(model, joint) for joint in moved],
+        low=ranges[:, 0].tolist() if limited else (),
+        high=ranges[:, 1].tolist() if limited else (),
+        max_torque=strengths.tolist() if motors else (),
+    )
+
+
+def joint_name(model: mujoco.MjModel, joint: int) -> str:
+    """Return the name of a joint, or its number where it has none."""
+    return model.joint(int(joint)).name or f"joint {joint}"
+
+
+def total_mass(model: mujoco.MjModel) -> float:
+    """Return the mass of all bodies [kg]."""
+    return float(model.body_mass.sum())

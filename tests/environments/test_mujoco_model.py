@@ -1,0 +1,38 @@
+"""What is read from the model of an environment that MuJoCo simulates."""
+
+from contextlib import closing
+
+import pytest
+
+from rlctl.environments.info import describe
+from rlctl.environments.spec import EnvSpec
+
+pytest.importorskip("mujoco")
+
+
+def about(task: str):
+    with closing(EnvSpec(task).make()) as env:
+        return describe(env)
+
+
+def test_control_dt_is_not_the_rounded_number_of_frames():
+    assert about("Humanoid-v5").control_dt == pytest.approx(0.015)  # 67 frames per second would be 0.0149
+
+
+def test_joints_are_those_of_the_actuators():
+    joints = about("HalfCheetah-v5").joints
+    assert joints.names == ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
+    assert (joints.low[0], joints.high[0]) == pytest.approx((-0.52, 1.05))
+    assert joints.max_torque == (120.0, 90.0, 60.0, 120.0, 60.0, 30.0)
+
+
+def test_limits_are_left_out_where_a_joint_has_none():
+    joints = about("Reacher-v5").joints
+    assert joints.names == ("joint0", "joint1")
+    assert joints.low == ()
+    assert joints.max_torque == (200.0, 200.0)
+
+
+def test_other_environments_have_no_model():
+    info = about("Pendulum-v1")
+    assert (info.control_dt, info.joints) == (None, None)
