@@ -34,7 +34,7 @@ def test_they_are_episodes_of_the_evaluation_bit_for_bit(run, tmp_path, capsys):
     request = ReplayRequest(str(run.run.path), episodes=5, output=tmp_path, choice=Choice("worst", 2))
     result = run_replay(request)
     evaluated = run_evaluation(EvalRequest(str(run.run.path), episodes=5), Gates()).episodes
-    expected = sorted((bool(each.result.success), each.result.total_reward, each.result.seed) for each in evaluated)[:2]
+    expected = sorted((bool(row["success"]), row["return"], row["seed"]) for row in evaluated)[:2]
     assert [(each.success, each.total_reward, each.seed) for each in result.episodes] == expected
     assert all(each.recording.is_file() for each in result.episodes)
     assert result.choice.startswith("the 2 worst of 5 episodes, of which ")
