@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli import check_env, eval, export, identify, replay, runs, serve, tasks, train, tune
+from rlctl.cli import check_env, eval, export, identify, recipe, replay, runs, serve, tasks, train, tune
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
 
@@ -40,6 +40,7 @@ COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "serve": serve.serve,
     "identify": identify.identify,
     "tasks": tasks.app,
+    "recipe": recipe.recipe,
     "runs": runs.app,
 }
 

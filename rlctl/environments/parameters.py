@@ -9,6 +9,7 @@ from typing import Any
 
 from rlctl.environments.plugin_code import call_plugin
 from rlctl.errors import RecipeError, did_you_mean, short_repr
+from rlctl.storage.validation import explain_first
 
 
 def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
@@ -60,8 +61,7 @@ def check_fields(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
         try:
             checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
         except pydantic.ValidationError as error:
-            problem = error.errors()[0]["msg"].removeprefix("Input ")
-            raise RecipeError(f"task.{key}: {problem}, got {short_repr(repr(value))}") from None
+            raise RecipeError(explain_first(error, f"task.{key}")) from None
     return checked
 
 

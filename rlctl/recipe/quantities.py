@@ -49,6 +49,6 @@ class NumberAfter(GroupedMetadata):
         except ValueError:
             text = ""
         if not text.startswith(self.prefix):
-            # The type's description says what would be right; see `rlctl.recipe.schema_text`.
+            # The type's description says what would be right; see `rlctl.storage.validation`.
             raise PydanticCustomError("wrong_type", "wrong type")
         return text

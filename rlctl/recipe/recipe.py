@@ -13,13 +13,12 @@ from pydantic import Field
 
 from rlctl.environments.spec import EnvSpec, merge
 from rlctl.errors import RecipeError, short_repr
-from rlctl.recipe import schema_text
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.recipe.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
 from rlctl.recipe.quantities import Number, Section, Switch, Whole
 from rlctl.recipe.stages import Stage, check_promotions
-from rlctl.storage import yaml_text
+from rlctl.storage import validation, yaml_text
 
 Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
@@ -216,21 +215,21 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
     except pydantic.ValidationError as error:
         schema = build_schema(values.get("algo", "ppo"))
 
-        def explain(problem: Any, path: schema_text.Place) -> str:
+        def explain(problem: Any, path: validation.Place) -> str:
             origins = (each if isinstance(each, str) else each.find(path) for each in sources)
             origin = next((each for each in origins if each is not None), "recipe")
             return (f"{origin}: " if origin else "") + _explain(problem, path, schema, values)
 
-        raise RecipeError(schema_text.explain_all(error, schema, explain)) from None
+        raise RecipeError(validation.explain_all(error, schema, explain)) from None
 
 
-def build_schema(algo: Any = None) -> schema_text.Schema:
+def build_schema(algo: Any = None) -> validation.Schema:
     """Return the JSON schema of a recipe, with the parameters of an algorithm and its networks; do not change it."""
     return _build_schema(algo if isinstance(algo, str) and algo in ALGORITHMS else None)
 
 
 @functools.cache
-def _build_schema(algo: str | None) -> schema_text.Schema:
+def _build_schema(algo: str | None) -> validation.Schema:
     schema = Recipe.model_json_schema()
     for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
         if algo in models:
@@ -240,13 +239,13 @@ def _build_schema(algo: str | None) -> schema_text.Schema:
     return schema
 
 
-def _explain(problem: Any, path: Sequence[str | int], schema: schema_text.Schema, values: Mapping[str, Any]) -> str:
+def _explain(problem: Any, path: Sequence[str | int], schema: validation.Schema, values: Mapping[str, Any]) -> str:
     where, shown = "", path
     if len(path) > 1 and path[0] == "stages":
         where, shown = f"stage {int(path[1]) + 1}: ", path[2:]
     key = ".".join(short_repr(str(part)) for part in shown)
     of = f" for {values.get('algo', 'ppo')}" if path and path[0] in ("algo_kwargs", "policy_kwargs") else ""
-    return where + schema_text.explain(problem, path, schema, values, key=key, of=of)
+    return where + validation.explain(problem, path, schema, values, key=key, of=of)
 
 
 def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:

@@ -116,7 +116,9 @@ class RunDirectory:
 
     def write_recipe(self, recipe: Recipe) -> None:
         """Write the resolved recipe; what is edited in it later is noticed."""
-        files.write_sealed(self.recipe_file, recipe.to_yaml())
+        from rlctl.recipe.json_schema import format_editor_line
+
+        files.write_sealed(self.recipe_file, format_editor_line() + recipe.to_yaml())
 
     def status(self) -> dict[str, Any]:
         """Read `run.json`."""

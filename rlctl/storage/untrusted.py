@@ -101,11 +101,9 @@ def _explain_error(error: ValueError) -> str:
     """Return in a line what is wrong with a description; of pydantic's report the first problem, with its place."""
     import pydantic
 
-    if isinstance(error, pydantic.ValidationError):
-        problem = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in problem["loc"]) or "it"
-        return short_repr(f"{place}: {problem['msg']}, got {short_repr(problem['input'])}", 200)
-    return short_repr(str(error), 200)
+    from rlctl.storage.validation import explain_first
+
+    return short_repr(explain_first(error) if isinstance(error, pydantic.ValidationError) else str(error), 200)
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:

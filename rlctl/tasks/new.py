@@ -13,6 +13,7 @@ from pathlib import Path
 
 from rlctl.environments import installed
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.recipe import json_schema
 from rlctl.storage import files as storage_files
 
 TEMPLATE = Path(__file__).with_name("template")
@@ -57,6 +58,8 @@ def create(name: str) -> NewPlugin:
         )
         for path, text in sources.items()
     }
+    # The editor's schema lies next to the recipe: a path into this machine's packages would mean nothing elsewhere.
+    content[Path(package, json_schema.FILE.name)] = json_schema.FILE.read_text(encoding="utf-8")
     write_files(folder, content)
     return NewPlugin(name, folder, package, cls, list(content))
 

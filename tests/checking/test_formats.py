@@ -16,7 +16,7 @@ from gymnasium import spaces
 from rlctl.checking import families
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
 from rlctl.checking.finding import FAMILIES, RULES, choose_rules, find_rule
-from rlctl.checking.formats import FORMATS, choose, github, plain, rules, sarif, structured
+from rlctl.checking.formats import FORMATS, choose, github, plain, sarif, structured
 from rlctl.checking.leaves import find_leaves
 from rlctl.checking.messages import Built
 from rlctl.checking.records import Records
@@ -268,8 +268,3 @@ def test_command_refuses_a_waiver_without_a_reason():
     run = rlctl(f"{HERE}/broken_waivers.py:NoReason", "--select", "RL106")
     assert (run.returncode, run.stdout) == (2, "")
     assert "RL106 is waived without a reason" in run.stderr
-
-
-def test_the_page_of_the_rules_is_current():
-    page = (ROOT / "docs" / "rules.md").read_text()
-    assert page == rules.render_page(), "write it again: python -m rlctl.checking.formats.rules > docs/rules.md"

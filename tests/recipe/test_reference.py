@@ -1,5 +1,6 @@
 """The models of the algorithms' parameters are SB3's signatures, and `docs/recipe.md` is made from them."""
 
+import importlib.util
 import inspect
 from pathlib import Path
 
@@ -7,10 +8,14 @@ import pytest
 
 from rlctl.policy.torch_policy import ACTIVATIONS
 from rlctl.policy.torch_policy import ALGORITHMS as CLASSES
-from rlctl.recipe import reference
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
 from rlctl.recipe.recipe import ALGORITHMS
+
+_spec = importlib.util.spec_from_file_location("generate", Path(__file__).parents[2] / "docs" / "generate.py")
+generate = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(generate)
+PAGES = generate.render_pages()
 
 # Set by rlctl itself, or not plain data.
 NOT_FOR_RECIPES = {
@@ -50,14 +55,13 @@ def test_names_and_defaults_are_those_of_sb3(algo):
         assert of_model(NETWORK_PARAMETERS[algo]) == defaults(policy.__init__, NOT_FOR_POLICIES)
 
 
-def test_the_page_is_current():
-    page = Path(__file__).parents[2] / "docs" / "recipe.md"
-    assert page.read_text(encoding="utf-8") == reference.render(), (
-        "write it again: python -m rlctl.recipe.reference > docs/recipe.md"
-    )
+@pytest.mark.parametrize("name", PAGES)
+def test_the_generated_files_are_current(name):
+    file = Path(generate.__file__).parent / name
+    assert file.read_text(encoding="utf-8") == PAGES[name], "write it again: python docs/generate.py"
 
 
 def test_every_key_has_a_meaning_and_what_it_may_be():
-    rows = [line.split("|")[1:-1] for line in reference.render().splitlines() if line.startswith("| `")]
+    rows = [line.split("|")[1:-1] for line in generate.render_recipe_page().splitlines() if line.startswith("| `")]
     assert len(rows) > 200
     assert all(value.strip() not in ("", "any value") and meaning.strip() for _, value, _, meaning in rows)

@@ -65,7 +65,3 @@ def render_page() -> str:
                 text = f"### {rule.id} {rule.name}\n\n**{rule.severity}.** {rule.meaning}\n\n*Fix:* {rule.fix}\n"
                 parts.append(text)
     return "\n".join(parts)
-
-
-if __name__ == "__main__":
-    print(render_page(), end="")

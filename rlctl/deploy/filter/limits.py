@@ -10,9 +10,8 @@ import pydantic
 from pydantic import Field
 
 from rlctl.errors import RecipeError, short_repr
-from rlctl.recipe import schema_text
 from rlctl.recipe.quantities import Number, Section
-from rlctl.storage import yaml_text
+from rlctl.storage import validation, yaml_text
 
 _NUMBER_WITH_UNIT = re.compile(r"^\s*[-+]?\d[\d.eE+-]*\s*[^\d\s.]")
 Positive = Annotated[Number, Field(gt=0)]
@@ -107,16 +106,16 @@ def read_limits(path: Path) -> Limits:
     except pydantic.ValidationError as error:
         schema = Limits.model_json_schema()
 
-        def explain(problem: Any, place: schema_text.Place) -> str:
+        def explain(problem: Any, place: validation.Place) -> str:
             return f"{path}:{yaml_text.find_line(text, place)}: {_explain(problem, place, schema, content)}"
 
-        raise RecipeError(schema_text.explain_all(error, schema, explain)) from None
+        raise RecipeError(validation.explain_all(error, schema, explain)) from None
 
 
-def _explain(problem: Any, place: schema_text.Place, schema: schema_text.Schema, content: Any) -> str:
+def _explain(problem: Any, place: validation.Place, schema: validation.Schema, content: Any) -> str:
     key, given = ".".join(str(part) for part in place), problem["input"]
-    found = re.search(r"\[(.+?)\]", schema_text.find_schema(schema, place).get("description", ""))
+    found = re.search(r"\[(.+?)\]", validation.find_schema(schema, place).get("description", ""))
     unit = found[1] if found else ""
     if isinstance(given, str) and unit and _NUMBER_WITH_UNIT.match(given):
         return f"{key}: write the number alone, in {unit}, got {short_repr(given)!r}"
-    return schema_text.explain(problem, place, schema, content, key=key, unit=unit)
+    return validation.explain(problem, place, schema, content, key=key, unit=unit)

@@ -165,8 +165,9 @@ def _check_type(where: str, hint: Any, value: Any, error: type[RlctlError]) -> N
     try:
         pydantic.TypeAdapter(hint).validate_python(value)
     except pydantic.ValidationError as problem:
-        message = problem.errors()[0]["msg"].removeprefix("Input ")
-        raise error(f"{where}: {message}, got {value!r}") from None
+        from rlctl.storage.validation import explain_first
+
+        raise error(explain_first(problem, where)) from None
     except pydantic.errors.PydanticSchemaGenerationError:
         return  # a type of the author's own
 

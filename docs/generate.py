@@ -1,20 +1,22 @@
-"""Prints the page about recipes, `docs/recipe.md`: `python -m rlctl.recipe.reference > docs/recipe.md`."""
+"""Writes the generated pages, `recipe.md`, `rules.md` and the JSON schema of recipes: `python docs/generate.py`."""
 
 from __future__ import annotations
 
 import itertools
+import pathlib
 from collections.abc import Iterator
 
 from pydantic import BaseModel
 
-from rlctl.recipe import schema_text
+from rlctl.checking.formats import rules
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
+from rlctl.recipe.json_schema import render_json_schema
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
 from rlctl.recipe.recipe import Recipe, build_schema
-from rlctl.recipe.schema_text import Schema
 from rlctl.recipe.sources import list_presets
 from rlctl.recipe.stages import Stage
-from rlctl.storage import yaml_text
+from rlctl.storage import validation, yaml_text
+from rlctl.storage.validation import Schema
 
 Path = tuple[str | int, ...]
 
@@ -47,7 +49,8 @@ Presets come with rlctl and go over the task's own recipe like a file, by `--con
 
 {presets}
 
-This page is generated: `python -m rlctl.recipe.reference > docs/recipe.md`.
+This page is generated: `python docs/generate.py`. For editors there is a
+[JSON schema](../rlctl/recipe/recipe.schema.json): `rlctl recipe --schema`.
 """
 _STAGES = """
 Stages are a curriculum. Each changes the recipe's own task, and all but the last say when they end:
@@ -60,8 +63,8 @@ stages:
 """
 
 
-def render() -> str:
-    """Return the page."""
+def render_recipe_page() -> str:
+    """Return the page about recipes."""
     lines = [
         _HEAD.replace("{presets}", "\n".join(_render_presets())),
         "## Keys",
@@ -91,10 +94,10 @@ def _render_table(root: Schema, path: Path, model: type[BaseModel]) -> list[str]
 
 def _render_rows(root: Schema, path: Path, prefix: str, model: type[BaseModel] | None) -> Iterator[str]:
     """Yield a row for each key of the mapping at `path`, and below it the keys of the mapping that it is, if so."""
-    for key in schema_text.list_keys(root, schema_text.find_schema(root, path)):
-        part = schema_text.find_schema(root, (*path, key))
+    for key in validation.list_keys(root, validation.find_schema(root, path)):
+        part = validation.find_schema(root, (*path, key))
         meaning = part.get("description") or _find_description(model, key)
-        value = schema_text.describe_value(root, part).replace("|", "\\|")
+        value = validation.describe_value(root, part).replace("|", "\\|")
         yield f"| `{prefix}{key}` | {value} | {_render_default(part)} | {meaning} |"
         if key not in _OWN_TABLES and "examples" not in part:
             yield from _render_rows(root, (*path, key), f"{prefix}{key}.", None)
@@ -102,9 +105,9 @@ def _render_rows(root: Schema, path: Path, prefix: str, model: type[BaseModel] |
 
 def _find_description(model: type[BaseModel] | None, key: str) -> str:
     """Return the description that a class gives a field, or the class that it inherits the field from."""
-    classes = [each for each in model.__mro__ if issubclass(each, BaseModel)] if model else []
-    found = (each.model_fields[key].description for each in classes if key in each.model_fields)
-    return next((text for text in found if text), "")
+    classes = [cls for cls in model.__mro__ if issubclass(cls, BaseModel)] if model else []
+    texts = (cls.model_fields[key].description for cls in classes if key in cls.model_fields)
+    return next((text for text in texts if text), "")
 
 
 def _render_default(part: Schema) -> str:
@@ -114,5 +117,15 @@ def _render_default(part: Schema) -> str:
     return "" if isinstance(default, dict) else yaml_text.dump(default).partition("\n")[0]
 
 
+def render_pages() -> dict[str, str]:
+    """Return the generated files by name."""
+    return {
+        "recipe.md": render_recipe_page(),
+        "rules.md": rules.render_page(),
+        "../rlctl/recipe/recipe.schema.json": render_json_schema(),
+    }
+
+
 if __name__ == "__main__":
-    print(render(), end="")
+    for name, text in render_pages().items():
+        (pathlib.Path(__file__).parent / name).write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What a JSON schema says of a value, in words: for messages about a recipe, and for the page that describes one."""
+"""What is wrong with data that was checked against a model, and what its JSON schema expects, in words."""
 
 from __future__ import annotations
 
@@ -57,6 +57,13 @@ def explain_all(error: pydantic.ValidationError, root: Schema, explain: Callable
         problems.setdefault(_locate(problem, root), problem)  # pydantic has one for each type that a value may be of
     lines = [explain(problem, place) for place, problem in problems.items()]
     return "\n".join(lines if len(lines) <= _MOST_LINES else [*lines[:2], f"and {len(lines) - 2} more mistakes"])
+
+
+def explain_first(error: pydantic.ValidationError, label: str = "") -> str:
+    """Return the first problem in one line: `LABEL: should be a valid number, got 'abc'`; without a label its place."""
+    problem = error.errors(include_url=False)[0]
+    place = label or ".".join(map(str, problem["loc"])) or "it"
+    return f"{place}: {problem['msg'].removeprefix('Input ')}, got {short_repr(repr(problem['input']))}"
 
 
 def _locate(problem: Any, root: Schema) -> Place:

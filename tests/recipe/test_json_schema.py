@@ -1,0 +1,58 @@
+"""The schema of recipes for editors takes every recipe that rlctl takes, and names the mistakes."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from rlctl.recipe.json_schema import build_json_schema
+from rlctl.storage import yaml_text
+
+ROOT = Path(__file__).parents[2]
+RECIPES = [*ROOT.glob("plugins/*/*.yaml"), *ROOT.glob("rlctl/recipe/presets/*.yaml"), *ROOT.glob("examples/*/*.yaml")]
+VALIDATOR = jsonschema.Draft7Validator(build_json_schema())
+
+
+@pytest.mark.parametrize("file", RECIPES, ids=lambda file: file.stem)
+def test_recipes_are_valid(file):
+    content = yaml_text.load(file.read_text(), str(file))
+    assert [error.message for error in VALIDATOR.iter_errors(content)] == []
+
+
+@pytest.mark.parametrize(
+    ("recipe", "place"),
+    [
+        ({"n_env": 3}, []),
+        ({"n_envs": 0}, ["n_envs"]),
+        ({"n_envs": "many"}, ["n_envs"]),
+        ({"algo": "pp"}, ["algo"]),
+        ({"algo_kwargs": {"tau": 0.1}}, ["algo_kwargs"]),  # ppo has none
+        ({"algo": "sac", "algo_kwargs": {"n_steps": "no"}}, ["algo_kwargs", "n_steps"]),
+    ],
+)
+def test_mistakes_are_found(recipe, place):
+    assert place in [list(error.path) for error in VALIDATOR.iter_errors(recipe)]
+
+
+def test_what_each_algorithm_has():
+    assert VALIDATOR.is_valid({"algo": "sac", "algo_kwargs": {"tau": 0.1}})
+    assert VALIDATOR.is_valid({"total_timesteps": "200_000"})
+    jsonschema.Draft7Validator.check_schema(VALIDATOR.schema)
+
+
+def test_the_command(rlctl):
+    assert json.loads(rlctl("recipe", "--schema").stdout) == VALIDATOR.schema
+    assert yaml_text.load(rlctl("recipe", "reach").stdout, "recipe")["algo"] == "ppo"
+    assert rlctl("recipe").stderr == "error: give a task, e.g. rlctl recipe reach; --schema needs none\n"
+
+
+def test_recipes_name_their_schema(tmp_path):
+    from rlctl.recipe.json_schema import FILE
+    from rlctl.recipe.recipe import Recipe
+    from rlctl.run.directory import RunDirectory
+
+    run = RunDirectory(tmp_path)
+    run.write_recipe(Recipe())
+    assert run.recipe_file.read_text().startswith(f"# yaml-language-server: $schema={FILE}\n")
+    assert run.recipe() == Recipe()
