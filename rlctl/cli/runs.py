@@ -60,13 +60,16 @@ def report_runs(
     pictures: Annotated[
         bool, typer.Option("--pictures/--no-pictures", help="Play episodes again, to draw them.")
     ] = True,
+    episodes: Annotated[
+        int, typer.Option(help="Episodes that each run plays to compare recipes; 0: do not compare.", min=0)
+    ] = 100,
 ) -> None:
-    """Write what came of runs as one file: result, curves, evaluations, diagnosis, pictures, how to reproduce it."""
+    """Write the result of runs as one file: verdict, curves, evaluations, diagnosis, pictures, how to reproduce it."""
     claim_stdout()
     from rlctl import output as streams
     from rlctl.runs.report.write import write_report
 
-    if (path := write_report(runs, format, output, pictures=pictures)) is not None:
+    if (path := write_report(runs, format, output, pictures=pictures, episodes=episodes)) is not None:
         streams.out().print(f"report: {path}")
 
 

@@ -68,7 +68,7 @@ class _World:
         markers = [np.asarray(position) for position in self._env.task.markers().values()]
         if self._followed is None:
             low, high = find_bounds(bodies, markers)
-            self._target, distance = (low + high) / 2, 1.15 * float(np.linalg.norm(high - low))
+            self._target, distance = (low + high) / 2, 1.5 * float(np.linalg.norm(high - low))
         else:
             low, high = find_bounds([self._followed[0]], [])
             self._target, distance = (low + high) / 2, 1.6 * float(np.linalg.norm(high - low))

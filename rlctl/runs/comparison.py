@@ -126,7 +126,22 @@ def compare(
     if len(texts) < 2:
         raise UsageError("give two or more to compare, the baseline first: rlctl runs compare A B")
     groups = [find_runs_of(text) for text in texts]
-    _refuse_unequal(texts, groups)
+    names = [
+        text.rstrip("/") if len(group) > 1 else str(group[0].path) for text, group in zip(texts, groups, strict=True)
+    ]
+    return compare_runs(names, groups, request, threshold, force=force)
+
+
+def compare_runs(
+    names: Sequence[str],
+    groups: Sequence[Sequence[RunDirectory]],
+    request: EvalRequest,
+    threshold: float | None = None,
+    *,
+    force: bool = False,
+) -> Comparison:
+    """Compare sides that have these names and runs; see `compare`."""
+    _refuse_unequal(names, groups)
     task = _common_task([run for group in groups for run in group], request.task)
     if request.task is None and not force:
         _refuse_changed([run for group in groups for run in group])
@@ -136,11 +151,11 @@ def compare(
     request = dataclasses.replace(request, spec=first.evaluation.spec)
     sides = [
         Side(
-            name=text.rstrip("/") if len(group) > 1 else str(group[0].path),
+            name=name,
             runs=[first if run is groups[0][0] else _evaluate(run, request, threshold) for run in group],
             mixed=find_mixed(own),
         )
-        for text, group, own in zip(texts, groups, recipes, strict=True)
+        for name, group, own in zip(names, groups, recipes, strict=True)
     ]
     baseline, *others = sides
     of_recipes = len(groups[0]) > 1
@@ -178,10 +193,10 @@ def _find_effective(recipe: Recipe, key: str, value: Any) -> Any:
     return value if field is None else field.default
 
 
-def _refuse_unequal(texts: Sequence[str], groups: list[list[RunDirectory]]) -> None:
+def _refuse_unequal(names: Sequence[str], groups: Sequence[Sequence[RunDirectory]]) -> None:
     sizes = {len(group) > 1 for group in groups}
     if len(sizes) > 1:
-        alone = next(text for text, group in zip(texts, groups, strict=True) if len(group) == 1)
+        alone = next(name for name, group in zip(names, groups, strict=True) if len(group) == 1)
         raise UsageError(
             f"{alone}: one run beside a group of seeds. A recipe is judged by several seeds: "
             "train more, or compare two single runs as policies"

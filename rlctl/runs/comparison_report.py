@@ -84,14 +84,23 @@ def _show_candidate(result: Comparison, candidate: Candidate) -> None:
     out = output.out()
     question = f"\n{candidate.side.name} against {result.baseline.name}: "
     out.print(Text.assemble(question, (candidate.verdict, "bold")))
-    for quantity, difference in candidate.differences.items():
-        out.print(f"  {quantity}: {format_difference(difference, as_percent=quantity == 'success')}")
-    if candidate.verdict is Verdict.CANNOT_TELL:
-        out.print(f"  {format_needed(candidate, len(result.candidates))}")
+    for line in describe_candidate(result, candidate):
+        out.print(f"  {line}")
     for key, (value, before) in candidate.recipe_changes.items():
         out.print(f"  recipe: {key}: {format_value(key, before)} -> {format_value(key, value)}")
     if not candidate.recipe_changes:
         out.print("  recipe: the same")
+
+
+def describe_candidate(result: Comparison, candidate: Candidate) -> list[str]:
+    """Return a line per difference, and how much data would decide where these cannot tell."""
+    lines = [
+        f"{quantity}: {format_difference(difference, as_percent=quantity == 'success')}"
+        for quantity, difference in candidate.differences.items()
+    ]
+    if candidate.verdict is Verdict.CANNOT_TELL:
+        lines.append(format_needed(candidate, len(result.candidates)))
+    return lines
 
 
 def format_difference(difference: Difference, *, as_percent: bool) -> str:

@@ -45,7 +45,7 @@ def describe_entry(entry: installed.TaskEntry, *, check: bool) -> ListedTask:
     score: dict[str, Any] = {}
     try:
         if problem is None:
-            summary, algo, score = _read_summary(entry), _read_algorithm(entry), _read_score(entry)
+            summary, algo, score = read_summary(entry), _read_algorithm(entry), _read_score(entry)
     except RlctlError as error:
         problem = str(error)
     except (OSError, UnicodeDecodeError) as error:
@@ -65,7 +65,7 @@ def describe_entry(entry: installed.TaskEntry, *, check: bool) -> ListedTask:
     )
 
 
-def _read_summary(entry: installed.TaskEntry) -> str:
+def read_summary(entry: installed.TaskEntry) -> str:
     """Read the first line of a task's docstring off its source; to import the task would take seconds."""
     file = entry.module_file
     return _read_class_summaries(file).get(entry.target.partition(":")[2], "") if file else ""

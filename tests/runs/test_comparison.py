@@ -12,6 +12,7 @@ from rlctl.recipe.sources import resolve
 from rlctl.run.train_request import TrainRequest
 from rlctl.runs.comparison import Candidate, Comparison, Side, compare, find_recipe_changes
 from rlctl.runs.comparison_report import as_json, format_needed
+from rlctl.runs.report.write import write_report
 from rlctl.runs.selection import find_runs_of
 from rlctl.runs.significance import Verdict
 from rlctl.training.request import run_training
@@ -126,3 +127,10 @@ def test_a_parameter_that_is_not_set_has_its_default():
     same = resolve("ant", None, {"algo": "sac", "algo_kwargs": {"learning_rate": 0.0003}})
     assert find_recipe_changes(higher, unset) == {"algo_kwargs.learning_rate": (0.002, 0.0003)}
     assert find_recipe_changes(same, unset) == {}
+
+
+def test_a_report_of_two_recipes_begins_with_the_verdict(root):
+    text = write_report([f"{root}/0.9*/Line/*"], "md", root / "report.md", episodes=2).read_text()
+    assert "\n**gamma 0.99 against gamma 0.9: cannot tell**\n" in text
+    assert text.index("cannot tell") < text.index("In the evaluations that chose them")
+    assert "- tested: success and return, p-values adjusted for all tests together; where all are equal, 5% of" in text

@@ -12,6 +12,7 @@ import pytest
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.recipe.sources import parse_settings, resolve
 from rlctl.run import robustness
+from rlctl.run.directory import RunDirectory
 from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.runs.report import content
 from rlctl.runs.report.write import write_report
@@ -35,6 +36,7 @@ def group(write_run):
             evals=((1000, 0.2, 1.0 + seed), (2000, 0.8 + 0.1 * seed, 9.0 + seed)),
             recipe_changes={"algo_kwargs.learning_rate": 0.001, "task.name": "<b>&"},
             versions={"rlctl": "0.1.0"},
+            started="2026-11-21T10:00:00+00:00",
         )
         rows = (f"{200 * step},{step},{step + seed},{step / 10},{step}\n" for step in range(1, 11))
         (folder / "metrics.csv").write_text(HEADER + "".join(rows))
@@ -50,8 +52,15 @@ def write(*runs, **options):
 def test_page_has_everything_and_needs_nothing_else(group):
     page = write(group[2])
     assert "In the evaluation that chose it the best policy succeeds in 100.0% of 100 episodes, with" in page
-    for plot in ("return over training steps", "success over training steps", "reward terms over training steps"):
+    for plot in ("Return over training steps", "Success rate over training steps", "Reward terms over training steps"):
         assert f'aria-label="{plot}"' in page
+        assert f">{plot}</text>" in page
+    assert ">60%</text>" in page  # of the axis, as in the table
+    assert "prefers-color-scheme: dark" in page
+    assert "#000000" not in page  # black lines and texts would be lost on a dark page
+    for name, text in (("Task", "reach: Bring the hand within"), ("Started", "2026-11-21 10:00 UTC")):
+        assert f"<dt>{name}</dt><dd>{text}" in page
+    assert "<dd>2,000 steps in 90 s</dd>" in page
     assert page.count("<svg") == page.count("</svg>") == 3
     assert "Nothing unusual in the records of this training." in page
     assert "rlctl train reach --seed 2 --set algo_kwargs.learning_rate=0.001" in page
@@ -80,6 +89,32 @@ def test_group_is_drawn_with_a_band(group):
     assert "the best policies of 3 trainings succeed in 90.0% of the episodes (80.0% to 100.0%)" in page
     assert "Mean of 3 trainings, from the lowest to the highest." in page
     assert "rlctl train reach --seeds 0,1,2 --set algo_kwargs.learning_rate=0.001" in page
+
+
+def write_recipes(group, **recipes):
+    for folder, settings in zip(group, recipes.values(), strict=True):
+        RunDirectory(folder).write_recipe(resolve("reach", None, {"algo_kwargs": settings}))
+
+
+def test_a_band_per_recipe(group):
+    write_recipes(group, a={"learning_rate": 0.001}, b={"learning_rate": 0.001}, c={"learning_rate": 0.002})
+    report = content.collect([str(run) for run in group])
+    assert [(recipe.name, len(recipe.runs)) for recipe in report.recipes] == [
+        ("learning_rate 0.001", 2),
+        ("learning_rate 0.002", 1),
+    ]
+    page = write(*group, episodes=0)
+    assert page.count(">learning_rate 0.001</text>") == 3  # legends of return and success, title of its terms
+    assert "learning_rate 0.002: In the evaluation that chose it" in page
+    assert "Mean of 1 to 2 trainings each, from the lowest to the highest." in page
+    assert "not compared: learning_rate 0.002: one run beside a group of seeds" in write(*group)
+
+
+def test_a_bad_result_is_not_called_usual(write_run):
+    run = write_run("reach/2026-11-21_10-00-00_s0", evals=((1000, 0.088, 1.0),))
+    page = write(run)
+    assert "Nothing unusual" not in page
+    assert "No known mistake shows in the records of this training, but the best policy succeeds in only 8.8%" in page
 
 
 def test_curves_of_seeds_are_averaged_at_common_steps():
@@ -111,8 +146,8 @@ def test_robustness_is_in_it_where_it_was_measured(group):
     assert "worst of 20 episodes each at mass 0.6: success 30.0%, return 1" in page
     (group[1] / "robustness.json").write_text("{")
     assert "robustness.json: damaged: " in write(group[1])
-    assert 'aria-label="success by mass"' in page
-    assert 'aria-label="success by mass and friction"' in page
+    assert 'aria-label="Success rate by mass"' in page
+    assert 'aria-label="Success rate by mass and friction"' in page
 
 
 def test_markdown_is_printed_for_pull_requests(group, rlctl):
@@ -165,7 +200,7 @@ def test_trained_run_has_pictures_of_its_best_and_worst_episode(rlctl, tmp_path)
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
-@pytest.mark.parametrize("width", [360, 1200])
+@pytest.mark.parametrize("width", [390, 1280])
 def test_browser_shows_it(group, tmp_path, width):
     write(group[0].parent, target=tmp_path / "all.html")
     command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]

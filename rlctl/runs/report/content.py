@@ -5,83 +5,160 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from rlctl.errors import ArtifactError, RlctlError, UsageError
-from rlctl.recipe.recipe import NOT_SET, find_mixed
+from rlctl.environments import installed
+from rlctl.errors import ArtifactError, RlctlError, UsageError, short_repr
+from rlctl.evaluation.evaluate import EvalRequest
+from rlctl.output import format_duration
+from rlctl.recipe.recipe import NOT_SET, Recipe
+from rlctl.recipe.stages import format_value
 from rlctl.run.episode import RecordedEpisode
+from rlctl.runs.comparison import Comparison, compare_runs, find_recipe_changes
 from rlctl.runs.diagnosis import Finding
 from rlctl.runs.selection import find_runs_of
 from rlctl.runs.show import RunDescription
 from rlctl.runs.summary import Rows, list_points
+from rlctl.tasks.listing import read_summary
+
+_SETTINGS_NAMED = 3  # in the name of a recipe
+_GOOD_SUCCESS = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class Report:
+class RecipeRuns:
+    """The runs of one recipe."""
+
+    name: str
+    """What distinguishes this recipe from the others; empty for a single one."""
+    runs: list[RunDescription]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunReport:
     """One run, or several of one task."""
 
-    runs: list[RunDescription]
+    recipes: list[RecipeRuns]
     notes: list[str]
     """What a reader must know of the runs themselves."""
 
     @property
-    def title(self) -> str:
-        first = self.runs[0].summary
-        seeds = ", ".join(str(each.summary.seed) for each in self.runs)
-        algorithms = " and ".join(dict.fromkeys(each.summary.algo for each in self.runs))
-        return f"{first.task}, {algorithms}, {'seed' if len(self.runs) == 1 else 'seeds'} {seeds}"
+    def runs(self) -> list[RunDescription]:
+        """All runs, recipe by recipe."""
+        return [run for recipe in self.recipes for run in recipe.runs]
 
     @property
-    def terms(self) -> list[str]:
-        """The names of the reward terms."""
-        columns = self.runs[0].metrics[0] if self.runs[0].metrics else {}
-        return [name.removeprefix("term/") for name in columns if name.startswith("term/")]
+    def title(self) -> str:
+        """Task, algorithms and seeds."""
+        first = self.runs[0].summary
+        numbers = dict.fromkeys(str(run.summary.seed) for run in self.runs)
+        algorithms = " and ".join(dict.fromkeys(run.summary.algo for run in self.runs))
+        return f"{first.task}, {algorithms}, {'seed' if len(numbers) == 1 else 'seeds'} {', '.join(numbers)}"
 
 
-def collect(texts: Sequence[str]) -> Report:
+def collect(texts: Sequence[str]) -> RunReport:
     """Read the runs that some words name.
 
     Raises `ArtifactError` for a damaged run and one that has nothing yet, `UsageError` for runs of several tasks.
     """
-    found = {run.path.resolve(): run for text in texts for run in find_runs_of(text)}
-    runs = [RunDescription(run) for run in found.values()]
-    for each in runs:
-        if each.summary.state == "damaged":
-            raise ArtifactError(f"{each.run.path}: damaged: {each.summary.reason}")
-    if len(tasks := {each.summary.task for each in runs}) > 1:
+    folders = {run.path.resolve(): run for text in texts for run in find_runs_of(text)}
+    runs = [RunDescription(run) for run in folders.values()]
+    for run in runs:
+        if run.summary.state == "damaged":
+            raise ArtifactError(f"{run.run.path}: damaged: {run.summary.reason}")
+    if len(tasks := {run.summary.task for run in runs}) > 1:
         raise UsageError(f"runs of several tasks, {', '.join(sorted(tasks))}: a report is of one")
-    if not any(each.metrics or each.evaluations for each in runs):
+    if not any(run.metrics or run.evaluations for run in runs):
         raise ArtifactError(f"{runs[0].run.path}: nothing to report yet: not one update is done")
-    return Report(runs, _find_notes(runs))
-
-
-def _find_notes(runs: Sequence[RunDescription]) -> list[str]:
-    notes = [
-        f"{each.summary.name} is {each.summary.state_text}, {each.summary.steps or 0:,} steps so far"
-        for each in runs
-        if each.summary.state in ("running", "stopped")
-    ]
-    for each in runs:
-        warnings = [each.summary.state_text] if each.summary.state == "failed" else each.warnings
-        notes += [f"{each.summary.name}: {warning}" for warning in warnings]
-    notes += [f"{each.summary.name} has no evaluation yet" for each in runs if not each.evaluations]
+    notes = [note for run in runs for note in _find_notes(run)]
     try:
-        recipes = [each.run.recipe() for each in runs]
+        return RunReport(_group_by_recipe(runs), notes)
     except RlctlError as error:
-        return [*notes, f"a recipe cannot be read: {error}"]
-    keys = find_mixed(recipes)
-    return [*notes, f"the recipes differ: {', '.join(keys)}"] if keys else notes
+        return RunReport([RecipeRuns("", runs)], [*notes, f"a recipe cannot be read: {error}"])
 
 
-def summarize_result(report: Report) -> str:
-    """Return the result as a sentence.
+def _find_notes(run: RunDescription) -> list[str]:
+    name, notes = run.summary.name, []
+    if run.summary.state in ("running", "stopped"):
+        notes.append(f"{name} is {run.summary.state_text}, {run.summary.steps or 0:,} steps so far")
+    warnings = [run.summary.state_text] if run.summary.state == "failed" else run.warnings
+    notes += [f"{name}: {warning}" for warning in warnings]
+    return notes if run.evaluations else [*notes, f"{name} has no evaluation yet"]
+
+
+def _group_by_recipe(runs: Sequence[RunDescription]) -> list[RecipeRuns]:
+    """Put runs together that differ in nothing but the seed; raises `RlctlError` for a recipe that cannot be read."""
+    groups: list[tuple[Recipe, list[RunDescription]]] = []
+    for run in runs:
+        recipe = run.run.recipe()
+        same = next((group for other, group in groups if not find_recipe_changes(recipe, other)), None)
+        if same is None:
+            groups.append((recipe, [run]))
+        else:
+            same.append(run)
+    first = groups[0][0]
+    changes = [find_recipe_changes(recipe, first) for recipe, _ in groups]
+    baseline = {key: before for change in changes for key, (_, before) in change.items()}
+    return [
+        RecipeRuns(_name_recipe(baseline | {key: value for key, (value, _) in change.items()}), group)
+        for change, (_, group) in zip(changes, groups, strict=True)
+    ]
+
+
+def _name_recipe(settings: Mapping[str, Any]) -> str:
+    """Return `learning_rate 0.001, gamma 0.98`; of many settings the first."""
+    names = [
+        f"{key.removeprefix('algo_kwargs.')} {short_repr(format_value(key, value), 30)}"
+        for key, value in settings.items()
+    ]
+    return ", ".join(names[:_SETTINGS_NAMED]) + (", ..." if len(names) > _SETTINGS_NAMED else "")
+
+
+def compare_recipes(report: RunReport, episodes: int) -> Comparison | None:
+    """Evaluate and compare the recipes of a report, the first as the baseline; None for a single recipe.
+
+    Raises `RlctlError` where they cannot be compared.
+    """
+    if len(report.recipes) == 1:
+        return None
+    groups = [[run.run for run in recipe.runs] for recipe in report.recipes]
+    return compare_runs([recipe.name for recipe in report.recipes], groups, EvalRequest(None, episodes=episodes))
+
+
+def list_facts(report: RunReport) -> list[tuple[str, str]]:
+    """Return what, when, how long and where was trained, with names."""
+    summaries = [run.summary for run in report.runs]
+    task = summaries[0].task
+    entry = installed.find(task)
+    summary = read_summary(entry) if entry else ""
+    hosts = dict.fromkeys(f"{run.status.get('host', '')}, {run.status.get('device', '')}" for run in report.runs)
+    started = sorted(summary.started[:16].replace("T", " ") for summary in summaries if summary.started)
+    steps = sorted({summary.steps or 0 for summary in summaries})
+    of_steps = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
+    seconds = format_duration(sum(summary.seconds or 0.0 for summary in summaries))
+    trained = f"{of_steps} steps in {seconds}"
+    if len(summaries) > 1:
+        trained = f"{len(summaries)} trainings, {of_steps} steps each, {seconds} together"
+    versions = ", ".join(f"{name} {version}" for name, version in summaries[0].versions.items())
+    facts = {
+        "Task": f"{task}: {summary}" if summary else task,
+        "Started": " to ".join(dict.fromkeys((started[0], started[-1]))) + " UTC" if started else "",
+        "Trained": trained,
+        "Machine": "; ".join(host.strip(", ") for host in hosts),
+        "Versions": versions,
+    }
+    return [(name, text) for name, text in facts.items() if text]
+
+
+def summarize_result(runs: Sequence[RunDescription]) -> str:
+    """Return the result of the runs of a recipe as a sentence.
 
     It says where its figures come from: the best of several evaluations is better than new episodes will be.
     """
-    scored = [each for each in report.runs if each.summary.best_return is not None]
+    scored = [run for run in runs if run.summary.best_return is not None]
     if not scored:
         return "No evaluation yet."
     if len(scored) == 1:
@@ -91,10 +168,10 @@ def summarize_result(report: Report) -> str:
         verb = "has"
         if summary.best_success is not None:
             verb = f"succeeds in {summary.best_success:.1%} of {count} episodes, with"
-        of_return = f"a mean return of {summary.best_return:.4g}, at step {summary.best_step:,}"
+        of_return = f"a mean return of {summary.best_return:.4g}, at step {summary.best_step or 0:,}"
         return f"In the evaluation that chose it the best policy {verb} {of_return}."
-    successes = [each.summary.best_success for each in scored if each.summary.best_success is not None]
-    returns = [each.summary.best_return for each in scored if each.summary.best_return is not None]
+    successes = [run.summary.best_success for run in scored if run.summary.best_success is not None]
+    returns = [run.summary.best_return for run in scored if run.summary.best_return is not None]
     of_returns = f"a mean return of {np.mean(returns):.4g} ({min(returns):.4g} to {max(returns):.4g})"
     start = f"In the evaluations that chose them the best policies of {len(scored)} trainings"
     if len(successes) < len(scored):
@@ -103,7 +180,19 @@ def summarize_result(report: Report) -> str:
     return f"{start} succeed in {rates}, with {of_returns}."
 
 
-def collect_findings(report: Report) -> list[tuple[Finding, list[str]]]:
+def describe_absence(report: RunReport) -> str:
+    """Return what a report without findings says: that nothing is known to be wrong, but not that a result is good."""
+    which = "this training" if len(report.runs) == 1 else "these trainings"
+    rates = [run.summary.best_success for run in report.runs if run.summary.best_success is not None]
+    if not rates or (best := max(rates)) >= _GOOD_SUCCESS:
+        return f"Nothing unusual in the records of {which}."
+    return (
+        f"No known mistake shows in the records of {which}, but the best policy succeeds in only {best:.1%} of the "
+        "episodes: train longer, make the task easier first (stages), or look at an episode with rlctl replay."
+    )
+
+
+def collect_findings(report: RunReport) -> list[tuple[Finding, list[str]]]:
     """Return what the runs' records show, each finding once, with its evidence; of several runs with their seeds."""
     found: dict[str, tuple[Finding, list[str]]] = {}
     for run in report.runs:
@@ -114,38 +203,40 @@ def collect_findings(report: Report) -> list[tuple[Finding, list[str]]]:
     return list(found.values())
 
 
-def list_commands(report: Report) -> list[str]:
+def list_commands(report: RunReport) -> list[str]:
     """Return the commands that train the same again: one for all seeds of a recipe."""
     seeds: dict[tuple[str, ...], list[int]] = {}
-    for each in report.runs:
+    for run in report.runs:
         changes = [
             f"{key}={value if isinstance(value, str) else json.dumps(value)}"
-            for key, value in each.summary.changes.items()
+            for key, value in run.summary.changes.items()
             if value != NOT_SET  # another algorithm's, which its own `algo` leaves out
         ]
-        source = each.status.get("from")
+        source = run.status.get("from")
         start = ["--from", str(source.get("policy"))] if isinstance(source, dict) else []
         options = (*start, *(part for change in changes for part in ("--set", change)))
-        seeds.setdefault(options, []).append(each.summary.seed or 0)
+        seeds.setdefault(options, []).append(run.summary.seed or 0)
     task = report.runs[0].summary.task
     return [
         shlex.join(
-            ["rlctl", "train", task, "--seed" if len(each) == 1 else "--seeds", ",".join(map(str, each)), *options]
+            ["rlctl", "train", task, "--seed" if len(own) == 1 else "--seeds", ",".join(map(str, own)), *options]
         )
-        for options, each in seeds.items()
+        for options, own in seeds.items()
     ]
 
 
-def choose_episodes(report: Report) -> list[tuple[str, RecordedEpisode]]:
+def choose_episodes(report: RunReport) -> list[tuple[str, RecordedEpisode]]:
     """Return the best and the worst recorded episode of the best evaluation there are episodes of, with their names."""
-    episodes = max(report.runs, key=lambda each: each.summary.score).episodes
-    steps = max((_trained_steps(each) for each in episodes), default=-1)
-    last = [each for each in episodes if _trained_steps(each) == steps]
+    episodes = max(report.runs, key=lambda run: run.summary.score).episodes
+    steps = max((_trained_steps(episode) for episode in episodes), default=-1)
+    last = [episode for episode in episodes if _trained_steps(episode) == steps]
     if not last:
         return []
-    ordered = sorted(last, key=lambda each: (each.info.success is True, each.info.total_reward))
+    ordered = sorted(last, key=lambda episode: (episode.info.success is True, episode.info.total_reward))
     named = [("best", ordered[-1]), ("worst", ordered[0])] if len(ordered) > 1 else [("one", ordered[0])]
-    return [(f"The {name} recorded episode of the last evaluation: {_outcome(each)}", each) for name, each in named]
+    return [
+        (f"The {name} recorded episode of the last evaluation: {_outcome(episode)}", episode) for name, episode in named
+    ]
 
 
 def _trained_steps(episode: RecordedEpisode) -> int:
@@ -163,7 +254,7 @@ def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[s
 
     All of one shape, at most (points,); a single table gives its own rows, averaged where there are more.
     """
-    curves = [np.array(found) for rows in tables if (found := list_points(rows, column))]
+    curves = [np.array(curve) for rows in tables if (curve := list_points(rows, column))]
     if not curves:
         return None
     if len(curves) == 1:

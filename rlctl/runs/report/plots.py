@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlctl.run.robustness import PushTest, RobustnessMap
-from rlctl.runs.report.content import Report, mean_curve
+from rlctl.runs.report.content import RecipeRuns, RunReport, mean_curve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,38 +26,55 @@ _STYLE: dict[Any, Any] = {
     "grid.alpha": 0.3,
 }
 _LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8}
+_NO_METADATA: dict[Any, Any] = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+_TITLES = {"return": "Return", "success": "Success rate"}
+_UNITS = {"return": "return of an episode", "success": "success rate"}
 
 
-def plot_learning(report: Report, column: str) -> str | None:
+def plot_learning(report: RunReport, column: str) -> str | None:
     """Return the curve of a quantity over training steps, with evaluations; None where there is none.
 
-    Several runs are drawn as their mean, with a band from the lowest to the highest.
+    Several runs of a recipe are drawn as their mean, with a band from the lowest to the highest.
     """
-    training = mean_curve([each.metrics for each in report.runs], column)
-    evaluated = mean_curve([each.evaluations for each in report.runs], column)
-    if training is None and evaluated is None:
-        return None
     figure, axes = _make_figure()
-    for curve, label, style in ((training, "training", {}), (evaluated, "evaluations", {"marker": "o", "ms": 3})):
-        if curve is not None:
-            _draw_curve(axes, curve, label, style)
+    for number, recipe in enumerate(report.recipes):
+        training = mean_curve([run.metrics for run in recipe.runs], column)
+        evaluated = mean_curve([run.evaluations for run in recipe.runs], column)
+        color = {"color": f"C{number}"} if recipe.name else {}  # a colour is a recipe
+        if training is not None:
+            _draw_curve(axes, training, recipe.name or "training", color)
+        if evaluated is not None:
+            line = {"linestyle": "none", **color} if recipe.name else {}
+            _draw_curve(axes, evaluated, "" if recipe.name else "evaluations", {"marker": "o", "ms": 3, **line})
+    if not axes.lines:
+        return None
     if column == "success":
-        axes.set_ylim(-0.03, 1.03)
+        _scale_rates(axes)
     axes.legend(loc="best", **_LEGEND)
-    return _finish(figure, axes, "steps", column, f"{column} over training steps")
+    return _finish(figure, axes, "training steps", _UNITS[column], f"{_TITLES[column]} over training steps")
 
 
-def plot_terms(report: Report) -> str | None:
-    """Return the weighted reward terms over training steps; None where there are none."""
-    curves = {name: mean_curve([each.metrics for each in report.runs], f"term/{name}") for name in report.terms}
-    drawn = {name: curve for name, curve in curves.items() if curve is not None}
+def plot_terms(recipe: RecipeRuns) -> str | None:
+    """Return the weighted reward terms of a recipe over training steps; None where there are none."""
+    columns = dict.fromkeys(name for run in recipe.runs for name in (run.metrics[0] if run.metrics else {}))
+    names = [name for name in columns if name.startswith("term/")]
+    curves = {name: mean_curve([run.metrics for run in recipe.runs], name) for name in names}
+    drawn = {name.removeprefix("term/"): curve for name, curve in curves.items() if curve is not None}
     if not drawn:
         return None
     figure, axes = _make_figure()
     for name, curve in drawn.items():
         _draw_curve(axes, curve, name, {"linewidth": 1.2})
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), **_LEGEND)
-    return _finish(figure, axes, "steps", "sum per episode", "reward terms over training steps")
+    title = "Reward terms over training steps" + (f"\n{recipe.name}" if recipe.name else "")
+    return _finish(figure, axes, "training steps", "weighted sum per episode", title)
+
+
+def _scale_rates(axes: Axes) -> None:
+    from matplotlib.ticker import PercentFormatter
+
+    axes.set_ylim(-0.03, 1.03)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
 
 
 def _draw_curve(axes: Axes, curve: dict[str, Any], label: str, style: dict[str, Any]) -> None:
@@ -83,13 +100,13 @@ def plot_robustness(result: RobustnessMap) -> str:
     for index, cell in enumerate(result.cells):
         if cell.nominal:
             axes.plot(index % shape[1], index // shape[1], marker="s", ms=9, mfc="none", mec="white", mew=1.5)
-    figure.colorbar(image, label=quantity)
-    return _finish(figure, axes, columns.name, rows.name, f"{quantity} by {rows.name} and {columns.name}")
+    figure.colorbar(image, label=_UNITS[quantity], format="{x:.0%}" if quantity == "success" else None)
+    return _finish(figure, axes, columns.name, rows.name, f"{_TITLES[quantity]} by {rows.name} and {columns.name}")
 
 
 def _plot_varied(result: RobustnessMap, quantity: str) -> str:
     (axis,) = result.axes
-    intervals = [each.success_interval if quantity == "success" else each.return_interval for each in result.cells]
+    intervals = [cell.success_interval if quantity == "success" else cell.return_interval for cell in result.cells]
     low, high = np.array(intervals, np.float64).T
     means = [_value(cell, quantity) for cell in result.cells]
     curve = {"steps": axis.values, "mean": means, "low": low, "high": high, "count": len(means)}
@@ -98,17 +115,19 @@ def _plot_varied(result: RobustnessMap, quantity: str) -> str:
     if axis.nominal is not None:
         axes.axvline(axis.nominal, linestyle=":", color="gray", label="nominal")
         axes.legend(loc="best", **_LEGEND)
-    return _finish(figure, axes, axis.name, quantity, f"{quantity} by {axis.name}")
+    if quantity == "success":
+        _scale_rates(axes)
+    return _finish(figure, axes, axis.name, _UNITS[quantity], f"{_TITLES[quantity]} by {axis.name}")
 
 
 def plot_push(test: PushTest) -> str:
     """Return how many episodes go well by the push."""
     figure, axes = _make_figure()
-    axes.plot([each.impulse for each in test.levels], [each.held for each in test.levels], marker="o", ms=3)
+    axes.plot([level.impulse for level in test.levels], [level.held for level in test.levels], marker="o", ms=3)
     if test.threshold is not None:
         axes.axvline(test.threshold, linestyle=":", color="gray")
-    axes.set_ylim(-0.03, 1.03)
-    return _finish(figure, axes, "push [N s]", test.measure, f"{test.measure} by push")
+    _scale_rates(axes)
+    return _finish(figure, axes, "push [N s]", f"episodes: {test.measure}", f"{test.measure.capitalize()} by push")
 
 
 def _value(cell: Any, quantity: str) -> float:
@@ -131,12 +150,15 @@ def _finish(figure: Figure, axes: Axes, x: str, y: str, title: str) -> str:
 
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-    if x == "steps":
+    axes.set_title(title, loc="left", fontsize=9, fontweight="bold")
+    if x == "training steps":
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     file = io.StringIO()
     with matplotlib.rc_context(_STYLE):
-        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    svg = file.getvalue()[file.getvalue().index("<svg") :]
+        figure.savefig(
+            file, format="svg", transparent=True, metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
+        )
+    svg = file.getvalue()[file.getvalue().index("<svg") :].replace("#000000", "currentColor")  # which is of the page
     # The page scales it; a name is for those who cannot see it.
     name = title.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     return re.sub(

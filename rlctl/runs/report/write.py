@@ -9,9 +9,11 @@ from typing import Any, Literal
 
 from rlctl import output
 from rlctl.errors import RlctlError
+from rlctl.runs.comparison_report import describe_candidate, describe_tests
 from rlctl.runs.report import content
-from rlctl.runs.report.content import Report
+from rlctl.runs.report.content import RunReport
 from rlctl.runs.show import describe_robustness, tabulate
+from rlctl.runs.summary import Rows
 from rlctl.storage import files
 
 DEFAULT_FILE = Path("report.html")
@@ -21,15 +23,22 @@ _PICTURES = 6
 
 
 def write_report(
-    runs: Sequence[str], form: Literal["html", "md"] = "html", target: Path | None = None, *, pictures: bool = True
+    runs: Sequence[str],
+    form: Literal["html", "md"] = "html",
+    target: Path | None = None,
+    *,
+    pictures: bool = True,
+    episodes: int = 100,
 ) -> Path | None:
     """Write a report and return its file, by default report.html; None for Markdown that was printed.
+
+    Runs of several recipes are compared first, for which each plays `episodes`; with 0 they are not.
 
     Raises `UsageError` for runs of several tasks, `ArtifactError` for a damaged run or one that has nothing yet.
     """
     report = content.collect(runs)
     is_html = form == "html"
-    text = _render(f"report.{form}.jinja", is_html, _values(report, is_html, pictures))
+    text = _render(f"report.{form}.jinja", is_html, _values(report, is_html, pictures, episodes))
     if target is None and not is_html:
         output.results().write(output.escape_controls(text))
         return None
@@ -55,44 +64,103 @@ def _escape_html(value: Any) -> Any:
     return value.replace("&", "&amp;").replace("<", "&lt;")
 
 
-def _values(report: Report, is_html: bool, pictures: bool) -> dict[str, Any]:
+def _values(report: RunReport, is_html: bool, pictures: bool, episodes: int) -> dict[str, Any]:
     first = report.runs[0]
+    verdicts, notes = _compare(report, episodes)
+    several = len(report.recipes) > 1
     values = {
         "title": report.title,
-        "result": content.summarize_result(report),
-        "notes": report.notes,
+        "verdicts": verdicts,
+        "results": [
+            f"{recipe.name}: {content.summarize_result(recipe.runs)}"
+            if several
+            else content.summarize_result(recipe.runs)
+            for recipe in report.recipes
+        ],
+        "facts": content.list_facts(report),
+        "notes": [*notes, *report.notes],
         "findings": content.collect_findings(report),
-        "runs": [(each.summary.name, *tabulate(each.evaluations)) for each in report.runs],
+        "absence": content.describe_absence(report),
+        "runs": [
+            (f"{run.summary.name}{recipe.name and f' ({recipe.name})'}", _split_terms(run.evaluations))
+            for recipe in report.recipes
+            for run in recipe.runs
+        ],
         "robustness": [
-            line for each in report.runs if each.robustness is not None for line in describe_robustness(each.robustness)
+            line for run in report.runs if run.robustness is not None for line in describe_robustness(run.robustness)
         ],
         "commands": content.list_commands(report),
-        "versions": ", ".join(f"{name} {version}" for name, version in first.summary.versions.items()),
+        "recipe_name": report.recipes[0].name,
         "recipe": first.run.recipe_file.read_text(encoding="utf-8", errors="replace").strip()
         if first.run.recipe_file.is_file()
         else "(missing)",
     }
-    return {**values, **_drawings(report, pictures)} if is_html else values
+    return {**values, **_draw(report, pictures)} if is_html else values
 
 
-def _drawings(report: Report, pictures: bool) -> dict[str, Any]:
+def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, list[str]]], list[str]]:
+    """Return per candidate the question, the verdict and what speaks for it; and notes, as why none was compared."""
+    if not episodes:
+        return [], []
+    try:
+        result = content.compare_recipes(report, episodes)
+    except RlctlError as error:
+        return [], [f"not compared: {str(error).splitlines()[0]}"]
+    if result is None:
+        return [], []
+    verdicts = [
+        (
+            f"{candidate.side.name} against {result.baseline.name}",
+            str(candidate.verdict),
+            [*describe_candidate(result, candidate), describe_tests(result)],
+        )
+        for candidate in result.candidates
+    ]
+    worlds = result.world_differences
+    return verdicts, [f"all were compared with the first's {', '.join(worlds)}"] if worlds else []
+
+
+def _split_terms(rows: Rows) -> list[tuple[list[str], list[list[str]]]]:
+    """Return the table of evaluations, and that of the reward terms if there are any, as columns and cells."""
+    columns, cells = tabulate(rows)
+    main = [index for index, name in enumerate(columns) if not name.startswith("term/")]
+    terms = [index for index, name in enumerate(columns) if name.startswith("term/") or name == "steps"]
+    names = [name.removeprefix("term/") for name in columns]
+    return [
+        ([names[index] for index in chosen], [[row[index] for index in chosen] for row in cells])
+        for chosen in (main, terms)
+        if len(chosen) > 1
+    ]
+
+
+def _draw(report: RunReport, pictures: bool) -> dict[str, Any]:
     from rlctl.runs.report import plots
 
-    learning = [plots.plot_learning(report, "return"), plots.plot_learning(report, "success"), plots.plot_terms(report)]
-    measured = [each.robustness for each in report.runs if each.robustness is not None]
-    maps = [plots.plot_robustness(each) for result in measured for each in result.maps if len(each.axes) <= 2]
+    learning = [plots.plot_learning(report, name) for name in ("return", "success")]
+    learning += [plots.plot_terms(recipe) for recipe in report.recipes]
+    measured = [run.robustness for run in report.runs if run.robustness is not None]
+    maps = [plots.plot_robustness(varied) for result in measured for varied in result.maps if len(varied.axes) <= 2]
     maps += [plots.plot_push(result.push) for result in measured if result.push is not None]
     return {
         "learning": [plot for plot in learning if plot is not None],
-        "band": f"Mean of {len(report.runs)} trainings, from the lowest to the highest."
-        if len(report.runs) > 1
-        else "",
+        "band": _describe_bands(report),
         "maps": maps,
         "pictures": list(_take_pictures(report)) if pictures else [],
     }
 
 
-def _take_pictures(report: Report) -> Iterator[tuple[str, list[tuple[int, str]]]]:
+def _describe_bands(report: RunReport) -> str:
+    counts = [len(recipe.runs) for recipe in report.recipes]
+    of_recipes = ""
+    if len(counts) > 1:
+        of_recipes = "A colour is a recipe: lines are training episodes, points are evaluations. "
+    if max(counts) == 1:
+        return of_recipes
+    count = str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
+    return f"{of_recipes}Mean of {count} trainings{' each' if of_recipes else ''}, from the lowest to the highest."
+
+
+def _take_pictures(report: RunReport) -> Iterator[tuple[str, list[tuple[int, str]]]]:
     from rlctl.replaying.view import take_pictures
 
     for name, episode in content.choose_episodes(report):
