@@ -65,7 +65,7 @@ def scramble(folder, random):
 
 
 @pytest.mark.parametrize("seed", range(10))
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_whatever_a_run_holds_it_is_shown(write_run, seed, tmp_path):
     folder = write_run(
         "reach/2026-11-21_10-00-00_s0", steps=1000, best_step=1000, started="2026-11-21T10:00:00", error="",
