@@ -20,12 +20,12 @@ from rlctl.rollout.collect import Episode
 from rlctl.runs.diagnosis import Grade, diagnose
 from rlctl.runs.summary import read_table
 from rlctl.training import measurements, status
+from rlctl.training.checkpoints import Saver
 from rlctl.training.curriculum import Curriculum, begin_next_episodes
 from rlctl.training.display import Display, format_score
-from rlctl.training.evaluation import Evaluator
+from rlctl.training.evaluation_episodes import Evaluator
 from rlctl.training.progress import Progress
 from rlctl.training.rollouts import Rollouts
-from rlctl.training.saving import Saver
 from rlctl.training.snapshot import check_finite, pack
 
 _FINAL_EPISODES = 30

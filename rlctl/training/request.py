@@ -12,8 +12,8 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import status
 from rlctl.training.display import make_display
-from rlctl.training.prepare import prepare
 from rlctl.training.progress import Progress
+from rlctl.training.setup import prepare
 from rlctl.training.signals import StopSignals
 from rlctl.training.start import Start, find_start
 

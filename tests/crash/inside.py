@@ -21,10 +21,10 @@ def run(arguments, plan):
     if plan.get("real_workers"):
         set_start(subprocess.Popen)
     from rlctl.storage import files
-    from rlctl.training import saving
+    from rlctl.training import checkpoints
 
-    saving.CHECKPOINT_TIME_SHARE = plan.get("time_for_checkpoints", 1e9)  # at every boundary
-    _announce(saving.Saver, log)
+    checkpoints.CHECKPOINT_TIME_SHARE = plan.get("time_for_checkpoints", 1e9)  # at every boundary
+    _announce(checkpoints.Saver, log)
     files.os = FaultyOs(log, **plan.get("disk", {}))
     files.shutil = FaultyShutil(files.os)
     if "outside_change" in plan:

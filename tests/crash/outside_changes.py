@@ -15,9 +15,9 @@ def begin(what, after=0, until=None):
     if what in CLOCKS:
         CLOCKS[what]()
         return
-    from rlctl.training import saving
+    from rlctl.training import checkpoints
 
-    original = saving.Saver.checkpoint
+    original = checkpoints.Saver.checkpoint
 
     @functools.wraps(original)
     def checkpoint(saver, pack, progress, **options):
@@ -29,7 +29,7 @@ def begin(what, after=0, until=None):
             CHANGES[what](RunDirectory(saver.metrics.path.parent))
         return saved
 
-    saving.Saver.checkpoint = checkpoint
+    checkpoints.Saver.checkpoint = checkpoint
 
 
 def edited(file, change):

@@ -7,7 +7,7 @@ from rlctl.recipe import recipe
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
-from rlctl.training import saving
+from rlctl.training import checkpoints
 from rlctl.training.request import TrainResult, run_training
 
 ENVS = Path(__file__).with_name("envs.py")
@@ -61,7 +61,7 @@ def small_ppo() -> dict:
 @pytest.fixture
 def every_boundary(monkeypatch):
     """Write a checkpoint at every boundary, whatever it costs."""
-    monkeypatch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e9)
+    monkeypatch.setattr(checkpoints, "CHECKPOINT_TIME_SHARE", 1e9)
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ class Mine(Staged):
 @pytest.fixture
 def kill_at(monkeypatch):
     """End a training right after the checkpoint of a step."""
-    from rlctl.training.saving import Saver
+    from rlctl.training.checkpoints import Saver
 
     def kill(step):
         original = Saver.checkpoint
@@ -233,7 +233,7 @@ def test_an_import_changes_nothing_of_ours(train, intrusive):
 
 
 def test_an_import_does_not_take_signals_from_a_training(train, intrusive, monkeypatch):
-    from rlctl.training.saving import Saver
+    from rlctl.training.checkpoints import Saver
 
     before = signal.getsignal(signal.SIGTERM)
     original = Saver.checkpoint

@@ -4,7 +4,7 @@ import pytest
 
 from rlctl.recipe import recipe as recipes
 from rlctl.rollout.workers import available_cores
-from rlctl.training import saving
+from rlctl.training import checkpoints
 from rlctl.training.vec_env import WorkerVecEnv
 from tests.training.comparing import Killed, assert_same_run, rows
 from tests.training.conftest import FAULTY, SMALL
@@ -149,7 +149,7 @@ def newest_other_than(run):
     ("case", "steps", "evaluated"), [("ppo", 40, "128"), pytest.param("dqn", 20, "64", marks=pytest.mark.slow)]
 )
 def test_an_evaluation_after_the_last_checkpoint(train, resume, kill_after, monkeypatch, case, steps, evaluated):
-    monkeypatch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e-9)
+    monkeypatch.setattr(checkpoints, "CHECKPOINT_TIME_SHARE", 1e-9)
     env, given = CASES[case]
     whole = train(env, given).run
     undo = kill_after(steps)

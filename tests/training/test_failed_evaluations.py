@@ -83,7 +83,7 @@ def test_none_ever_succeeded(train, settings, tmp_path, rlctl):
 
 
 def test_a_resume_remembers(train, resume, settings, tmp_path, monkeypatch):
-    from rlctl.training.saving import Saver
+    from rlctl.training.checkpoints import Saver
 
     def killed(saver, *arguments, **options):
         saved = original(saver, *arguments, **options)

@@ -9,7 +9,7 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.rollout import workers
-from rlctl.training import checkpoint, saving
+from rlctl.training import checkpoint, checkpoints
 from tests.training import faulty_envs
 from tests.training.comparing import assert_same_run
 from tests.training.conftest import FAULTY as ENVS
@@ -38,7 +38,7 @@ def whole(tmp_path_factory):
 
     root = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(saving, "CHECKPOINT_TIME_SHARE", 1e9)
+        patch.setattr(checkpoints, "CHECKPOINT_TIME_SHARE", 1e9)
         return run_training(
             TrainRequest(f"{ENVS}:Faulty", settings={**TINY, "task": {"fault": ""}}, root=root, check=False)
         ).run

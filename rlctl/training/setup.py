@@ -29,8 +29,8 @@ from rlctl.training.start import Start
 
 if TYPE_CHECKING:
     from rlctl.training.checkpoint import Checkpoints
+    from rlctl.training.checkpoints import Saver
     from rlctl.training.loop import Learner, TrainingLoop
-    from rlctl.training.saving import Saver
 
 
 _CHECK_BUDGET_S = 2.0
@@ -51,7 +51,7 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
         checked = None
         if request.check and start.run is None:
             checked = _begin_check(specs[-1], request.env_timeout_s)
-        from rlctl.training.evaluation import Evaluator
+        from rlctl.training.evaluation_episodes import Evaluator
         from rlctl.training.loop import TrainingLoop
 
         learner = _build_learner(start, specs, workers, display)
@@ -127,7 +127,7 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
 def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Saver:
     """Restore the checkpoint, if there is one, and return what writes from now on."""
     from rlctl.training.checkpoint import Checkpoints
-    from rlctl.training.saving import Saver, cut_back
+    from rlctl.training.checkpoints import Saver, cut_back
     from rlctl.training.tensorboard import make_logger
 
     model = learner.rollouts.model

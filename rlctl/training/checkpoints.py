@@ -12,7 +12,7 @@ from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
 from rlctl.storage.table import Table
 from rlctl.training.checkpoint import Checkpoints
-from rlctl.training.evaluation import remove_after
+from rlctl.training.evaluation_episodes import remove_after
 from rlctl.training.progress import Progress
 
 CHECKPOINT_TIME_SHARE = 0.02

@@ -24,7 +24,7 @@ from rlctl.storage import files
 from rlctl.version import collect_versions
 
 if TYPE_CHECKING:
-    from rlctl.training.saving import Saver
+    from rlctl.training.checkpoints import Saver
 
 
 _POLICY = "training step "
