@@ -70,8 +70,8 @@ class Checkpoint:
         return self.state.progress
 
 
-class Checkpoints:
-    """Writes the checkpoints of a training, and restores one."""
+class CheckpointFolders:
+    """Writes the folders of a run's checkpoints, and restores what one of them holds."""
 
     def __init__(self, run: RunDirectory, model: BaseAlgorithm, env: WorkerVecEnv, keep: int) -> None:
         self._run = run

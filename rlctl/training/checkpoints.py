@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile
 from rlctl.run.directory import RunDirectory
+from rlctl.run.episode import load_episode
 from rlctl.storage import files
 from rlctl.storage.table import Table
-from rlctl.training.checkpoint import Checkpoints
-from rlctl.training.evaluation_episodes import remove_after
-from rlctl.training.progress import Progress
+from rlctl.training.checkpoint import Checkpoint, CheckpointFolders, find_differences
+from rlctl.training.learner import Learner
+from rlctl.training.snapshot import check_finite
 
+STEP_LABEL = "training step "
+"""What a kept episode was played with, for people: followed by the number."""
 CHECKPOINT_TIME_SHARE = 0.02
 """Part of the training's time that checkpoints may take."""
 
 
-class Saver:
+class Checkpoints:
     """Writes tables, policies and checkpoints. What cannot be written costs a warning and is tried again."""
 
-    def __init__(self, run: RunDirectory, checkpoints: Checkpoints, warn: Callable[[str], None]) -> None:
+    def __init__(self, learner: Learner, run: RunDirectory, keep: int, warn: Callable[[str], None]) -> None:
+        """Write into the folder of a run, which keeps the newest `keep` checkpoints; `warn` shows a message."""
         self.run = run
         self.metrics = Table(run.metrics_file)
         self.evals = Table(run.evals_file)
@@ -30,9 +34,10 @@ class Saver:
         """Step of the last checkpoint that is whole on the disk."""
         self.problem = ""
         """What could not be written the last time, and why."""
-        self._checkpoints = checkpoints
+        self._learner = learner
+        self._folders = CheckpointFolders(run, learner.model, learner.env, keep)
         self._warn = warn
-        self._next_checkpoint = time.monotonic()
+        self._next_s = time.monotonic()
         self._uncounted_checkpoints = 1
         """Checkpoints that come whether they are due or not: the last one."""
         self._reported: set[str] = set()
@@ -80,80 +85,88 @@ class Saver:
             self._unsaved_best.write(self.run.best_policy)
         self._unsaved_best = None
 
-    def checkpoint_is_due(self) -> bool:
-        """Whether the time that checkpoints may take allows one."""
-        return time.monotonic() >= self._next_checkpoint
+    def is_due(self) -> bool:
+        """Say whether the time that checkpoints may take allows one."""
+        return time.monotonic() >= self._next_s
 
-    def checkpoint(self, pack: Callable[[], PolicyFile], progress: Progress) -> bool:
-        """Write the last policy and a checkpoint; False, with a warning, if the disk does not take it."""
+    def save(self) -> bool:
+        """Write the last policy and a checkpoint; False, with a warning, if the disk does not take it.
+
+        Raises `DivergedError` where a number that is learnt is not finite.
+        """
+        check_finite(self._learner.model, self.run.path)
+        self._learner.progress.seconds = self._learner.seconds
         began = time.monotonic()
-        policy = pack()
-        saved = self.attempt("checkpoint", lambda: self._write_checkpoint(policy, progress))
-        if saved:
+        policy = self._learner.pack()
+        is_saved = self.attempt("checkpoint", lambda: self._write(policy))
+        if is_saved:
             self._report_saved_again()
-            self.attempt("old checkpoints", self._checkpoints.remove_old)
+            self.attempt("old checkpoints", self._folders.remove_old)
         now = time.monotonic()
-        self._next_checkpoint = now + (1 + self._uncounted_checkpoints) * (now - began) / CHECKPOINT_TIME_SHARE
+        self._next_s = now + (1 + self._uncounted_checkpoints) * (now - began) / CHECKPOINT_TIME_SHARE
         self._uncounted_checkpoints = 0
-        return saved
+        return is_saved
 
     def _report_saved_again(self) -> None:
         if self._reported:
             self._warn(f"saved again, at step {self.saved_step:,}")
         self._reported.clear()
 
-    def _write_checkpoint(self, policy: PolicyFile, progress: Progress) -> None:
-        # Whoever goes on from a checkpoint will not come by here again: everything before it must be on the disk.
+    def _write(self, policy: PolicyFile) -> None:
+        # Whoever resumes from a checkpoint will not come by here again: everything before it must be on the disk.
+        progress = self._learner.progress
         self.metrics.flush(sync=True)
         self.evals.flush(sync=True)
         progress.metrics_bytes, progress.evals_bytes = self.metrics.size, self.evals.size
         progress.metrics_sha256, progress.evals_sha256 = self.metrics.digest(), self.evals.digest()
         self._write_best()
         policy.write(self.run.last_policy)
-        self._checkpoints.save(policy, progress)
+        self._folders.save(policy, progress)
         self.saved_step = policy.info.training_steps
 
+    def restore(self, checkpoint: Checkpoint, changed: Sequence[str]) -> str:
+        """Restore model and environments; return a message about how exactly the training is resumed.
 
-def cut_back(run: RunDirectory, step: int, progress: Progress) -> list[str]:
-    """Put a run folder back to where the checkpoint of a step has it; return warnings.
+        `changed` is why it cannot be exact, as far as is known before.
+        """
+        file = checkpoint.folder / "policy.safetensors"
+        PolicyFile.read_info(file).check_fits(self._learner.curriculum.goal, file)
+        mismatch = self._folders.restore(checkpoint)
+        inexact = [*changed, *find_differences(checkpoint.state.computed_with, self._folders.computed_with())]
+        inexact += [mismatch] if mismatch else []
+        self.saved_step = checkpoint.state.step
+        exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "as if it had never stopped"
+        return f"going on at step {checkpoint.state.step:,}, {exactness}"
 
-    Tables are cut back, checkpoints that are damaged are set aside, and the best policy stays the best there is.
-    """
-    for folder in run.checkpoints():
-        if int(folder.name) > step:
-            files.set_aside(folder)
-    remove_after(run, step)
-    warnings = []
-    for file, size, sha256 in (
-        (run.metrics_file, progress.metrics_bytes, progress.metrics_sha256),
-        (run.evals_file, progress.evals_bytes, progress.evals_sha256),
-    ):
-        if not Table(file).cut_back(size, sha256, step):
-            warnings.append(
-                f"warning: {file}: edited or damaged: its rows up to step {step:,} are not those that were written; "
-                "they are kept as they are, without lines that are not whole"
-            )
-    return warnings + _read_best_score(run, progress)
+    def cut_back(self, step: int) -> list[str]:
+        """Put the run folder back to where the checkpoint of a step has it; return warnings.
+
+        Tables are cut back, later checkpoints are set aside, and the episodes of later evaluations are removed.
+        """
+        for folder in self.run.checkpoints():
+            if int(folder.name) > step:
+                files.set_aside(folder)
+        _remove_episodes_after(self.run, step)
+        progress = self._learner.progress
+        tables = (
+            (self.metrics, progress.metrics_bytes, progress.metrics_sha256),
+            (self.evals, progress.evals_bytes, progress.evals_sha256),
+        )
+        return [
+            f"warning: {table.path}: edited or damaged: its rows up to step {step:,} are not those that were written; "
+            "they are kept as they are, without lines that are not whole"
+            for table, size, sha256 in tables
+            if not table.cut_back(size, sha256, step)
+        ]
 
 
-def _read_best_score(run: RunDirectory, progress: Progress) -> list[str]:
-    """Take the score from the best policy's own file, which may be newer than the checkpoint.
-
-    Return a warning if it is not as good as the checkpoint says.
-    """
-    best_step, problem = progress.best_step, ""
-    score = (progress.best_success or 0.0, progress.best_return or 0.0)
-    progress.best_success = progress.best_return = progress.best_step = None
-    try:
-        info = PolicyFile.read(run.best_policy).info
-    except ArtifactError as error:
-        problem = str(error)
-    else:
-        if info.evaluation is not None:
-            progress.best_success, progress.best_return = info.evaluation.success, info.evaluation.mean_return
-            progress.best_step = info.training_steps
-        if progress.best_step is None or (progress.best_success or 0.0, progress.best_return or 0.0) < score:
-            problem = f"{run.best_policy}: not the best policy, but that of step {info.training_steps:,}"
-    if best_step is None or not problem:
-        return []
-    return [f"warning: {problem}; the best one was that of step {best_step:,}, and is lost unless a checkpoint has it"]
+def _remove_episodes_after(run: RunDirectory, step: int) -> None:
+    """Remove the episodes of evaluations after a training step: a resumed run repeats them."""
+    for file in run.episodes.glob("*.npz"):
+        try:
+            policy = load_episode(file).info.policy
+        except ArtifactError:
+            continue  # not one that a training has written whole
+        number = policy.removeprefix(STEP_LABEL)
+        if policy.startswith(STEP_LABEL) and number.isdigit() and int(number) > step:
+            files.remove(file)

@@ -5,49 +5,42 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import ArtifactError, EpisodeFailed, RlctlError
+from rlctl.errors import EpisodeFailed, RlctlError
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Recipe
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
-from rlctl.storage import files
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
+from rlctl.training.checkpoints import STEP_LABEL, Checkpoints
 from rlctl.version import collect_versions
 
-if TYPE_CHECKING:
-    from rlctl.training.checkpoints import Saver
 
-
-_POLICY = "training step "
-"""What a kept episode was played with, for people: followed by the number."""
-
-
-class Evaluator:
+class EvaluationEpisodes:
     """Plays the evaluation episodes of a run, and writes some; nothing of the training changes by it.
 
     `goal` is what the environments are in which it evaluates.
     """
 
-    def __init__(self, recipe: Recipe, make_workers: Callable[[], Workers], saver: Saver, goal: EnvInfo) -> None:
+    def __init__(
+        self, recipe: Recipe, make_workers: Callable[[], Workers], checkpoints: Checkpoints, goal: EnvInfo
+    ) -> None:
         self._recipe = recipe
         self._make_workers = make_workers
-        self._saver = saver
+        self._checkpoints = checkpoints
         self._goal = goal
         # They build their environments beside the first updates, which leave a core idle.
         self._workers: Workers | None = make_workers()
         self._spec = self._workers.spec
         self._latest: list[RecordedEpisode] = []
 
-    def run(self, policy: PolicyFile, check: Callable[[], None], *, unseen: int | None = None) -> list[Episode]:
+    def play(self, policy: PolicyFile, check: Callable[[], None], *, unseen: int | None = None) -> list[Episode]:
         """Return the episodes of a policy: those of every evaluation, or a number that no evaluation has played.
 
         `check` is called several times a second and may raise to leave. Raises `TaskError` if an environment fails;
@@ -89,7 +82,7 @@ class Evaluator:
 
             path = self._write(episode)
             recording = path.with_suffix(".rrd")
-            title = f"{self._saver.run.path.name} / episode {path.stem}"
+            title = f"{self._checkpoints.run.path.name} / episode {path.stem}"
             record_episode(episode, recording, title=title, several=count > 1)
             recordings.append(recording)
         return recordings
@@ -104,7 +97,7 @@ class Evaluator:
         info = EpisodeInfo(
             spec=spec,
             seed=error.seed,
-            policy="training" if evaluated_at is None else f"{_POLICY}{evaluated_at}",
+            policy="training" if evaluated_at is None else f"{STEP_LABEL}{evaluated_at}",
             total_reward=0.0,
             versions=collect_versions(),
             failure=str(error).partition("\n")[0],
@@ -114,11 +107,11 @@ class Evaluator:
         actions = np.asarray(error.actions).reshape(-1, *(self._goal.spaces()[1].shape or ()))
         episode = RecordedEpisode(actions, nothing, nothing, nothing.reshape(0, 0), info)
         written: list[Path] = []
-        self._saver.attempt("failed episode", lambda: written.append(self._write(episode)))
+        self._checkpoints.attempt("failed episode", lambda: written.append(self._write(episode)))
         return error.with_hint(f"to reproduce it: rlctl replay {shlex.quote(str(written[0]))}") if written else error
 
     def _write(self, episode: RecordedEpisode) -> Path:
-        run = self._saver.run
+        run = self._checkpoints.run
         path = run.episode_file(run.next_episode_number())
         save_episode(path, episode)
         return path
@@ -129,22 +122,10 @@ class Evaluator:
         info = EpisodeInfo(
             spec=self._spec,
             seed=episode.result.seed,
-            policy=f"{_POLICY}{steps}",
+            policy=f"{STEP_LABEL}{steps}",
             success=episode.result.success,
             total_reward=episode.result.total_reward,
             term_names=list(self._goal.reward_weights),
             versions=collect_versions(),
         )
         return RecordedEpisode(**vars(trajectory), info=info)
-
-
-def remove_after(run: RunDirectory, steps: int) -> None:
-    """Remove the episodes of evaluations after a training step: a resumed run repeats them."""
-    for file in run.episodes.glob("*.npz"):
-        try:
-            policy = load_episode(file).info.policy
-        except ArtifactError:
-            continue  # not one that a training has written whole
-        step = policy.removeprefix(_POLICY)
-        if policy.startswith(_POLICY) and step.isdigit() and int(step) > steps:
-            files.remove(file)

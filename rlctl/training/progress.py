@@ -19,9 +19,6 @@ class Progress:
     """Step of the last row of metrics."""
     last_eval: int = 0
     """Step of the last evaluation."""
-    best_success: float | None = None
-    best_return: float | None = None
-    best_step: int | None = None
     good_in_a_row: int = 0
     """Evaluations in a row that reached the recipe's `stop_success`."""
     failed_evaluations: int = 0
@@ -48,11 +45,3 @@ class Progress:
     """Environment steps before the stage began."""
     stage_episodes: list[float | None] = dataclasses.field(default_factory=list)
     """Success (0 or 1, None where not reported) or return of the stage's last episodes, as its rule wants them."""
-
-    def is_better(self, success: float | None, mean_return: float) -> bool:
-        """Say whether an evaluation is better than the best so far: by success, then by return."""
-        if self.best_step is None:
-            return True
-        if success is not None and self.best_success is not None and success != self.best_success:
-            return success > self.best_success
-        return self.best_return is None or mean_return > self.best_return

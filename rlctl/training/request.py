@@ -6,14 +6,15 @@ import dataclasses
 import time
 from pathlib import Path
 
-from rlctl.errors import TaskError
+from rlctl.errors import ArtifactError, TaskError
+from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.recipe.recipe import Recipe
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import status
 from rlctl.training.display import make_display
 from rlctl.training.progress import Progress
-from rlctl.training.setup import prepare
+from rlctl.training.setup import set_up
 from rlctl.training.signals import StopSignals
 from rlctl.training.start import Start, find_start
 
@@ -27,7 +28,9 @@ class TrainResult:
     recipe: Recipe
     steps: int
     progress: Progress
-    """The best evaluation, the stage of the curriculum, and the seconds of training, with those before a resume."""
+    """The stage of the curriculum, and the seconds of training, with those before a resume."""
+    best: PolicyInfo | None
+    """The best policy, with the score that it was kept for; None where no evaluation succeeded."""
     wall_seconds: float
     """From the call to the end: with the start of the workers, the check, imports and saving."""
     recordings: list[Path] = dataclasses.field(default_factory=list)
@@ -46,25 +49,35 @@ def run_training(request: TrainRequest) -> TrainResult:
         if start.run is not None and start.checkpoint is not None and start.checkpoint.progress.done:
             return _report_finished(start, start.run, start.checkpoint.progress)
         title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
-        with make_display(title, start.recipe.total_timesteps) as display, prepare(start, display) as training:
+        with make_display(title, start.recipe.total_timesteps) as display, set_up(start, display) as training:
             signals.begin(training)
             training.run()
             signals.end()
             recordings = training.write_end(request.record)
-    run, progress = training.saver.run, training.progress
+    run, progress = training.checkpoints.run, training.learner.progress
     _raise_if_evaluations_failed(run, progress)
     seconds = time.monotonic() - start.began
-    return TrainResult(run, start.task, start.recipe, training.steps, progress, seconds, recordings)
+    best, steps = training.evaluator.best, training.learner.steps
+    return TrainResult(run, start.task, start.recipe, steps, progress, best, seconds, recordings)
 
 
 def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> TrainResult:
+    best = _read_best(run)
     if run.status().get("status") == "running":  # killed after all was done
-        status.write_end(run, start.step, progress)
+        status.write_end(run, start.step, progress, best)
     _raise_if_evaluations_failed(run, progress)
     note = "this run is finished already: nothing to do; -n makes it longer"
     if start.request.record:
         note += f"; to record episodes of it: rlctl replay {run.path}"
-    return TrainResult(run, start.task, start.recipe, start.step, progress, time.monotonic() - start.began, note=note)
+    seconds = time.monotonic() - start.began
+    return TrainResult(run, start.task, start.recipe, start.step, progress, best, seconds, note=note)
+
+
+def _read_best(run: RunDirectory) -> PolicyInfo | None:
+    try:
+        return PolicyFile.read_info(run.best_policy)
+    except ArtifactError:
+        return None
 
 
 def _raise_if_evaluations_failed(run: RunDirectory, progress: Progress) -> None:

@@ -1,4 +1,4 @@
-"""Prepares a training: environments, model, and run folder, with what a checkpoint restores of them."""
+"""Sets up a training: what is open while it goes on: workers, the check before it, the lock and the run folder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from rlctl.environments.named_task import RUN
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.output import format_count
-from rlctl.policy.file import PolicyFile
 from rlctl.recipe.recipe import ON_POLICY
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
@@ -28,9 +27,9 @@ from rlctl.training.display import Display
 from rlctl.training.start import Start
 
 if TYPE_CHECKING:
-    from rlctl.training.checkpoint import Checkpoints
-    from rlctl.training.checkpoints import Saver
-    from rlctl.training.loop import Learner, TrainingLoop
+    from rlctl.training.checkpoints import Checkpoints
+    from rlctl.training.learner import Learner
+    from rlctl.training.loop import TrainingLoop
 
 
 _CHECK_BUDGET_S = 2.0
@@ -40,8 +39,8 @@ _EXPERIMENTS = ("build", "comparisons", "episodes")
 
 
 @contextlib.contextmanager
-def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
-    """Prepare a training; at the end its processes are ended, and the run has what ended it before its time."""
+def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
+    """Open what a training needs; at the end its processes are ended, and the run has what ended it before its time."""
     recipe, request = start.recipe, start.request
     specs = recipe.env_specs(start.task, named_by=RUN if start.run else "")
     display.phase(f"building {format_count(recipe.n_envs, 'environment')}, importing PyTorch")
@@ -51,7 +50,8 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
         checked = None
         if request.check and start.run is None:
             checked = _begin_check(specs[-1], request.env_timeout_s)
-        from rlctl.training.evaluation_episodes import Evaluator
+        from rlctl.training.evaluation_episodes import EvaluationEpisodes
+        from rlctl.training.evaluator import Evaluator
         from rlctl.training.loop import TrainingLoop
 
         learner = _build_learner(start, specs, workers, display)
@@ -64,14 +64,17 @@ def prepare(start: Start, display: Display) -> Iterator[TrainingLoop]:
         lock = start.lock or stack.enter_context(run.lock())
         if not lock.keeps_out:
             display.message(f"warning: {run.path}: no locks on this file system: let no second process write this run")
-        saver = _open_run(run, start, learner, display)
+        checkpoints = _open_run(run, start, learner, display)
         n_envs = min(recipe.eval.episodes, available_cores())
         make_workers = functools.partial(_make_workers, specs[-1], n_envs, start, display)
-        evaluator = Evaluator(recipe, make_workers, saver, learner.curriculum.goal)
-        stack.callback(evaluator.close)
+        episodes = EvaluationEpisodes(recipe, make_workers, checkpoints, learner.curriculum.goal)
+        stack.callback(episodes.close)
+        evaluator = Evaluator(learner, episodes, checkpoints, display)
+        if start.run is not None:
+            evaluator.restore()
         display.run_folder(run)
         try:
-            yield TrainingLoop(learner, evaluator, saver, display)
+            yield TrainingLoop(learner, evaluator, checkpoints, display)
         except BaseException as error:
             with contextlib.suppress(OSError):  # a full disk must not hide the error itself
                 status.write_failure(run, error)
@@ -96,7 +99,7 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
     from rlctl.policy.torch_policy import pin_threads
     from rlctl.training.algorithms import build_model
     from rlctl.training.curriculum import Curriculum, check_stages
-    from rlctl.training.loop import Learner
+    from rlctl.training.learner import Learner
     from rlctl.training.off_policy import OffPolicyRollouts
     from rlctl.training.on_policy import OnPolicyRollouts
     from rlctl.training.progress import Progress
@@ -124,39 +127,21 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
     return Learner(recipe, rollouts, Curriculum(recipe.stages, specs, goal, progress), progress)
 
 
-def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Saver:
+def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Checkpoints:
     """Restore the checkpoint, if there is one, and return what writes from now on."""
-    from rlctl.training.checkpoint import Checkpoints
-    from rlctl.training.checkpoints import Saver, cut_back
+    from rlctl.training.checkpoints import Checkpoints
     from rlctl.training.tensorboard import make_logger
 
-    model = learner.rollouts.model
-    model.set_logger(make_logger(run.tensorboard, display.message, None if start.run is None else start.step))
-    checkpoints = Checkpoints(run, model, learner.rollouts.env, start.recipe.checkpoint.keep)
+    learner.model.set_logger(make_logger(run.tensorboard, display.message, None if start.run is None else start.step))
+    checkpoints = Checkpoints(learner, run, start.recipe.checkpoint.keep, display.message)
     for note in start.notes:
         display.message(note)
     if start.checkpoint is not None:
-        display.message(_restore(start, checkpoints, learner))
-    for warning in cut_back(run, start.step, learner.progress) if start.run else ():
+        display.message(checkpoints.restore(start.checkpoint, start.inexact))
+    for warning in checkpoints.cut_back(start.step) if start.run else ():
         display.message(warning)
     status.write_start(run, start)
-    saver = Saver(run, checkpoints, display.message)
-    saver.saved_step = start.step if start.checkpoint is not None else None
-    return saver
-
-
-def _restore(start: Start, checkpoints: Checkpoints, learner: Learner) -> str:
-    """Restore model and environments; return a message about how exactly the training goes on."""
-    from rlctl.training.checkpoint import find_differences
-
-    assert start.checkpoint is not None
-    file = start.checkpoint.folder / "policy.safetensors"
-    PolicyFile.read(file).info.check_fits(learner.curriculum.goal, file)
-    mismatch = checkpoints.restore(start.checkpoint)
-    inexact = [*start.inexact, *find_differences(start.checkpoint.state.computed_with, checkpoints.computed_with())]
-    inexact += [mismatch] if mismatch else []
-    exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "as if it had never stopped"
-    return f"going on at step {start.step:,}, {exactness}"
+    return checkpoints
 
 
 def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[CheckReport]:

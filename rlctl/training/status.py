@@ -17,6 +17,7 @@ from rlctl.run.directory import RunDirectory
 from rlctl.version import collect_versions
 
 if TYPE_CHECKING:
+    from rlctl.policy.file import PolicyInfo
     from rlctl.training.progress import Progress
     from rlctl.training.start import Start
 
@@ -73,17 +74,18 @@ def write_failure(run: RunDirectory, error: BaseException) -> None:
         run.write_status({"status": kind, "error": str(error) or repr(error), "ended": _now()})
 
 
-def write_end(run: RunDirectory, steps: int, progress: Progress) -> None:
-    """Write that a training is done, and what came of it."""
+def write_end(run: RunDirectory, steps: int, progress: Progress, best: PolicyInfo | None) -> None:
+    """Write that a training is done, and what came of it; `best` is its best policy."""
+    score = best.evaluation if best else None
     run.write_status(
         {
             "status": "finished",
             "ended": _now(),
             "steps": steps,
             "seconds": round(progress.seconds, 3),
-            "best_step": progress.best_step,
-            "best_success": progress.best_success,
-            "best_return": progress.best_return,
+            "best_step": best.training_steps if best else None,
+            "best_success": score.success if score else None,
+            "best_return": score.mean_return if score else None,
             "observations_outside": progress.observations_outside,
             "failed_evaluations": progress.failed_evaluations,
             **({"stage": progress.stage} if progress.stage else {}),

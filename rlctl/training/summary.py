@@ -36,6 +36,7 @@ def show(result: TrainResult, json: str | None) -> None:
 
 def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:
     progress, stages = result.progress, len(result.recipe.stages)
+    score = result.best.evaluation if result.best else None
     return {
         "run": str(result.run.path),
         "task": result.task,
@@ -43,9 +44,9 @@ def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:
         "seconds": round(progress.seconds, 3),
         "wall_seconds": round(result.wall_seconds, 3),
         "best": {
-            "step": progress.best_step,
-            "success_rate": progress.best_success,
-            "mean_return": progress.best_return,
+            "step": result.best.training_steps if result.best else None,
+            "success_rate": score.success if score else None,
+            "mean_return": score.mean_return if score else None,
             "episodes": result.recipe.eval.episodes,
             "policy": str(result.run.best_policy),
         },
@@ -62,10 +63,10 @@ def _format_result(result: TrainResult) -> list[str]:
     if result.wall_seconds >= progress.seconds + 3:
         line += f" ({duration(result.wall_seconds)} with start, check and end)"
     lines = [line]
-    if progress.best_return is not None and progress.best_step is not None:
-        success = "" if progress.best_success is None else f"success {percent(progress.best_success)}, "
+    if result.best is not None and (score := result.best.evaluation) is not None:
+        success = "" if score.success is None else f"success {percent(score.success)}, "
         lines.append(
-            f"best at step {progress.best_step:,}: {success}return {progress.best_return:.2f} "
+            f"best at step {result.best.training_steps:,}: {success}return {score.mean_return:.2f} "
             f"(mean of {output.format_count(result.recipe.eval.episodes, 'episode')})"
         )
     if stages:

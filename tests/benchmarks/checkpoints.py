@@ -51,13 +51,13 @@ def beside_training(repeat: int) -> Row:
 
 def _train_as_shipped(seed: int) -> tuple[float, float, float, float]:
     """Return the parts of the time at boundaries, in evaluations and in checkpoints, and the time [s]."""
-    from rlctl.training.checkpoints import Saver
+    from rlctl.training.checkpoints import Checkpoints
     from rlctl.training.loop import TrainingLoop
 
     with (
         _timed_calls(TrainingLoop, "boundary") as boundaries,
         _timed_calls(TrainingLoop, "evaluate") as evaluations,
-        _timed_calls(Saver, "checkpoint") as checkpoints,
+        _timed_calls(Checkpoints, "save") as checkpoints,
         _timed_calls(TrainingLoop, "run") as runs,
     ):
         _run({"seed": seed})
@@ -82,11 +82,11 @@ def _while_training(name: str, settings: dict, repeat: int) -> Row:
 
 def _train(settings: dict) -> tuple[float, int, float, float, float]:
     """Return the part of the time, how many, when the first two were there [s], and the median of their times [ms]."""
-    from rlctl.training.checkpoints import Saver
+    from rlctl.training.checkpoints import Checkpoints
     from rlctl.training.loop import TrainingLoop
 
     with (
-        _timed_calls(Saver, "checkpoint") as saves,
+        _timed_calls(Checkpoints, "save") as saves,
         _timed_calls(TrainingLoop, "evaluate") as evaluations,
         _timed_calls(TrainingLoop, "run") as runs,
     ):

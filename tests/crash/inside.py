@@ -24,7 +24,7 @@ def run(arguments, plan):
     from rlctl.training import checkpoints
 
     checkpoints.CHECKPOINT_TIME_SHARE = plan.get("time_for_checkpoints", 1e9)  # at every boundary
-    _announce(checkpoints.Saver, log)
+    _announce(checkpoints.Checkpoints, log)
     files.os = FaultyOs(log, **plan.get("disk", {}))
     files.shutil = FaultyShutil(files.os)
     if "outside_change" in plan:
@@ -48,7 +48,7 @@ def _opened(file: Path):
 
 def _announce(saver, log):
     """Log what is announced: each checkpoint whose saving came back as done."""
-    original = saver.checkpoint
+    original = saver.save
 
     @functools.wraps(original)
     def checkpoint(self, *arguments, **options):
@@ -57,7 +57,7 @@ def _announce(saver, log):
             log(f"saved {self.saved_step}")
         return saved
 
-    saver.checkpoint = checkpoint
+    saver.save = checkpoint
 
 
 if __name__ == "__main__":

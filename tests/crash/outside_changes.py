@@ -17,19 +17,19 @@ def begin(what, after=0, until=None):
         return
     from rlctl.training import checkpoints
 
-    original = checkpoints.Saver.checkpoint
+    original = checkpoints.Checkpoints.save
 
     @functools.wraps(original)
-    def checkpoint(saver, pack, progress, **options):
-        step = pack().info.training_steps
+    def save(saver):
+        step = saver._learner.steps
         if until is not None and step >= until:
             _broken.clear()
-        saved = original(saver, pack, progress, **options)
+        saved = original(saver)
         if step == after:
             CHANGES[what](RunDirectory(saver.metrics.path.parent))
         return saved
 
-    checkpoints.Saver.checkpoint = checkpoint
+    checkpoints.Checkpoints.save = save
 
 
 def edited(file, change):

@@ -45,7 +45,7 @@ def test_a_signal_in_a_phase(trials, whole, tmp_path, phase, number, everybody):
         assert ended.code == CODES[number], ended.stderr
         assert "interrupted" in ended.stderr.splitlines()[-1]
         if phase not in BEFORE:
-            assert "checkpoint saved. Go on with: rlctl train --resume runs/Line/" in ended.stderr
+            assert "checkpoint saved. Resume with: rlctl train --resume runs/Line/" in ended.stderr
             assert ended.announced > 0
     assert_nothing_lost(trials, ARGUMENTS["ppo"], ended, only_run(before.folder))
 

@@ -28,18 +28,18 @@ class Mine(Staged):
 @pytest.fixture
 def kill_at(monkeypatch):
     """End a training right after the checkpoint of a step."""
-    from rlctl.training.checkpoints import Saver
+    from rlctl.training.checkpoints import Checkpoints
 
     def kill(step):
-        original = Saver.checkpoint
+        original = Checkpoints.save
 
         def checkpoint(saver, *arguments, **options):
             original(saver, *arguments, **options)
             if saver.saved_step == step:
-                monkeypatch.setattr(Saver, "checkpoint", original)
+                monkeypatch.setattr(Checkpoints, "save", original)
                 raise Killed
 
-        monkeypatch.setattr(Saver, "checkpoint", checkpoint)
+        monkeypatch.setattr(Checkpoints, "save", checkpoint)
 
     return kill
 
@@ -233,10 +233,10 @@ def test_an_import_changes_nothing_of_ours(train, intrusive):
 
 
 def test_an_import_does_not_take_signals_from_a_training(train, intrusive, monkeypatch):
-    from rlctl.training.checkpoints import Saver
+    from rlctl.training.checkpoints import Checkpoints
 
     before = signal.getsignal(signal.SIGTERM)
-    original = Saver.checkpoint
+    original = Checkpoints.save
 
     def checkpoint(saver, *arguments, **options):
         saved = original(saver, *arguments, **options)
@@ -244,7 +244,7 @@ def test_an_import_does_not_take_signals_from_a_training(train, intrusive, monke
             os.kill(os.getpid(), signal.SIGTERM)
         return saved
 
-    monkeypatch.setattr(Saver, "checkpoint", checkpoint)
+    monkeypatch.setattr(Checkpoints, "save", checkpoint)
     with pytest.raises(Interrupted, match="interrupted at step 64; checkpoint saved"):
         train("Intrusive", TINY, envs=intrusive)
     assert signal.getsignal(signal.SIGTERM) == before

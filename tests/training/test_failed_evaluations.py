@@ -83,7 +83,7 @@ def test_none_ever_succeeded(train, settings, tmp_path, rlctl):
 
 
 def test_a_resume_remembers(train, resume, settings, tmp_path, monkeypatch):
-    from rlctl.training.checkpoints import Saver
+    from rlctl.training.checkpoints import Checkpoints
 
     def killed(saver, *arguments, **options):
         saved = original(saver, *arguments, **options)
@@ -91,8 +91,8 @@ def test_a_resume_remembers(train, resume, settings, tmp_path, monkeypatch):
             raise Killed
         return saved
 
-    original = Saver.checkpoint
-    monkeypatch.setattr(Saver, "checkpoint", killed)
+    original = Checkpoints.save
+    monkeypatch.setattr(Checkpoints, "save", killed)
     with pytest.raises(Killed):
         train("FailsWhenEvaluated", settings(2), envs=FAULTY)
     monkeypatch.undo()

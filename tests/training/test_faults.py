@@ -71,7 +71,7 @@ def test_a_fault_is_named_and_the_run_goes_on_after_it(fail, resume, monkeypatch
     assert str(error).splitlines() == [
         f"task '{ENVS}:Faulty': {message}",
         f"{PLACE}to reproduce it: rlctl replay {run.episode_file(0)}",
-        f"the checkpoint of step 64 stands; go on with: rlctl train --resume {run.path}",
+        f"checkpoint at step 64 is intact; resume with: rlctl train --resume {run.path}",
     ]
     assert error.exit_code == 3
     assert run.status()["status"] == "failed"
@@ -142,7 +142,7 @@ def test_observations_outside_their_space_are_counted_and_reported(train, capfd)
     printed = capfd.readouterr().err.splitlines()
     assert (
         "warning: observation is outside its space: element 0 is 12.5, not -10 to 10; "
-        "such observations are counted, and taken as they are"
+        "such observations are counted and used unchanged"
     ) in printed
     # Each of two environments took 32 steps, in four episodes; three had a fifth step.
     assert run.status()["observations_outside"] == 2 * 3

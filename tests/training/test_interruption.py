@@ -92,7 +92,7 @@ def test_a_signal_saves_a_checkpoint_and_leaves_no_child(start, rlctl, tmp_path,
     assert stdout == ""
     last = stderr.strip().splitlines()[-1]
     assert last.startswith("error: interrupted at step ")
-    assert "checkpoint saved. Go on with: rlctl train --resume runs/" in last
+    assert "checkpoint saved. Resume with: rlctl train --resume runs/" in last
     assert "Traceback" not in stderr
     wait_for(lambda: not any(child.is_running() for child in children))
     (run,) = tmp_path.glob("runs/Line/*")

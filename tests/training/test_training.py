@@ -82,7 +82,7 @@ def test_tensorboard_has_distributions(finished):
 def test_best_policy_is_that_of_the_best_evaluation(finished):
     result = finished
     best = max(rows(result.run.evals_file), key=lambda row: float(row["return"]))
-    assert load_policy(result.run.best_policy).info.training_steps == int(best["steps"]) == result.progress.best_step
+    assert load_policy(result.run.best_policy).info.training_steps == int(best["steps"]) == result.best.training_steps
 
 
 def test_new_episodes_decide_between_the_best_and_the_last(train, capfd):

@@ -1,0 +1,201 @@
+"""Evaluations while training, and the best policy: when to evaluate, what is written, and which policy is kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from rlctl.errors import ArtifactError, RlctlError, TaskError, UsageError
+from rlctl.evaluation.episode_statistics import mean_return, success_rate
+from rlctl.policy.file import PolicyFile, PolicyInfo, Score
+from rlctl.rollout.collect import Episode
+from rlctl.runs.diagnosis import Grade, diagnose
+from rlctl.runs.summary import read_table
+from rlctl.training import measurements
+from rlctl.training.checkpoints import Checkpoints
+from rlctl.training.display import Display, format_score
+from rlctl.training.evaluation_episodes import EvaluationEpisodes
+from rlctl.training.learner import Learner
+
+_FINAL_EPISODES = 30
+"""At least so many new episodes decide between the best policy and the last."""
+_STANDARD_ERRORS = 1.645
+"""Beyond so many a success rate is lower: 5 % of equal policies are taken for worse (one-sided)."""
+
+
+def is_lower(success: float, highest: float, episodes: int) -> bool:
+    """Say whether a success rate is lower than the highest by more than chance, both of so many episodes."""
+    both = (success + highest) / 2
+    standard_error = math.sqrt(2 * both * (1 - both) / episodes)
+    return highest - success > _STANDARD_ERRORS * standard_error
+
+
+def is_better(new: Score, best: Score | None, highest: float, episodes: int) -> bool:
+    """Say whether a policy is better than the best so far: by success, and by return where success cannot tell.
+
+    Success cannot tell where neither rate is lower than the highest one so far, `highest`, by more than chance; so a
+    row of small losses cannot add up.
+    """
+    if best is None:
+        return True
+    if new.success is None or best.success is None:
+        return new.mean_return > best.mean_return
+    highest = max(highest, new.success)
+    new_is_lower, best_is_lower = (is_lower(score.success or 0.0, highest, episodes) for score in (new, best))
+    if new_is_lower != best_is_lower:
+        return best_is_lower
+    return (new.mean_return, new.success) > (best.mean_return, best.success)
+
+
+class Evaluator:
+    """Evaluates the policy of a learner, and keeps the best one; nothing of the training changes by it.
+
+    `check`, a parameter of its methods, is called several times a second while episodes are played, and may raise.
+    """
+
+    def __init__(
+        self, learner: Learner, episodes: EvaluationEpisodes, checkpoints: Checkpoints, display: Display
+    ) -> None:
+        self.episodes = episodes
+        self.best: PolicyInfo | None = None
+        """The best policy so far, with its score, as its file has it."""
+        self._learner = learner
+        self._recipe = learner.recipe
+        self._checkpoints = checkpoints
+        self._display = display
+        self._highest_success = 0.0
+        """Of all evaluations so far."""
+        self._reported_findings: set[str] = set()
+
+    def restore(self) -> None:
+        """Take the best score from the best policy's own file, which may be newer than the checkpoint.
+
+        Shows a warning if there is none although evaluations were made.
+        """
+        rows = read_table(self._checkpoints.run.evals_file)
+        self._highest_success = max((row["success"] for row in rows if row["success"] is not None), default=0.0)
+        try:
+            self.best = self._checkpoints.read_best().info
+        except ArtifactError as error:
+            if rows:
+                self._display.message(f"warning: {error}; the policy of the next evaluation is taken as the best")
+
+    def is_due(self) -> bool:
+        """Say whether this boundary is evaluated: every so many steps, and at the end."""
+        steps, progress = self._learner.steps, self._learner.progress
+        return steps >= progress.next_eval or (self._learner.is_at_end and progress.last_eval < steps)
+
+    def evaluate(self, check: Callable[[], None]) -> None:
+        """Play the evaluation episodes, save the best policy, and write the row and the episodes.
+
+        An environment that fails costs this evaluation, not the training.
+        """
+        steps, progress = self._learner.steps, self._learner.progress
+        policy = self._learner.pack()
+        self._display.phase("evaluating")
+        try:
+            # They may take minutes, too long to wait after a signal; the resumed run repeats them.
+            episodes = self.episodes.play(policy, check)
+        except (TaskError, UsageError, ArtifactError) as error:  # the last two where files were removed meanwhile
+            self._note_failure(error)
+        else:
+            self._note(episodes, policy)
+        progress.last_eval = steps
+        if not self._learner.is_at_end:  # at the end all of it is printed
+            self._report_findings()
+        while progress.next_eval <= steps:
+            progress.next_eval += self._recipe.eval.every_steps or self._recipe.total_timesteps
+
+    def _report_findings(self) -> None:
+        """Show the warnings of the run's own records that were not there the last time."""
+        for finding in diagnose(self._checkpoints.run):
+            if finding.grade == Grade.WARNING and finding.id not in self._reported_findings:
+                self._reported_findings.add(finding.id)
+                self._display.message(finding.line)
+
+    def _note_failure(self, error: RlctlError) -> None:
+        progress, steps = self._learner.progress, self._learner.steps
+        progress.failed_evaluations += 1
+        progress.first_failure = progress.first_failure or f"at step {steps:,}: {error}"
+        error = self.episodes.keep_failed(error, self._learner.curriculum.goal_spec, steps)
+        self._display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
+
+    def _note(self, episodes: list[Episode], policy: PolicyFile) -> None:
+        learner, steps = self._learner, self._learner.steps
+        results = [episode.result for episode in episodes]
+        score = _score(episodes)
+        better = self._is_better(score, len(results))
+        self._highest_success = max(self._highest_success, score.success or 0.0)
+        if better:
+            self._keep_as_best(policy, score)
+        self._count_good(score)
+        row = {
+            "steps": steps,
+            "seconds": round(learner.seconds, 3),
+            **learner.curriculum.columns(),
+            **measurements.evaluation_row(results),
+        }
+        self._checkpoints.row(self._checkpoints.evals, row)
+        self._log(score, sum(result.length for result in results) / len(results))
+        self._checkpoints.attempt("episodes", lambda: self.episodes.keep(episodes, steps))
+        self._display.evaluation(steps, score.success, score.mean_return, better)
+
+    def _count_good(self, score: Score) -> None:
+        progress, threshold = self._learner.progress, self._recipe.stop_success
+        is_good = threshold is not None and score.success is not None and score.success >= threshold
+        progress.good_in_a_row = progress.good_in_a_row + 1 if is_good else 0
+
+    def _log(self, score: Score, mean_steps: float) -> None:
+        """Write to TensorBoard, by the names that SB3's own evaluations have."""
+        logger = self._learner.model.logger
+        logger.record("eval/mean_reward", score.mean_return)
+        logger.record("eval/mean_ep_length", mean_steps)
+        if score.success is not None:
+            logger.record("eval/success_rate", score.success)
+        logger.dump(self._learner.steps)
+
+    def compare_best_with_last(self, check: Callable[[], None]) -> None:
+        """Take the last policy for the best if new episodes show it.
+
+        The best of many evaluations is the luckiest of them, too: chosen by 8 episodes, one policy of a hopper had
+        2,612, and 2,386 in a hundred others, where the last had 2,579.
+        """
+        steps, best = self._learner.steps, self.best
+        rows = read_table(self._checkpoints.run.evals_file)
+        if best is None or best.training_steps == steps or not rows or rows[-1]["steps"] != steps:
+            return  # the last is the best, or could not be evaluated
+        count = max(_FINAL_EPISODES, self._recipe.eval.episodes)
+        self._display.phase("best or last")
+        last = self._learner.pack()
+        try:
+            before, after = (
+                _score(self.episodes.play(policy, check, unseen=count))
+                for policy in (self._checkpoints.read_best(), last)
+            )
+        except (TaskError, UsageError, ArtifactError) as error:
+            self._display.message(f"warning: the best and the last policy were not compared: {error}")
+            return
+        last_is_better = is_better(after, before, before.success or 0.0, count)
+        self._display.message(
+            f"{count} new episodes: {format_score(before.success, before.mean_return)} at step "
+            f"{best.training_steps:,}, {format_score(after.success, after.mean_return)} at the last; "
+            f"{'the last' if last_is_better else 'the previous best'} is kept as best"
+        )
+        if last_is_better:
+            self._keep_as_best(last, Score(success=rows[-1]["success"], mean_return=rows[-1]["return"] or 0.0))
+
+    def _is_better(self, score: Score, episodes: int) -> bool:
+        if self.best is not None and self.best.training_steps > self._learner.steps:
+            return False  # a resumed run repeats this evaluation: the policy that it led to is there already
+        best = None if self.best is None else self.best.evaluation
+        return is_better(score, best, self._highest_success, episodes)
+
+    def _keep_as_best(self, policy: PolicyFile, score: Score) -> None:
+        best = policy.with_info(evaluation=score)
+        self._checkpoints.save_best(best)
+        self.best = best.info
+
+
+def _score(episodes: list[Episode]) -> Score:
+    results = [episode.result for episode in episodes]
+    return Score(success=success_rate(results), mean_return=mean_return(results))

@@ -1,0 +1,72 @@
+"""The rows of `metrics.csv`, and the same numbers for TensorBoard and the display."""
+
+from __future__ import annotations
+
+import time
+
+from rlctl.recipe.recipe import ON_POLICY
+from rlctl.training import measurements
+from rlctl.training.checkpoints import Checkpoints
+from rlctl.training.display import Display
+from rlctl.training.learner import Learner
+from rlctl.training.snapshot import check_finite
+
+_OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
+
+
+class Metrics:
+    """Collects the training episodes that have ended, and writes a row about them and the updates."""
+
+    def __init__(self, learner: Learner, checkpoints: Checkpoints, display: Display) -> None:
+        self._learner = learner
+        self._checkpoints = checkpoints
+        self._display = display
+        self._last_row_s, self._last_row_steps = time.monotonic(), learner.steps
+
+    def collect_finished_episodes(self) -> None:
+        """Take the episodes that have ended from the environments; count observations outside their space."""
+        env, progress = self._learner.env, self._learner.progress
+        finished, env.ended = env.ended, []
+        progress.recent += finished
+        self._learner.curriculum.count(finished)
+        if env.outside and not progress.observations_outside:
+            self._display.message(f"warning: {env.outside_message}; such observations are counted and used unchanged")
+        progress.observations_outside += env.outside
+        env.outside = 0
+
+    def is_due(self) -> bool:
+        """Say whether this boundary gets a row: each rollout of an on-policy algorithm does."""
+        steps = self._learner.steps
+        return self._learner.recipe.algo in ON_POLICY or steps >= self._learner.progress.next_row
+
+    def write(self) -> None:
+        """Write a row, and the same to TensorBoard, if there were steps since the last one."""
+        learner, progress = self._learner, self._learner.progress
+        steps, logger, env = learner.steps, learner.model.logger, learner.env
+        if steps <= progress.last_row:
+            return
+        check_finite(learner.model, self._checkpoints.run.path)
+        now = time.monotonic()
+        elapsed_s = max(now - self._last_row_s, 1e-9)
+        recent, progress.recent = progress.recent, []
+        row = {
+            "steps": steps,
+            "seconds": round(learner.seconds, 3),
+            "fps": round((steps - self._last_row_steps) / elapsed_s, 1),
+            "playing": round(env.waited_s / elapsed_s, 3),
+            **learner.curriculum.columns(),
+            **measurements.training_row(recent, env.workers.info.reward_weights, logger.name_to_value),
+            **measurements.measure(learner.model, env, progress.last_row, learner.recipe.total_timesteps),
+        }
+        self._last_row_s, self._last_row_steps, env.waited_s = now, steps, 0.0
+        self._checkpoints.row(self._checkpoints.metrics, row)
+        for name, value in measurements.tensorboard_values(row).items():
+            logger.record(name, value)
+        learner.model.dump_logs()
+        self._display.metrics(row)
+        progress.last_row = steps
+        progress.next_row = steps + max(1, learner.recipe.total_timesteps // _OFF_POLICY_ROWS)
+
+    def exclude(self, seconds: float) -> None:
+        """Leave out some time from the rate of training: that of an evaluation."""
+        self._last_row_s += seconds
