@@ -17,6 +17,7 @@ def show(result: TrainResult, json: str | None) -> None:
     if output.present(_to_json(result, findings), json):
         return
     run = shlex.quote(str(result.run.path))
+    score = result.best.evaluation if result.best else None
     lines = [result.note] if result.note else []
     lines += [*_format_result(result), *format_end(findings, run)]
     lines += [f"recording: rerun {shlex.quote(str(path))}" for path in result.recordings]
@@ -26,7 +27,7 @@ def show(result: TrainResult, json: str | None) -> None:
         f"run: {result.run.path}",
         "next:",
         f"  rlctl eval {run}",
-        *([] if result.progress.best_success == 0 else [f"  rlctl export {run} --onnx"]),
+        *([] if score is not None and score.success == 0 else [f"  rlctl export {run} --onnx"]),
         f"  rlctl replay {run}",
         f"  tensorboard --logdir {shlex.quote(str(result.run.tensorboard))}",
     ]

@@ -14,7 +14,7 @@ import optuna
 from optuna.trial import TrialState
 
 from rlctl.environments.spec import merge
-from rlctl.errors import UsageError
+from rlctl.errors import RunTaken, UsageError
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
@@ -166,9 +166,9 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
     if trainings.stopped_by is not None and not (code == 0 and _has_finished(run)):
         return
     with _claim(run) as problem:
-        if problem or code == _KILLED:
+        if problem or code in (_KILLED, RunTaken.exit_code):
             # Nothing is known about its values: `tune --resume` tries it again.
-            trial.problem = problem or "killed by SIGKILL"
+            trial.problem = problem or ("killed by SIGKILL" if code == _KILLED else "another process trained it")
             return
         _note_end(tuning, trial, run, code, lines, pruned=pruning is not None and pruning.decided)
         if run is not None:
@@ -188,7 +188,7 @@ def _claim(run: RunDirectory | None) -> Iterator[str]:
         return
     try:
         lock = run.lock()
-    except UsageError as error:
+    except RunTaken as error:
         yield str(error)
         return
     with lock:
