@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from rlctl.policy.layers import Lstm, Normalize, OneHot
 from rlctl.policy.network import Network
 from rlctl.policy.onnx_file import METADATA_KEY
 from rlctl.policy.onnx_policy import ACTION, SINGLE_INPUT, STATE_INPUTS, STATE_OUTPUTS
+from rlctl.policy.own_graph import OBSERVATION, OwnGraph
 from rlctl.task.joints import Joints
 
 _STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of the step before"
@@ -29,7 +31,10 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
     graph, network = Graph(), Network(policy)
     observation_space, action_space = info.env.spaces()
     inputs = {key: _add_input(graph, info, key, part) for key, part in split_space(observation_space).items()}
-    value = concatenate(graph, [_emit_part(graph, inputs[key], network, key) for key in network.parts])
+    if network.own is None:
+        value = concatenate(graph, [_emit_part(graph, inputs[key], network, key) for key in network.parts])
+    else:
+        value = _emit_own(graph, inputs, network.own)
     state: tuple[str, ...] = ()
     if (lstm := network.lstm) is not None:
         hidden, cell = (graph.input(name, np.float32, _find_state_shape(lstm), _STATE_MEANING) for name in STATE_INPUTS)
@@ -76,6 +81,15 @@ def _emit_part(graph: Graph, source: tuple[str, Any], network: Network, key: str
     if dtype != np.float32 and not isinstance(layers[0], Normalize | OneHot):
         value = graph.cast(value, np.float32)
     return emit(graph, value, layers)
+
+
+def _emit_own(graph: Graph, inputs: Mapping[str, tuple[str, Any]], own: OwnGraph) -> str:
+    """From all parts of the observation to the latent of a user's network."""
+    values = {f"{OBSERVATION}{key}": value for key, (value, _) in inputs.items()}
+    for key, layer in own.normalize.items():
+        values[f"{OBSERVATION}{key}"] = emit(graph, inputs[key][0], [layer])
+    values |= {name: graph.constant(name, weight) for name, weight in own.weights.items()}
+    return graph.inline(onnx.ModelProto.FromString(own.content).graph, values)
 
 
 def _emit_continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool) -> tuple[str, np.dtype[Any]]:

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from rlctl.errors import AnswerIsNo, UsageError, short_repr
 from rlctl.exporting.c_header import Layout, write_comment, write_data, write_header
 from rlctl.exporting.c_layers import CWriter
+from rlctl.policy import own_modules
 from rlctl.policy.c_policy import LIBRARY_SUFFIX
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import ScaleImage
@@ -75,6 +76,13 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
         raise UsageError(
             f"export --c: {weights:,} weights are too many for a C file (at most {LARGEST:,}); rlctl export --onnx"
         )
+    kwargs = policy.info.policy_kwargs
+    for key in own_modules.KEYS:
+        if isinstance(own := kwargs.get(key), dict):
+            raise UsageError(
+                f"export --c: the layer {own['class']} of policy_kwargs.{key} cannot be written as C; "
+                "rlctl export --onnx can"
+            )
     name, network = _make_identifier(file_name), Network(policy)
     layout = Layout(name, policy.info)
     has_images = any(isinstance(layer, ScaleImage) for part in network.parts.values() for layer in part)

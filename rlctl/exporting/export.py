@@ -14,6 +14,7 @@ from rlctl.output import print_notes
 from rlctl.policy import onnx_file
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable
+from rlctl.policy.own_modules import KEYS, import_named
 from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.rollout.workers import Workers, available_cores
@@ -59,6 +60,8 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
 
 def _export(source: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
     policy = check_playable(PolicyFile.read(source.file))
+    if source.run is not None and any(isinstance(policy.info.policy_kwargs.get(key), dict) for key in KEYS):
+        import_named(source.run.recipe().policy_kwargs)  # they are the user's, whose run names them
     info = policy.info
     # The environments are built while torch is imported.
     with Workers(source.locate(info.spec), available_cores()) as workers:

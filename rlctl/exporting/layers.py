@@ -72,6 +72,21 @@ class Graph:
         self._nodes.append(helper.make_node(operator, list(inputs), outputs, name=name, **attributes))
         return outputs
 
+    def inline(self, graph: onnx.GraphProto, values: Mapping[str, str]) -> str:
+        """Add the nodes of another graph; `values` are those of its inputs. Return its first output."""
+        names = dict(values)
+        for tensor in graph.initializer:
+            names[tensor.name] = self.constant(f"own/{tensor.name}", numpy_helper.to_array(tensor))
+        for node in graph.node:
+            copied = onnx.NodeProto()
+            copied.CopyFrom(node)
+            copied.name = f"/own/{node.name or node.output[0]}"
+            names |= {output: f"/own/{output}" for output in node.output if output}
+            copied.input[:] = [names[value] if value else "" for value in node.input]
+            copied.output[:] = [names[value] if value else "" for value in node.output]
+            self._nodes.append(copied)
+        return names[graph.output[0].name]
+
     def cast(self, value: str, dtype: Any) -> str:
         """Add a conversion to a numpy dtype."""
         return self.add("Cast", value, to=_find_type(dtype))

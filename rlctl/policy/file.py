@@ -30,6 +30,8 @@ DETERMINISTIC = ("td3", "ddpg")
 """Algorithms whose policy has no distribution to sample from."""
 ACTOR_CRITIC = (*SQUASHED_GAUSSIAN, *DETERMINISTIC)
 """Algorithms whose policy has an `actor` of its own."""
+GRAPH = "graph/actor"
+"""The tensor that holds a user's network, an ONNX graph as bytes; see `rlctl.policy.own_graph`."""
 
 
 class Score(pydantic.BaseModel, extra="forbid"):
@@ -137,7 +139,8 @@ class PolicyFile:
 
 def list_actor_tensors(algo: str, names: Iterable[str]) -> list[str]:
     """Return which of the tensors of a policy file acting needs."""
-    prefixes = ("normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(algo)))
+    names = list(names)
+    prefixes = (GRAPH, "normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(algo)))
     return [name for name in names if name.startswith(prefixes)]
 
 

@@ -6,6 +6,7 @@ Its layers follow from the names of the file's tensors, which are those of SB3's
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gymnasium import spaces
@@ -13,8 +14,11 @@ from gymnasium import spaces
 from rlctl.environments.dict_spaces import split_space
 from rlctl.errors import UsageError
 from rlctl.policy import layers
-from rlctl.policy.file import ACTOR_CRITIC, DETERMINISTIC, SQUASHED_GAUSSIAN, PolicyFile
+from rlctl.policy.file import ACTOR_CRITIC, DETERMINISTIC, GRAPH, SQUASHED_GAUSSIAN, PolicyFile
 from rlctl.policy.layers import Activation, Array, Layer, Linear, apply
+
+if TYPE_CHECKING:
+    from rlctl.policy.own_graph import OwnGraph
 
 _BATCH_RENORM_EPSILON = 1e-3
 _RELU_BY_DEFAULT = (*ACTOR_CRITIC, "dqn")
@@ -33,13 +37,20 @@ class Network:
         algo, read = info.algo, _Reader(policy)
         owner = "actor." if algo in ACTOR_CRITIC else "q_net." if algo == "dqn" else "pi_"
         extractor = f"{owner}features_extractor"
+        self.own = read.own_graph()
+        """The part that a user wrote, instead of `parts` and, but for an LSTM, of `trunk`; None without."""
         self.parts = {
             key: read.features(key, space, f"{extractor}.extractors.{key}" if key else extractor)
             for key, space in split_space(info.env.spaces()[0]).items()
+            if self.own is None
         }
         """Layers from each part of a raw observation to its features."""
         self.lstm = read.lstm("lstm_actor") if algo == "recurrent_ppo" else None
         self.trunk, self.head = _read_actor(algo, read)
+        if self.own is not None and self.lstm is None:
+            self.trunk = []
+            if algo in (*DETERMINISTIC, "dqn"):
+                self.head = []
         """The head's result is the mean of the action, the action of TD3 and DDPG, logits, or values."""
         self.is_squashed = algo in ACTOR_CRITIC or bool(info.policy_kwargs.get("squash_output"))
         """Whether actions in a Box are in [-1, 1], and scaled to its bounds."""
@@ -53,6 +64,8 @@ class Network:
 
     def prepare(self) -> None:
         """Compute what follows from the numbers alone, again after they have changed."""
+        if self.own is not None:
+            self.own.prepare()
         for part in self.parts.values():
             for layer in part:
                 layer.prepare()
@@ -61,7 +74,9 @@ class Network:
     def compute_latent(self, observation: object) -> Array:
         """Return what the head starts from; a recurrent network goes one step on."""
         parts = self.parts
-        if "" in parts:
+        if self.own is not None:
+            value = self.own(observation)
+        elif "" in parts:
             value = apply(parts[""], observation)
         else:
             value = np.concatenate([apply(part, observation[key]) for key, part in parts.items()])  # type: ignore[index]
@@ -97,12 +112,29 @@ class _Reader:
 
     def __init__(self, policy: PolicyFile) -> None:
         info = self.info = policy.info
+        self.policy_tensors = policy.tensors
         self.tensors = {name.removeprefix("policy/"): values for name, values in policy.tensors.items()}
         name = info.policy_kwargs.get("activation_fn", "relu" if info.algo in _RELU_BY_DEFAULT else "tanh")
-        if name not in layers.ACTIVATIONS:
-            known = ", ".join(layers.ACTIVATIONS)
-            raise UsageError(f"a network with activation {name!r} cannot be played; known: {known}")
-        self.activation = Activation(name)
+        own = GRAPH in self.tensors and info.algo != "recurrent_ppo"
+        if not own and name not in (*layers.ACTIVATIONS,):
+            known, name = ", ".join(layers.ACTIVATIONS), name["class"] if isinstance(name, dict) else name
+            of = " of a recurrent policy" if info.algo == "recurrent_ppo" else ""
+            raise UsageError(f"a network{of} with activation {name!r} cannot be played; known: {known}")
+        self.activation = Activation("" if own else name)  # in a user's graph there are others
+
+    def own_graph(self) -> OwnGraph | None:
+        """Return the part that a user wrote."""
+        if GRAPH not in self.tensors:
+            return None
+        from rlctl.policy.own_graph import OwnGraph  # only here: it imports onnxruntime
+
+        keys = {key: f"normalize/{key}" for key in self.info.normalized_keys}
+        clip = float(self.info.clip_observation or np.inf)
+        normalize = {
+            key: layers.Normalize(name, self.tensors[f"{name}/mean"], self.tensors[f"{name}/var"], clip)
+            for key, name in keys.items()
+        }
+        return OwnGraph(self.policy_tensors, normalize)
 
     def features(self, key: str, space: spaces.Space[object], extractor: str) -> list[Layer]:
         """Return the layers from a raw observation to its features: normalised, one-hot, convolved or flat."""

@@ -109,7 +109,7 @@ def _open_session(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, s
     except ValueError as error:
         raise ArtifactError(f"{path}: damaged, or not an ONNX file of rlctl: {error}") from None
     try:
-        session = onnxruntime.InferenceSession(content, _make_options(), providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(content, make_options(), providers=["CPUExecutionProvider"])
         return session, session.get_modelmeta().custom_metadata_map
     except Exception as error:  # onnxruntime's own errors have no public base class
         raise ArtifactError(
@@ -118,7 +118,8 @@ def _open_session(path: Path) -> tuple[onnxruntime.InferenceSession, dict[str, s
         ) from None
 
 
-def _make_options() -> onnxruntime.SessionOptions:
+def make_options() -> onnxruntime.SessionOptions:
+    """Return options for small networks: one thread."""
     options = onnxruntime.SessionOptions()
     # These networks are too small to share among threads, and the result must not depend on the machine's cores.
     options.intra_op_num_threads = 1

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from rlctl.environments.dict_spaces import Observations, join, split
 from rlctl.errors import ArtifactError, short_repr
+from rlctl.policy import own_modules
 from rlctl.policy.file import PolicyFile, PolicyInfo, list_actor_tensors
 from rlctl.policy.layers import Normalize
 from rlctl.policy.policy import Policy
@@ -84,14 +85,27 @@ def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
     return space
 
 
+def is_own_extractor(cls: type) -> bool:
+    """Return whether a features extractor is a user's, not one of Stable-Baselines3."""
+    return cls.__module__.partition(".")[0] not in ("stable_baselines3", "sb3_contrib")
+
+
+def find_activation(name: Any) -> type[torch.nn.Module]:
+    """Return an activation function by its name, or by the description of a user's class."""
+    return own_modules.find_class(name) if isinstance(name, dict) else ACTIVATIONS[name]
+
+
 def describe_network(policy: BasePolicy) -> dict[str, Any]:
     """Return the constructor's arguments of a network as plain data, for `build_network`."""
     described = {}
     for name, value in {**policy._get_constructor_parameters(), **_list_left_out(policy)}.items():
-        if name in _NOT_KEPT or value is None:
+        if name == "features_extractor_class" and is_own_extractor(value):
+            value = own_modules.describe_class(value)
+        elif name in _NOT_KEPT or value is None:
             continue
         if name == "activation_fn":
-            value = next(known for known, cls in ACTIVATIONS.items() if cls is value)
+            known = next((known for known, cls in ACTIVATIONS.items() if cls is value), None)
+            value = known or own_modules.describe_class(value)
         described[name] = value
     return described
 
@@ -122,7 +136,9 @@ def build_network(info: PolicyInfo) -> BasePolicy:
         raise ArtifactError(f"policy of an unknown kind {info.policy!r} for {info.algo}")
     kwargs = dict(info.policy_kwargs)
     if "activation_fn" in kwargs:
-        kwargs["activation_fn"] = ACTIVATIONS[kwargs["activation_fn"]]
+        kwargs["activation_fn"] = find_activation(kwargs["activation_fn"])
+    if "features_extractor_class" in kwargs:
+        kwargs["features_extractor_class"] = own_modules.find_class(kwargs["features_extractor_class"])
     return cls(
         network_space(observation_space),
         action_space,

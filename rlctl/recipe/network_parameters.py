@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, PlainSerializer, ValidationInfo, WrapValidator
 
 from rlctl.recipe.hyperparameters import Parameters
 from rlctl.recipe.quantities import Number, Switch, Whole
@@ -46,14 +46,31 @@ class _ActorAndCritic(Parameters):
     qf: _Layers
 
 
-Activation = Literal["tanh", "relu", "elu", "silu"]
+def _accept_arguments(value: Any, check: Any, info: ValidationInfo) -> Any:
+    """Accept any arguments for a user's features extractor."""
+    return value if isinstance(value, dict) and info.data.get("features_extractor_class") else check(value)
+
+
+def _to_plain(value: Any) -> Any:
+    return value.model_dump(mode="json", exclude_unset=True) if isinstance(value, Parameters) else value
+
+
+_OwnClass = Annotated[str, Field(pattern=r"^[^:]+:\w+$", json_schema_extra={"text": "FILE.py:CLASS or MODULE:CLASS"})]
+Activation = Annotated[
+    Literal["tanh", "relu", "elu", "silu"],
+    WrapValidator(lambda value, check: value if isinstance(value, str) and ":" in value else check(value)),
+]
 
 
 class _Network(Parameters):
     activation_fn: Activation = "relu"
-    """Activation function of the hidden layers."""
-    features_extractor_kwargs: _FeaturesExtractor | None = None
-    """What comes before the layers of `net_arch`, for images: `features_dim`, `cnn_output_dim`, `normalized_image`."""
+    """Activation function of the hidden layers, or one of yours: `FILE.py:CLASS`, `MODULE:CLASS`."""
+    features_extractor_class: _OwnClass | None = None
+    """Your own network before the layers of `net_arch`: `FILE.py:CLASS`, of SB3's BaseFeaturesExtractor."""
+    features_extractor_kwargs: Annotated[
+        _FeaturesExtractor | None, WrapValidator(_accept_arguments), PlainSerializer(_to_plain)
+    ] = None
+    """For images: `features_dim`, `cnn_output_dim`, `normalized_image`; or the arguments of your own class."""
 
 
 class QNetwork(_Network):

@@ -112,7 +112,7 @@ def _describe(root: Schema, node: Schema) -> str:
     if "enum" in node:
         return " or ".join(map(str, node["enum"]))
     if "pattern" in node:
-        return str(node["pattern"])
+        return str(node.get("text", node["pattern"]))
     if "prefixItems" in node:
         return f"[{', '.join(describe_value(root, each) for each in node['prefixItems'])}]"
     kind = node.get("type")

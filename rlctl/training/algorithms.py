@@ -15,11 +15,13 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from rlctl.environments.dict_spaces import split_space
-from rlctl.errors import RecipeError, UsageError, short_repr
+from rlctl.errors import RecipeError, RlctlError, UsageError, short_repr
+from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.recipe.recipe import ON_POLICY, Normalize, Recipe
 from rlctl.storage import memory
 from rlctl.training.hindsight import replay_arguments
+from rlctl.training.own_networks import write_graph
 from rlctl.training.vec_env import WorkerVecEnv
 
 # numpy reserves a replay buffer without touching it: one of a terabyte is made at once, and fills up step by step.
@@ -56,8 +58,14 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         if recipe.algo in _DELAYED_BY_US:
             model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
         _use_fused_adam(model)
+        write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # what a user's network has wrong shows here
         return model
-    except (AssertionError, ValueError, TypeError, RuntimeError) as error:
+    except (RlctlError, KeyboardInterrupt):
+        raise
+    except Exception as error:
+        own = import_named(recipe.policy_kwargs)
+        if not own and not isinstance(error, AssertionError | ValueError | TypeError | RuntimeError):
+            raise
         raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error) or error, 300)}") from error
 
 
@@ -137,9 +145,9 @@ def _make_schedule(value: Any) -> Any:
 
 
 def _policy_kwargs(recipe: Recipe) -> dict[str, Any]:
-    kwargs = dict(recipe.policy_kwargs)
-    if "activation_fn" in kwargs:
-        kwargs["activation_fn"] = ACTIVATIONS[kwargs["activation_fn"]]
+    kwargs = {**recipe.policy_kwargs, **import_named(recipe.policy_kwargs)}
+    if isinstance(name := kwargs.get("activation_fn"), str):
+        kwargs["activation_fn"] = ACTIVATIONS[name]
     return kwargs
 
 

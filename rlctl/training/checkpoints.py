@@ -8,6 +8,8 @@ from typing import Any
 
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile
+from rlctl.policy.own_modules import describe_change
+from rlctl.policy.torch_policy import describe_network
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.storage import files
@@ -130,7 +132,10 @@ class Checkpoints:
         `changed` is why it cannot be exact, as far as is known before.
         """
         file = checkpoint.folder / "policy.safetensors"
-        PolicyFile.read_info(file).check_fits(self._learner.curriculum.goal, file)
+        info = PolicyFile.read_info(file)
+        info.check_fits(self._learner.curriculum.goal, file)
+        if change := describe_change(info.policy_kwargs, describe_network(self._learner.rollouts.model.policy)):
+            raise ArtifactError(f"{file}: {change}; put it back, or begin a new training: --from {file}")
         mismatch = self._folders.restore(checkpoint)
         inexact = [*changed, *find_differences(checkpoint.state.computed_with, self._folders.computed_with())]
         inexact += [mismatch] if mismatch else []

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.recipe.recipe import Recipe
 from rlctl.rollout.shared_arrays import SegmentArrays
+from rlctl.training.own_networks import write_graph
 from rlctl.training.progress import Progress
 from rlctl.training.snapshot import observation_statistics, pack
 from rlctl.training.updates import choose_learner
@@ -86,6 +87,7 @@ class Rollouts(abc.ABC):
         tensors = {f"policy/{name}": value.cpu().numpy() for name, value in model.policy.state_dict().items()}
         for key, (mean, var) in statistics.items():
             tensors |= {f"normalize/{key}/mean": mean, f"normalize/{key}/var": var}
+        tensors |= write_graph(model, self._algo, workers.info.spaces()[0])
         workers.set_policy(PolicyFile(self._policy_info, tensors))
         if (state := workers.recurrent_state) is not None:
             last = model._last_lstm_states.pi

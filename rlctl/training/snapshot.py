@@ -22,6 +22,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, DivergedError
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.torch_policy import describe_network, policy_name
+from rlctl.training.own_networks import write_graph
 from rlctl.version import collect_versions
 
 Tensors = dict[str, NDArray[Any]]
@@ -55,7 +56,7 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> Policy
         training_steps=model.num_timesteps,
         versions=collect_versions(),
     )
-    return PolicyFile(info, tensors)
+    return PolicyFile(info, {**tensors, **write_graph(model, algo, env.spaces()[0])})
 
 
 def observation_statistics(normalizer: VecNormalize | None) -> dict[str, RunningMeanStd]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from rlctl.environments.task_version import describe_task_changes
 from rlctl.errors import ArtifactError, RecipeError, UsageError
+from rlctl.policy import own_modules
 from rlctl.recipe.recipe import Recipe, validate
 from rlctl.recipe.sources import describe_rounding, resolve_with_stages
 from rlctl.run import lookup
@@ -99,6 +100,7 @@ def _find_new(request: TrainRequest) -> Start:
     task = request.task or ""
     with preserve_process_state():
         recipe = resolve_with_stages(task, request.config, request.settings)
+        recipe = recipe.model_copy(update={"policy_kwargs": own_modules.locate(recipe.policy_kwargs)})
     note = describe_rounding(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
     return Start(request, task, recipe, notes=(note,) if note else (), source=source)

@@ -39,6 +39,7 @@ def of_model(model):
     found = {name: field.default for name, field in model.model_fields.items()}
     if "activation_fn" in found:
         found["activation_fn"] = ACTIVATIONS[found["activation_fn"]]
+        assert found.pop("features_extractor_class") is None  # SB3's default, which follows from the observation
     return found
 
 

@@ -8,6 +8,7 @@ from sb3_contrib import TQC
 from stable_baselines3 import SAC
 
 from rlctl.errors import RecipeError
+from rlctl.training.own_networks import has_own_parts
 from rlctl.training.updates.dqn import DqnUpdate
 from rlctl.training.updates.ppo import PpoUpdate
 from rlctl.training.updates.sac import SacUpdate
@@ -19,7 +20,7 @@ def choose_learner(model: Any) -> Any:
     """Return whose `train` updates a model: one of these, or the model itself, which is SB3's."""
     updates: tuple[Any, ...] = (PpoUpdate, SacUpdate, TqcUpdate, Td3Update, DqnUpdate)
     for update in updates:
-        if update.supports(model):
+        if not has_own_parts(model.policy) and update.supports(model):
             return update(model)
     if type(model) in (SAC, TQC) and getattr(model, "policy_delay", 1) > 1:
         raise RecipeError(

@@ -1,0 +1,108 @@
+"""Networks that a user writes: `FILE.py:CLASS` or `MODULE:CLASS`, as `policy_kwargs` of a recipe name them.
+
+A policy file says which classes it was trained with. They are imported only if the user names them: in a recipe, as
+the run's recipe, or in `$RLCTL_NETWORKS`, a list of files. A policy file alone never causes an import.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rlctl.environments import registry
+from rlctl.environments.plugin_code import import_file
+from rlctl.errors import ArtifactError, RecipeError, RlctlError
+from rlctl.storage import files
+
+KEYS = ("features_extractor_class", "activation_fn")
+"""The `policy_kwargs` that may name a class."""
+VARIABLE = "RLCTL_NETWORKS"
+
+
+def import_named(policy_kwargs: Mapping[str, Any]) -> dict[str, type]:
+    """Import the classes that a recipe's `policy_kwargs` name, and return them by key.
+
+    Raises `RecipeError` for a name without a class, and for any exception of the import.
+    """
+    names = {key: policy_kwargs.get(key) for key in KEYS}
+    return {key: _import(key, name) for key, name in names.items() if isinstance(name, str) and ":" in name}
+
+
+def locate(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `policy_kwargs` with absolute paths of a user's files, so that a run can be continued from anywhere."""
+    located = dict(policy_kwargs)
+    for key in KEYS:
+        place, _, name = str(located.get(key, "")).rpartition(":")
+        if place.endswith(".py"):
+            located[key] = f"{Path(place).expanduser().resolve()}:{name}"
+    return located
+
+
+def _import(key: str, name: str) -> type:
+    try:
+        cls = registry.load(name)
+    except RlctlError as error:
+        problem = str(error).removeprefix(f"task {name!r}: ")
+        raise RecipeError(f"policy_kwargs.{key}: {name}: {problem}", details=error.details) from None
+    if not (inspect.isclass(cls) and any(base.__module__.startswith("torch.nn.") for base in cls.__mro__)):
+        raise RecipeError(f"policy_kwargs.{key}: {name}: not a class of torch.nn.Module")
+    return cls
+
+
+def describe_class(cls: type) -> dict[str, str]:
+    """Return name, file and the file's sha256 of a class, as plain data for a policy file."""
+    module = sys.modules[cls.__module__]
+    if cls.__module__.startswith("torch.nn."):
+        return {"class": cls.__qualname__, "module": "torch.nn"}
+    file = Path(str(module.__file__)).resolve()
+    return {"class": cls.__qualname__, "file": str(file), "sha256": files.digest(file.read_bytes())}
+
+
+def find_class(description: Mapping[str, str]) -> type:
+    """Return the class that a policy file describes, if the user has named its module.
+
+    Raises `ArtifactError` for a module that nobody named, that is gone, or that has changed since the training.
+    """
+    name = str(description["class"])
+    if description.get("module") == "torch.nn" and inspect.isclass(
+        known := getattr(sys.modules["torch.nn"], name, None)
+    ):
+        return known
+    file = Path(str(description["file"]))
+    shown = f"{file}:{name}"
+    if not file.is_file():
+        raise ArtifactError(f"it was trained with {shown}, and that file is missing; put it back")
+    module = _find_module(file)
+    if module is None:
+        raise ArtifactError(
+            f"it was trained with {shown}, which a policy file alone does not import; give the run, or name the file: "
+            f"{VARIABLE}={file}"
+        )
+    if files.digest(file.read_bytes()) != description["sha256"]:
+        raise ArtifactError(f"it was trained with {shown}, which has changed since: put the former version back")
+    cls = getattr(module, name, None)
+    if not inspect.isclass(cls):
+        raise ArtifactError(f"it was trained with {shown}, which has no such class")
+    return cls
+
+
+def _find_module(file: Path) -> Any:
+    """Return the imported module of a file; one that the environment variable names is imported now."""
+    named = [Path(entry).expanduser().resolve() for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry]
+    if file in named:
+        return import_file(str(file), file)
+    loaded = [module for module in list(sys.modules.values()) if getattr(module, "__file__", None)]
+    return next((module for module in loaded if Path(str(module.__file__)).resolve() == file), None)
+
+
+def describe_change(described: Mapping[str, Any], present: Mapping[str, Any]) -> str | None:
+    """Say which own class differs between the `policy_kwargs` of two policies; None where they are the same."""
+    for key in KEYS:
+        before, now = described.get(key), present.get(key)
+        if before != now and isinstance(before, dict) and isinstance(now, dict):
+            return f"{now.get('file')}, with {now['class']}, is not the file that it was trained with"
+    return None

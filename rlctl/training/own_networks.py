@@ -1,0 +1,160 @@
+"""A user's own networks: torch writes the part that is not ours as an ONNX graph, with which workers act."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.preprocessing import preprocess_obs
+
+from rlctl.environments.dict_spaces import SINGLE, join, split_space
+from rlctl.errors import RecipeError, describe_exception, short_repr
+from rlctl.exporting.layers import OPSET
+from rlctl.policy.file import ACTOR_CRITIC, GRAPH, Tensors
+from rlctl.policy.own_graph import OBSERVATION, OUTPUT
+from rlctl.policy.torch_policy import ACTIVATIONS, is_own_extractor
+
+_CACHE = "rlctl_own_graph"
+"""Attribute of a policy: its graph does not change with its weights."""
+
+
+def has_own_parts(policy: Any) -> bool:
+    """Return whether a policy has a features extractor or an activation function that a user wrote or chose."""
+    own_activation = getattr(policy, "activation_fn", None) not in (None, *ACTIVATIONS.values())
+    return own_activation or is_own_extractor(policy.features_extractor_class)
+
+
+def write_graph(model: Any, algo: str, raw_space: spaces.Space[Any]) -> Tensors:
+    """Return the graph of a model's own network as a tensor of a policy file; empty for SB3's networks.
+
+    `raw_space` is the observation space of the environment. Raises `RecipeError` if the network fails, or returns
+    another shape than it says.
+    """
+    policy = model.policy
+    if not has_own_parts(policy):
+        return {}
+    if not hasattr(policy, _CACHE):
+        setattr(policy, _CACHE, _write_graph(_Actor(policy, algo, raw_space), model))
+    return {GRAPH: getattr(policy, _CACHE)}
+
+
+class _Actor(torch.nn.Module):
+    """From the normalised parts of raw observations to the last hidden layer; of recurrent PPO to the LSTM."""
+
+    def __init__(self, policy: Any, algo: str, raw_space: spaces.Space[Any]) -> None:
+        super().__init__()
+        self.prefixes = {"extractor.": "pi_features_extractor.", "trunk.": "mlp_extractor."}
+        owner, trunk = policy, "mlp_extractor"
+        if algo in ACTOR_CRITIC or algo == "dqn":
+            name = "q_net" if algo == "dqn" else "actor"
+            owner, trunk = getattr(policy, name), {"dqn": "q_net", "td3": "mu", "ddpg": "mu"}.get(algo, "latent_pi")
+            self.prefixes = {"extractor.": f"{name}.features_extractor.", "trunk.": f"{name}.{trunk}."}
+        self.extractor = owner.pi_features_extractor if owner is policy else owner.features_extractor
+        self.trunk = None if algo == "recurrent_ppo" else getattr(owner, trunk)
+        self.parts = split_space(raw_space)
+        self._space, self._normalize_images = policy.observation_space, policy.normalize_images
+
+    def compute_features(self, *parts: torch.Tensor) -> torch.Tensor:
+        wanted = split_space(self._space)
+        arranged = {
+            key: value if value.shape[1:] == (wanted[key].shape or ()) else value.permute(0, 3, 1, 2)
+            for key, value in zip(self.parts, parts, strict=True)
+        }
+        observation: Any = preprocess_obs(join(arranged), self._space, normalize_images=self._normalize_images)
+        features: torch.Tensor = self.extractor(observation)
+        return features
+
+    def forward(self, *parts: torch.Tensor) -> torch.Tensor:
+        features = self.compute_features(*parts)
+        if self.trunk is None:
+            return features
+        latent: torch.Tensor = getattr(self.trunk, "forward_actor", self.trunk)(features)
+        return latent
+
+
+def _write_graph(actor: _Actor, model: Any) -> NDArray[np.uint8]:
+    was_training = model.policy.training
+    model.policy.set_training_mode(False)
+    normalized = _list_normalized(model)
+    sample = tuple(
+        torch.from_numpy(
+            np.zeros((2, *(part.shape or ())), np.float32 if key in normalized else part.dtype)  # a batch of two
+        ).to(model.device)
+        for key, part in actor.parts.items()
+    )
+    try:
+        with torch.no_grad():
+            _check_features(actor, sample)
+        return _export(actor, sample)
+    except RecipeError:
+        raise
+    except Exception as error:  # any exception from the user's module or torch's exporter
+        name = type(actor.extractor).__name__
+        raise RecipeError(
+            f"policy_kwargs: {name} cannot be used: {short_repr(describe_exception(error), 300)}"
+        ) from error
+    finally:
+        model.policy.set_training_mode(was_training)
+
+
+def _list_normalized(model: Any) -> list[str]:
+    from rlctl.training.snapshot import observation_statistics
+
+    return list(observation_statistics(model.get_vec_normalize_env()))
+
+
+def _check_features(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> None:
+    features, expected = actor.compute_features(*sample), (2, actor.extractor.features_dim)
+    if tuple(features.shape) != expected:
+        raise RecipeError(
+            f"policy_kwargs.features_extractor_class: {type(actor.extractor).__name__} returns features of shape "
+            f"{tuple(features.shape)} for 2 observations; its features_dim makes it {expected}"
+        )
+
+
+def _export(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> NDArray[np.uint8]:
+    import onnx
+
+    names = [f"{OBSERVATION}{'' if key == SINGLE else key}" for key in actor.parts]
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # this exporter is called deprecated; the new one needs onnxscript
+        torch.onnx.export(
+            actor,
+            sample,
+            file,
+            dynamo=False,
+            opset_version=OPSET,
+            input_names=names,
+            output_names=[OUTPUT],
+            dynamic_axes={name: {0: "batch"} for name in [*names, OUTPUT]},
+            keep_initializers_as_inputs=True,
+            do_constant_folding=False,
+        )
+    proto = onnx.load_from_string(file.getvalue())
+    _take_weights_out(proto.graph, actor)
+    return np.frombuffer(proto.SerializeToString(), np.uint8).copy()
+
+
+def _take_weights_out(graph: Any, actor: _Actor) -> None:
+    """Make the weights inputs that have the names of a policy file's tensors, without values."""
+    renamed = {}
+    for tensor in graph.initializer:
+        begin = next((begin for begin in actor.prefixes if tensor.name.startswith(begin)), None)
+        if begin is not None:
+            renamed[tensor.name] = f"policy/{actor.prefixes[begin]}{tensor.name.removeprefix(begin)}"
+    constants = [tensor for tensor in graph.initializer if tensor.name not in renamed]
+    names_of_constants = {tensor.name for tensor in constants}
+    inputs = [port for port in graph.input if port.name not in names_of_constants]
+    del graph.initializer[:], graph.input[:]
+    graph.initializer.extend(constants)
+    graph.input.extend(inputs)
+    for port in graph.input:
+        port.name = renamed.get(port.name, port.name)
+    for node in graph.node:
+        node.input[:] = [renamed.get(name, name) for name in node.input]
