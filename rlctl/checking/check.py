@@ -22,6 +22,8 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, did_you_mean
 from rlctl.recipe import sources
 
+METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
+"""The method that the findings of a family are about, where nothing more is known."""
 LOADING = ("RL0", "RL216")
 """What is judged even where no instance could be built: loading, and windows that end it."""
 
@@ -38,6 +40,8 @@ class CheckVerdict:
     """Rule id, or the part of the environment that no rule could look into, and why."""
     not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
     """Rule id, and what this kind of environment does not have."""
+    known: list[RuleFinding] = dataclasses.field(default_factory=list)
+    """What an earlier report, the baseline, has too."""
     crashed: dict[str, str] = dataclasses.field(default_factory=dict)
     """Rule id or name of an experiment, and traceback."""
 
@@ -65,6 +69,26 @@ class CheckReport:
             return 3
         bad = (Severity.ERROR, Severity.WARNING) if self.strict else (Severity.ERROR,)
         return int(any(finding.severity in bad for finding in self.verdict.findings))
+
+    def locate(self, finding: RuleFinding) -> tuple[Path, int] | None:
+        """Return file and line of what causes a finding: a call, else the method that it is about, else the class."""
+        if finding.where is not None:
+            return Path(finding.where[0]), finding.where[1]
+        built = self.records.built
+        method = finding.evidence.get("call") or METHODS.get(finding.rule[:3], "")
+        if built is not None and built.file is not None and method in built.lines:
+            return Path(built.file), built.lines[method]
+        return self.place
+
+    def fingerprint(self, finding: RuleFinding) -> str:
+        """Return what identifies a finding in every run: no number of a message, which differ from run to run."""
+        return f"{self.task} {finding.rule} {finding.evidence.get('element', '')}".strip()
+
+    def subtract(self, baseline: Collection[str]) -> None:
+        """Take out the findings whose fingerprints a baseline has: they are known, and fail nothing."""
+        verdict = self.verdict
+        verdict.known += [finding for finding in verdict.findings if self.fingerprint(finding) in baseline]
+        verdict.findings = [finding for finding in verdict.findings if self.fingerprint(finding) not in baseline]
 
     @property
     def place(self) -> tuple[Path, int] | None:

@@ -6,15 +6,18 @@ import inspect
 import linecache
 import re
 import sys
+import sysconfig
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from rlctl.checking.bullet_calls import LIBRARIES
 from rlctl.checking.messages import CallFailure
 from rlctl.checking.progress import CallProgress
 from rlctl.errors import RlctlError
+from rlctl.version import PACKAGE_FOLDER
 
 _HERE = Path(__file__).parent
 NO_DISPLAY = re.compile(
@@ -24,6 +27,11 @@ NO_DISPLAY = re.compile(
     re.IGNORECASE,
 )
 """What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
+_LIBRARY = re.compile(
+    rf"^<|^{re.escape(sysconfig.get_path('stdlib'))}/(?!site-packages|dist-packages)|"
+    rf"(site|dist)-packages/({'|'.join(LIBRARIES)})(/|\\.)"
+)
+"""Files of Python itself and of libraries: what raises there was called wrongly by the environment."""
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
 
 
@@ -49,6 +57,7 @@ def describe_failure(error: EnvironmentRaised, progress: CallProgress) -> CallFa
         error=describe(cause),
         details="".join(traceback.format_exception(cause)),
         file=find_missing_file(cause),
+        where=find_line(cause),
     )
 
 
@@ -56,11 +65,21 @@ def describe(error: BaseException) -> str:
     """Return an exception in a line, with the place in the environment's code."""
     if isinstance(error, RlctlError):  # of the task layer, which names the task and the step itself
         return f"{type(error).__name__}: {error}"
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _HERE not in Path(frame.filename).parents]
-    own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
-    place = f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
+    where = find_line(error)
+    place = f" ({Path(where[0]).name}:{where[1]})" if where else ""
     text = " ".join(str(error).split()) or "no message"
     return f"{type(error).__name__}: {text}{place}"
+
+
+def find_line(error: BaseException) -> tuple[str, int] | None:
+    """Return file and line of the environment's own code that an exception went through last, not a library's."""
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if PACKAGE_FOLDER not in Path(frame.filename).parents
+    ]
+    own = [frame for frame in frames if not _LIBRARY.search(frame.filename)] or frames
+    return (own[-1].filename, own[-1].lineno or 1) if own else None
 
 
 def lacks_display(failure: CallFailure) -> bool:

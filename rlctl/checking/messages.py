@@ -42,6 +42,10 @@ class Built:
     """Whether its Gymnasium registration says that equal seeds may give unequal episodes."""
     truncation: str = "unknown"
     """What the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
+    counter: str = ""
+    """The comparison by which the code of `step` sets `terminated` when a counter of steps reaches a number."""
+    lines: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """The first lines of its methods in `file`, by name."""
     accepts_seed: bool = True
     accepts_options: bool = True
     uses_pybullet: bool = False
@@ -146,6 +150,8 @@ class CallFailure:
     """A traceback, or the last lines that a dying process printed."""
     file: Mapping[str, Any] | None = None
     """A file that was not found: its name, and the folders that were searched."""
+    where: tuple[str, int] | None = None
+    """File and line of the environment's own code that it went through last."""
     process: str = ""
     """Which child process: `probe` or `instances`."""
 

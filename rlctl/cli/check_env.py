@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -24,6 +25,10 @@ def check_env(
         str | None, typer.Option("--output", "-o", metavar="FILE", help="Where the report goes.", show_default="stdout")
     ] = None,
     json: Json = None,
+    baseline: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="A report of --json: what it has is known and fails nothing."),
+    ] = None,
     env_timeout: EnvTimeout = 10.0,
     list_rules: Annotated[bool, typer.Option("--list", help="List all rules, and do nothing else.")] = False,
     explain: Annotated[
@@ -36,7 +41,7 @@ def check_env(
     from rlctl.checking import formats
     from rlctl.checking.check import check
     from rlctl.checking.finding import choose_rules
-    from rlctl.checking.formats import rules
+    from rlctl.checking.formats import rules, structured
     from rlctl.environments.spec import EnvSpec
 
     if explain is not None and explain.upper().startswith("Q"):
@@ -50,8 +55,15 @@ def check_env(
         return
     if task is None:
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
-    form_name, target = formats.choose(form, output, json)
+    if json is not None and (form or output):
+        raise UsageError("--json FILE excludes --format and -o")
+    known = set() if baseline is None else structured.read_baseline(Path(baseline))
     spec = parse_changes(settings).apply(EnvSpec(task))
     report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)
-    formats.show(report, form_name, target)
+    report.subtract(known)
+    formats.show_crashes(report)
+    if json is not None:
+        formats.show(report, "json", json)
+    if json != "-":
+        formats.show(report, form or "text", output)
     raise typer.Exit(report.exit_code)

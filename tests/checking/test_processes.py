@@ -133,15 +133,29 @@ def test_command_of_a_broken_environment(tmp_path):
     file = tmp_path / "report.json"
     chosen = ["--select", "RL1,RL901"]
     run = rlctl(f"{BROKEN}:OftenOutOfRange", "--set", "task.size=4.0", *chosen, "--json", str(file))
-    assert (run.returncode, run.stdout) == (1, "")
+    assert run.returncode == 1
+    assert run.stdout.startswith("error RL103")
     content = json.loads(file.read_text())
     (finding,) = content["findings"]
-    assert finding.keys() == {"rule", "name", "severity", "message", "evidence", "fix"}
+    assert finding.keys() == {
+        *("rule", "name", "severity", "message", "evidence", "fix", "fingerprint", "file", "line"),
+    }
+    assert finding["fingerprint"].endswith(finding["evidence"]["element"])
     assert (finding["rule"], finding["severity"]) == ("RL103", "error")
     assert finding["evidence"]["expected"] == [-4.0, 4.0]
     assert content["speed"]["steps_per_second"] > 0
     assert content["environment"]["action_space"].startswith("Box(-1.0, 1.0, (2,)")
     assert content["not_judged"] == []
+
+
+def test_findings_of_the_baseline_fail_nothing(tmp_path):
+    task, file = f"{BROKEN}:ArrayReward", str(tmp_path / "report.json")
+    assert rlctl(task, "--select", "RL2", "--json", file).returncode == 1
+    run = rlctl(task, "--select", "RL2", "--baseline", file)
+    assert run.returncode == 0
+    assert "no findings, 1 known from the baseline" in run.stdout
+    run = rlctl(task, "--select", "RL2", "--baseline", str(tmp_path / "none.json"))
+    assert (run.returncode, run.stdout) == (2, "")
 
 
 def test_command_shows_the_worst_first_with_numbers_and_fix():

@@ -102,6 +102,11 @@ def _find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
         return
     ended = [episode for episode in episodes if episode.ended == "terminated"]
     limit = max((episode.steps for episode in ended), default=0)
+    if records.require_built().counter:
+        counter = records.require_built().counter
+        message = f"step sets terminated by a counter ({counter}), and truncated is always False"
+        yield RuleFinding("RL501", message, {"value": "terminated", "expected": "truncated"})
+        return
     longer = [episode for episode in episodes if episode.ended not in ENDS] + records.role("search")
     if any(episode.steps > limit for episode in longer):
         return

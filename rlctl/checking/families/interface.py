@@ -112,7 +112,7 @@ def _find_exceptions(records: Records) -> Iterator[RuleFinding]:
         failure for failure in select_failures(records, "raised") if failure.file is None
     ]  # the others are RL007's
     for failure in raised[:MOST_FAILURES]:
-        yield RuleFinding("RL207", failure.message, failure.place)
+        yield RuleFinding("RL207", failure.message, failure.place, where=failure.where)
 
 
 @check("RL208")
@@ -165,7 +165,9 @@ def render(context: Context) -> Iterator[ChildMessage]:
         return
     if wrong := _describe_wrong_picture(picture):
         message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"
-        yield RuleFinding("RL215", message, {"value": wrong, "expected": PICTURE})
+        is_rgba = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.shape[2:] == (4,)
+        severity = Severity.INFO if is_rgba else None
+        yield RuleFinding("RL215", message, {"value": wrong, "expected": PICTURE}, severity)
 
 
 def _lacks_library(error: BaseException) -> bool:

@@ -17,7 +17,7 @@ from rlctl.checking.experiments import check, experiment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.checking.families.interface import select_failures
-from rlctl.checking.finding import NotJudged, RuleFinding, Severity
+from rlctl.checking.finding import RULES, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage, Skipped
 from rlctl.checking.recording import Recording
@@ -125,7 +125,7 @@ def _failure(records: Records, rule: str, phase: str, doing: str) -> RuleFinding
     return None
 
 
-@check("RL401", "comparisons", "instances")
+@check("RL401", "comparisons", "global random", "instances")
 def find_shared_world(records: Records) -> Iterator[RuleFinding]:
     """Compare instances that were stepped in turns with such that were alone."""
     _require_same_alone(records)
@@ -135,7 +135,11 @@ def find_shared_world(records: Records) -> Iterator[RuleFinding]:
     for alone, beside in (("fresh process", "interleaved"), ("second alone", "interleaved second")):
         trajectory, difference = compare(records, alone, beside)
         if difference is not None:
-            yield report("RL401", records, trajectory, difference, f"{IN_TURNS}, against one alone")
+            draws = any(finding.rule == "RL309" for finding in records.findings)
+            cause, fix = (
+                ("; both draw from a global random generator (RL309)", RULES["RL309"].fix) if draws else ("", "")
+            )
+            yield report("RL401", records, trajectory, difference, f"{IN_TURNS}, against one alone", cause, fix)
             return
 
 

@@ -163,7 +163,8 @@ def describe_built(instance: Instance) -> Built:
         events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
         max_steps=find_longest_episode(env),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
-        truncation=_read_truncation(inner),
+        **_read_flags(inner),
+        lines=_find_lines(author, file),
         accepts_seed=instance.accepts_seed,
         accepts_options=instance.accepts_options,
         uses_pybullet=bool(find_clients()),
@@ -189,19 +190,37 @@ def _place(author: type) -> tuple[str | None, int | None]:
         return None, None
 
 
-def _read_truncation(env: Any) -> str:
-    """Return what the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
+def _find_lines(author: type, file: str | None) -> dict[str, int]:
+    """Return the first lines of the methods of a class that are written in one file."""
+    lines = {}
+    for name in ("__init__", "reset", "step"):
+        code = getattr(inspect.unwrap(getattr(author, name, None) or author), "__code__", None)
+        if code is not None and code.co_filename == file:
+            lines[name] = int(code.co_firstlineno)
+    return lines
+
+
+def _read_flags(env: Any) -> dict[str, str]:
+    """Return what the code of `step` says of its flags, as `Built` has it."""
     try:
         nodes = list(ast.walk(ast.parse(textwrap.dedent(inspect.getsource(type(env).step)))))
     except (AttributeError, OSError, TypeError, SyntaxError):
-        return "unknown"
+        return {}
     returned = [node.value for node in nodes if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple)]
-    flags = [ast.unparse(values.elts[3]) for values in returned if len(values.elts) == 5]
+    flags = [[ast.unparse(element) for element in values.elts[2:4]] for values in returned if len(values.elts) == 5]
     assigned: dict[str, set[str]] = {}
+    counters = set()
     for node in nodes:
         if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign) and node.value is not None:
             for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
                 assigned.setdefault(ast.unparse(target), set()).add(ast.unparse(node.value))
+        if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and ast.unparse(node.value) == "1":
+            counters.add(ast.unparse(node.target))
     if not flags:
-        return "unknown"
-    return "never" if all(assigned.get(flag, {flag}) == {"False"} for flag in flags) else "computed"
+        return {}
+    if any(assigned.get(truncated, {truncated}) != {"False"} for _, truncated in flags):
+        return {"truncation": "computed"}
+    texts = {text for terminated, _ in flags for text in assigned.get(terminated, {terminated})}
+    names = "|".join(map(re.escape, counters))
+    limits = [re.search(rf"\(?(?:{names})\s*(?:>=|>|==)\s*[\w.]+\)?", text) for text in texts if counters]
+    return {"truncation": "never", "counter": next((limit[0] for limit in limits if limit), "")}

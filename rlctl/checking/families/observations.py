@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.experiments import RECORDING, check
-from rlctl.checking.finding import RuleFinding, Severity
+from rlctl.checking.finding import RuleFinding, Severity, list_names
 from rlctl.checking.leaves import Leaf, name_leaf
 from rlctl.checking.messages import Form, RecordedEpisode, Series
 from rlctl.checking.records import Records
@@ -19,6 +19,9 @@ ROUNDING = 1e-6
 LARGE_SHARE, SMALL_SHARE = 0.1, 0.005
 """Part of all observations from which values outside the bounds are no rare extreme, or below which they hardly matter.
 The last one of an episode does not count: a limit that ends it has just been passed."""
+OFF_CENTRE = 0.05
+"""How far zero may be from the middle of an action's range, in parts of the range, for an info."""
+MOST_NAMED = 8
 SMALLEST_SIDE = 36
 """An image with a shorter side does not fit through the default network's filters [pixels]."""
 
@@ -103,10 +106,13 @@ def find_out_of_range(records: Records) -> Iterator[RuleFinding]:
         outside = np.concatenate([excess.any(axis=1) for *_, excess in recorded])
         count, total = int(outside.sum()), len(outside)
         element = built.element(index, flat)
+        columns = np.flatnonzero(np.any([record[2].any(axis=0) for record in recorded], axis=0))
+        others = [built.element(index, int(column)) for column in columns if column != flat]
+        more = f"; so are {list_names(others, MOST_NAMED)}" if others else ""
         yield RuleFinding(
             "RL103",
             f"{element} is {value:.9g} {_when(step)}; the space allows [{low:.9g}, {high:.9g}]"
-            f"{' (float rounding)' if is_rounding else ''}; {count} of {total} observations are outside",
+            f"{' (float rounding)' if is_rounding else ''}; {count} of {total} observations are outside{more}",
             trajectory.at(
                 step,
                 element=element,
@@ -175,9 +181,12 @@ def _unusual_actions(leaf: Leaf) -> Iterator[RuleFinding]:
     low, high = np.ravel(np.asarray(leaf.low, np.float64)), np.ravel(np.asarray(leaf.high, np.float64))
     is_open = ~np.isfinite(low) | ~np.isfinite(high)
     is_thrust = (low == 0) & (high <= 1)  # or a pedal: by nature to one side
+    with np.errstate(invalid="ignore"):
+        off = np.where(is_open | is_thrust, 0.0, np.abs(low + high) / np.maximum(high - low, 1e-9))
     for wrong, severity, what in (
         (is_open, Severity.ERROR, "have no finite bounds"),
-        ((low != -high) & ~is_thrust, Severity.WARNING, "are not symmetric"),
+        (off > OFF_CENTRE, Severity.WARNING, "are not symmetric"),
+        (off > 0, Severity.INFO, "are not quite symmetric"),
         ((low != -1) | (high != 1), Severity.INFO, "are not in [-1, 1]"),
     ):
         if wrong.any():

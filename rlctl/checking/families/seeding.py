@@ -19,7 +19,7 @@ from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.messages import FIRST_SEED, ChildMessage
 from rlctl.checking.records import Records
 
-WATCHED_STEPS = 30
+WATCHED_STEPS = 300
 """For how many steps the process's random generators are compared."""
 UNSEEDED_RESETS, UNSEEDED_STEPS = 2, 20
 """Of two discrete starts one may be the same by chance."""

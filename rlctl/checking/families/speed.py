@@ -11,7 +11,7 @@ from rlctl.checking.bullet_calls import visible_to_profilers
 from rlctl.checking.clock import read_clock
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments import check, experiment
-from rlctl.checking.finding import NotJudged, RuleFinding, list_names
+from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context, Instance, Timer, rebuilds_world
 from rlctl.checking.messages import ChildMessage, Fact
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_code
@@ -35,6 +35,8 @@ MOST_CALLS = 5
 MILLION = 1_000_000
 SLOW_STEPS_PER_S = 100.0
 """Below it a million steps, a small training, take about three hours on one core [steps/s]."""
+CLEARLY_SLOW = 1.25
+"""So many times slower than that is a warning; less may be a busy machine."""
 SLOW_LOADING_S = 0.005
 """Loading in a reset that takes less is not reported, whatever its share of short episodes: PyBullet's resetSimulation
 of an empty world alone takes half a millisecond [s]."""
@@ -147,6 +149,7 @@ def _find_slow_step(records: Records) -> Iterator[RuleFinding]:
         "RL901",
         f"{per_s:,.3g} steps/s: a million steps take {hours:,.3g} hours per process on this machine; slowest: {calls}",
         {"value": per_s, "expected": SLOW_STEPS_PER_S, "step_ms": 1e3 * speed.step_s, "steps": speed.steps},
+        Severity.WARNING if left * SLOW_STEPS_PER_S > CLEARLY_SLOW else Severity.INFO,
     )
 
 
@@ -181,6 +184,7 @@ def _find_loading(records: Records) -> Iterator[RuleFinding]:
                 "RL904",
                 f"{call} calls {names}: {_time(seconds)} per {call}, {share:.0%} of {part}",
                 {"call": call, "value": [timed.name for timed in named], "ms": 1e3 * seconds, "share": share},
+                Severity.WARNING if share >= LITTLE_LOADING else Severity.INFO,
             )
 
 

@@ -14,8 +14,7 @@ COMMANDS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO:
 
 def text(report: CheckReport) -> str:
     """Return a line per finding, and one that says what was found."""
-    place = _place(report)
-    lines = [_annotation(finding, place) for finding in report.verdict.findings]
+    lines = [_annotation(finding, _place(report.locate(finding))) for finding in report.verdict.findings]
     lines += [f"::error title={name} crashed::a bug in rlctl" for name in report.verdict.crashed]
     return "\n".join([*lines, summary(report)]) + "\n"
 
@@ -26,11 +25,11 @@ def _annotation(finding: RuleFinding, place: str) -> str:
     return f"::{COMMANDS[finding.severity]} {place}title={title}::{message}"
 
 
-def _place(report: CheckReport) -> str:
+def _place(place: tuple[Path, int] | None) -> str:
     """Return file and line as properties; empty for a file outside the repository, which cannot be annotated."""
-    if report.place is None:
+    if place is None:
         return ""
-    file, line = report.place
+    file, line = place
     root = Path(os.environ.get("GITHUB_WORKSPACE", Path.cwd())).resolve()
     if not file.resolve().is_relative_to(root):
         return ""

@@ -6,6 +6,7 @@ import io
 import itertools
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import output
@@ -50,6 +51,7 @@ def summary(report: CheckReport) -> str:
     counts = Counter(finding.severity for finding in verdict.findings)
     counted = ", ".join(output.format_count(counts[s], s) for s in Severity if counts[s])
     waived = f", {len(verdict.waived)} waived" if verdict.waived else ""
+    waived += f", {len(verdict.known)} known from the baseline" if verdict.known else ""
     rules = f"{output.format_count(len(verdict.judged), 'rule')} judged"
     return f"{report.task}: {counted or 'no findings'}{waived}; {rules} in {report.seconds:.1f} s"
 
@@ -91,7 +93,9 @@ def _add(body: Text, finding: RuleFinding) -> None:
 
 
 def _numbers(finding: RuleFinding) -> str:
-    shown = {key: value for key, value in finding.evidence.items() if key not in LONG and value is not None}
+    shown = {key: value for key, value in finding.evidence.items() if key not in LONG and value not in (None, [], "")}
+    if finding.where is not None:
+        shown["at"] = f"{Path(finding.where[0]).name}:{finding.where[1]}"
     return ", ".join(f"{key.replace('_', ' ')} {_short(value)}" for key, value in shown.items())
 
 
@@ -127,11 +131,12 @@ def _facts(report: CheckReport) -> Iterator[str]:
     if built is None:
         yield "not judged: everything else, because no instance could be built"
         return
-    for kind, unjudged in (("does not apply", verdict.not_applicable), ("not judged", verdict.not_judged)):
-        reasons: dict[str, list[str]] = {}
-        for name, reason in unjudged.items():
-            reasons.setdefault(reason, []).append(name)
-        yield from (f"{kind}: {', '.join(_families(names))}: {reason}" for reason, names in reasons.items())
+    if verdict.not_applicable:
+        yield f"does not apply: {', '.join(_families(list(verdict.not_applicable)))} (--json FILE says why)"
+    reasons: dict[str, list[str]] = {}
+    for name, reason in verdict.not_judged.items():
+        reasons.setdefault(reason, []).append(name)
+    yield from (f"not judged: {', '.join(_families(names))}: {reason}" for reason, names in reasons.items())
 
 
 def _families(names: list[str]) -> list[str]:
@@ -145,7 +150,7 @@ def _table(rows: list[Row]) -> Iterator[str]:
     names = [f"{row.name}{f' ({row.size})' if row.size > 1 else ''}" for row in shown]
     width = max((len(name) for name in names), default=0)
     for name, row in zip(names, shown, strict=True):
-        observed = f", observed {row.observed[0]:.4g} to {row.observed[1]:.4g}" if row.observed else ""
-        yield f"  {name:<{width}}  {row.low:.4g} to {row.high:.4g}{observed}"
+        observed = f", observed {row.observed[0] + 0.0:.4g} to {row.observed[1] + 0.0:.4g}" if row.observed else ""
+        yield f"  {name:<{width}}  {row.low + 0.0:.4g} to {row.high + 0.0:.4g}{observed}"
     if len(rows) > SHOWN_ROWS:
         yield f"  and {len(rows) - SHOWN_ROWS} more"

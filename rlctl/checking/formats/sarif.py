@@ -21,11 +21,12 @@ SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 def text(report: CheckReport) -> str:
     """Return a report as SARIF."""
     verdict = report.verdict
-    known = {finding.rule for finding in (*verdict.findings, *verdict.waived)}
+    known = {finding.rule for finding in (*verdict.findings, *verdict.waived, *verdict.known)}
     rules = [rule for rule in RULES.values() if rule.id in known]
     numbers = {rule.id: number for number, rule in enumerate(rules)}
     waivers = report.records.built.waivers if report.records.built else {}
     results = [_result(report, finding, numbers) for finding in verdict.findings]
+    results += [{**_result(report, known, numbers), "baselineState": "unchanged"} for known in verdict.known]
     for finding in verdict.waived:
         suppression = {"kind": "inSource", "justification": waivers[finding.rule]}
         results.append({**_result(report, finding, numbers), "suppressions": [suppression]})
@@ -56,14 +57,11 @@ def _result(report: CheckReport, finding: RuleFinding, numbers: dict[str, int]) 
         "ruleIndex": numbers[finding.rule],
         "level": LEVELS[finding.severity],
         "message": {"text": f"{finding.message}\nfix: {finding.fix}"},
-        # The numbers in a message change from run to run; rule, task and element do not.
-        "partialFingerprints": {
-            "rlctl/v1": f"{report.task} {finding.rule} {finding.evidence.get('element', '')}".strip()
-        },
+        "partialFingerprints": {"rlctl/v1": report.fingerprint(finding)},
         "properties": {"task": report.task, "evidence": plain(finding.evidence)},
     }
-    if report.place is not None:
-        file, line = report.place
+    if (place := report.locate(finding)) is not None:
+        file, line = place
         location = {"artifactLocation": _artifact(file.resolve()), "region": {"startLine": line}}
         result["locations"] = [{"physicalLocation": location}]
     return result

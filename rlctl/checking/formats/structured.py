@@ -17,6 +17,7 @@ from rlctl.checking.finding import RuleFinding
 from rlctl.checking.leaves import Leaf, name_leaf
 from rlctl.checking.messages import Built
 from rlctl.checking.records import Records
+from rlctl.errors import UsageError
 from rlctl.version import __version__
 
 SCHEMA = Path(__file__).parent.parent / "report.schema.json"
@@ -33,14 +34,15 @@ def content(report: CheckReport) -> dict[str, Any]:
     """Return a report as plain data."""
     verdict, records = report.verdict, report.records
     return {
-        "format": "rlctl check-env 1",
+        "format": "rlctl check-env 2",
         "rlctl": __version__,
         "task": report.task,
         "exit_code": report.exit_code,
         "strict": report.strict,
-        "findings": [finding_json(finding) for finding in verdict.findings],
+        "findings": [_describe(report, finding) for finding in verdict.findings],
+        "known": [_describe(report, finding) for finding in verdict.known],
         "waived": [
-            {**finding_json(finding), "reason": records.built.waivers[finding.rule] if records.built else ""}
+            {**_describe(report, finding), "reason": records.built.waivers[finding.rule] if records.built else ""}
             for finding in verdict.waived
         ],
         "judged": verdict.judged,
@@ -55,6 +57,25 @@ def content(report: CheckReport) -> dict[str, Any]:
         "budget_seconds": report.budget_s,
         "experiments": {name: end.seconds for name, end in records.finished.items()},
     }
+
+
+def read_baseline(file: Path) -> set[str]:
+    """Return the fingerprints of all findings of a JSON report; raises `UsageError` for another file."""
+    try:
+        report = json.loads(file.read_text(encoding="utf-8"))
+        return {finding["fingerprint"] for part in ("findings", "known") for finding in report[part]}
+    except OSError as error:
+        raise UsageError(
+            f"--baseline {file}: {error.strerror}; make one with rlctl check-env TASK --json {file}"
+        ) from None
+    except (ValueError, KeyError, TypeError):
+        raise UsageError(f"--baseline {file} is no report of rlctl check-env --json") from None
+
+
+def _describe(report: CheckReport, finding: RuleFinding) -> dict[str, Any]:
+    place = report.locate(finding)
+    where = {"file": str(place[0]), "line": place[1]} if place else {"file": None, "line": None}
+    return {**finding_json(finding), "fingerprint": report.fingerprint(finding), **where}
 
 
 def finding_json(finding: RuleFinding) -> dict[str, Any]:
