@@ -1,4 +1,4 @@
-"""Writes the generated pages, `recipe.md`, `rules.md` and the JSON schema of recipes: `python docs/generate.py`."""
+"""Writes `recipe.md` and the JSON schema of recipes: `python docs/generate.py`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Iterator
 
 from pydantic import BaseModel
 
-from rlctl.checking.formats import rules
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.json_schema import render_json_schema
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
@@ -121,7 +120,6 @@ def render_pages() -> dict[str, str]:
     """Return the generated files by name."""
     return {
         "recipe.md": render_recipe_page(),
-        "rules.md": rules.render_page(),
         "../rlctl/recipe/recipe.schema.json": render_json_schema(),
     }
 

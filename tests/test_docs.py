@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib.util
 import re
 import shlex
 import tomllib
@@ -280,3 +281,11 @@ def test_files_named_by_the_page_on_the_architecture_exist():
 
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 200
+
+
+def test_pages_of_the_rules_are_current():
+    spec = importlib.util.spec_from_file_location("make_rules", ROOT / "docs" / "make_rules.py")
+    make_rules = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(make_rules)
+    for file, text in make_rules.render_all(make_rules.read_printed()).items():
+        assert file.read_text() == text, "run: python docs/make_rules.py"

@@ -32,6 +32,7 @@ STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))
 DELAY_STEPS = 4
 """Over so many steps the effect of the first action is looked for."""
 NAN_STEPS = 4
+"""Of an episode whose first action is NaN."""
 LONGEST_DELAY = 4
 """Observations may hold so many earlier actions; a penalty on changes of the action reaches as far [steps]."""
 MOST_NAMES = 8
@@ -50,10 +51,10 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
             raise NotJudged("no number of the action can be varied")
         trials = Trials(context, instance)
         trials.require_repeatable()
-        yield from _late_effects(trials, every)
         effects: dict[str, Effect] = {}
         why = f"only {MOST_DIMENSIONS} are compared" if len(every) > MOST_DIMENSIONS else ""
         try:
+            yield from _late_effects(trials, every)
             for dimension in every[:MOST_DIMENSIONS]:
                 effects[dimension.name] = _find_effect(trials, dimension)
         except OutOfTime:
@@ -71,22 +72,28 @@ def give_nan(context: Context) -> Iterator[ChildMessage]:
         if not any(leaf.kind == "Box" and leaf.dtype.startswith("float") for leaf in instance.action_leaves):
             raise NotApplicable("no continuous action")
         trials = Trials(context, instance)
-        good = trials.actions(FIRST_SEED, NAN_STEPS)
-        numbers = [
-            number for number in find_dimensions(instance.action_leaves) if number.leaf.dtype.startswith("float")
-        ]
         # A simulator may write a log about it to the working directory: MuJoCo does.
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.suppress(EnvironmentRaised):
-            frames = trials.with_values(FIRST_SEED, NAN_STEPS, dict.fromkeys(numbers, np.nan), at=0)
-            if not all(np.isfinite(frame).all() for frame in frames[1:]):
-                later = trials.play(FIRST_SEED, good)
-                lasts = not all(np.isfinite(frame).all() for frame in later)
-                where = "the observation or the reward" + (", in later episodes too" if lasts else "")
+            try:
+                returned = _play_nan(trials)
+            except OutOfTime:
+                raise NotJudged("time ran out before an action of NaN could be judged") from None
+            if returned:
                 evidence = {"seed": FIRST_SEED, "step": 1, "value": "NaN", "expected": "an exception"}
-                severity = Severity.WARNING if lasts else None
-                yield RuleFinding(
-                    "RL704", f"an action of NaN is accepted, and NaN comes back in {where}", evidence, severity
-                )
+                severity = Severity.WARNING if "later" in returned else None
+                message = f"an action of NaN is accepted, and NaN comes back in {returned}"
+                yield RuleFinding("RL704", message, evidence, severity)
+
+
+def _play_nan(trials: Trials) -> str:
+    """Return where NaN comes back after a first action of NaN; empty where it does not."""
+    numbers = [number for number in find_dimensions(trials.instance.action_leaves) if "float" in number.leaf.dtype]
+    frames = trials.with_values(FIRST_SEED, NAN_STEPS, dict.fromkeys(numbers, np.nan), at=0)
+    if all(np.isfinite(frame).all() for frame in frames[1:]):
+        return ""
+    later = trials.play(FIRST_SEED, trials.actions(FIRST_SEED, NAN_STEPS))
+    lasts = not all(np.isfinite(frame).all() for frame in later)
+    return "the observation or the reward" + (", in later episodes too" if lasts else "")
 
 
 def _late_effects(trials: Trials, dimensions: Sequence[ActionNumber]) -> Iterator[RuleFinding]:

@@ -49,7 +49,7 @@ def change_attributes(context: Context) -> Iterator[ChildMessage]:
     with context.fresh() as instance:
         trials = Trials(context, instance)
         trials.require_repeatable()
-        plain = trials.plain(FIRST_SEED, HIDDEN_STEPS)
+        plain = trials.plain(FIRST_SEED, HIDDEN_STEPS)  # known by now
         if plain[0].size > MOST_OBSERVED:
             raise NotApplicable(f"the observation has more than {MOST_OBSERVED} numbers")
         try:
