@@ -137,8 +137,9 @@ def _shorten(source: str) -> str:
     """Leave out docstrings and what comes after enough lines."""
     source = re.sub(r'^ *""".*?"""\n+', "", source, flags=re.DOTALL | re.MULTILINE)
     lines = source.rstrip().splitlines()
-    more = ["    # ..."] if len(lines) > MOST_LINES else []
-    return "\n".join(lines[:MOST_LINES] + more) + "\n"
+    more = ["", "    ..."] if len(lines) > MOST_LINES else []
+    text = "\n".join(lines[:MOST_LINES]).rstrip()
+    return "\n".join([text, *more]) + "\n"
 
 
 def main() -> None:
