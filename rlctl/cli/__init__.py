@@ -12,6 +12,8 @@ from typing import Annotated
 import typer
 
 from rlctl.cli import check_env, eval, export, identify, recipe, replay, runs, serve, tasks, train, tune
+from rlctl.cli.arguments import suggest_setting
+from rlctl.errors import UsageError
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
 
@@ -90,6 +92,11 @@ def _call(arguments: list[str]) -> int:
         code = app(arguments, standalone_mode=False)
     except typer.Abort:  # at a question
         raise KeyboardInterrupt from None
+    except Exception as error:
+        option = getattr(error, "option_name", None)  # of Typer's error for an option that does not exist
+        if option is not None and arguments[0] in ("train", "tune") and (setting := suggest_setting(option)):
+            raise UsageError(f"no option {option}; it is a key of the recipe: {setting}VALUE") from None
+        raise
     if code == error_boundary.INTERRUPTED:
         raise KeyboardInterrupt  # which Typer has caught
     return code if isinstance(code, int) else 0

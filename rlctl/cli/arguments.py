@@ -69,6 +69,18 @@ class RecipeFlags:
         return merge_flags(**vars(self))
 
 
+def suggest_setting(option: str) -> str | None:
+    """Return `--set algo_kwargs.learning_rate=` for `--lr` or `--learning-rate`; None where no recipe has the key."""
+    from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
+    from rlctl.recipe.recipe import Recipe
+
+    name = option.lstrip("-").replace("-", "_")
+    name = {"lr": "learning_rate"}.get(name, name)
+    if any(name in parameters.model_fields for parameters in ALGORITHM_PARAMETERS.values()):
+        return f"--set algo_kwargs.{name}="
+    return f"--set {name}=" if name in Recipe.model_fields else None
+
+
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a function for Typer: each parameter that is a dataclass is replaced by its fields that are options."""
     parameters, requests = [], {}

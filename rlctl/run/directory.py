@@ -142,6 +142,8 @@ class RunDirectory:
         if which in ("best", "last"):
             file = self.best_policy if which == "best" else self.last_policy
             if not file.is_file():
+                if which == "best" and self.evals_file.is_file() and self.checkpoints():
+                    raise ArtifactError(f"{file}: missing, although the run was evaluated; use --checkpoint last")
                 hint = "train longer, or use --checkpoint last" if which == "best" else "it saved none"
                 raise ArtifactError(f"{self.path}: no {which} policy yet; {hint}")
             return file

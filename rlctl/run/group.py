@@ -93,7 +93,7 @@ def find_group(text: str, root: Path = ROOT) -> Path | None:
     """Return the group that a user's word stands for, if it does: its folder, or a word whose newest run is in one."""
     if is_group(Path(text)):
         return Path(text)
-    folder = find_run(text, root).path.parent
+    folder = find_run(text, root, to_train=True).path.parent
     return folder if is_group(folder) and not (Path(text) / "run.json").is_file() else None
 
 

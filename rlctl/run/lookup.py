@@ -39,8 +39,11 @@ class FoundPolicy:
         return dataclasses.replace(spec, task=locate_task(spec.task, self.run))
 
 
-def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
-    """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing."""
+def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> RunDirectory:
+    """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing.
+
+    Where there is none the error names the policy that the task ships, `to_train` from or to use.
+    """
     if text is None or text == "latest":
         # The link first: names go by a clock, which may have been set back since.
         newest = _read_latest(root) or next(iter(_list_newest_first(root, "*/*/run.json", "*/*/*_s*/run.json")), None)
@@ -72,7 +75,8 @@ def find_run(text: str | None, root: Path = ROOT) -> RunDirectory:
     if tunings := sorted((root / registry.make_slug(text)).glob(f"*/{TUNE_FILE}")):
         raise ArtifactError(f"no run of {text!r} but the trials of rlctl tune; name one in {tunings[-1].parent}")
     if entry := installed.find(text):
-        shipped = "; for the policy that it ships: --pretrained" if entry.policy_file else ""
+        option = f"rlctl train {text} --from {text}" if to_train else "--pretrained"
+        shipped = f"; for the policy that it ships: {option}" if entry.policy_file else ""
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
     names = {each.name for each in root.glob("*/")} | {each.name for each in installed.list_installed()}
     hint = did_you_mean(text, sorted(names)) or " All runs: rlctl runs"

@@ -130,9 +130,10 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
 def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Checkpoints:
     """Restore the checkpoint, if there is one, and return what writes from now on."""
     from rlctl.training.checkpoints import Checkpoints
-    from rlctl.training.tensorboard import make_logger
+    from rlctl.training.tensorboard import list_parameters, make_logger
 
-    learner.model.set_logger(make_logger(run.tensorboard, display.message, None if start.run is None else start.step))
+    resumed_at = None if start.run is None else start.step
+    learner.model.set_logger(make_logger(run.tensorboard, display.message, resumed_at, list_parameters(start.recipe)))
     checkpoints = Checkpoints(learner, run, start.recipe.checkpoint.keep, display.message)
     for note in start.notes:
         display.message(note)

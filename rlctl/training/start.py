@@ -113,7 +113,7 @@ def _find_checkpoint(request: TrainRequest) -> Start:
     """
     from rlctl.training import checkpoint
 
-    run = lookup.find_run(request.resume, request.root)
+    run = lookup.find_run(request.resume, request.root, to_train=True)
     before = run.recipe()
     lock = run.lock()  # before looking: a process that is training removes old checkpoints
     try:

@@ -16,9 +16,12 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
-from torch.utils.tensorboard.summary import histogram
+from torch.utils.tensorboard.summary import histogram, hparams
+
+from rlctl.recipe.recipe import Recipe
 
 _BINS = 40
+_COMPARED = ("eval/success_rate", "eval/mean_reward", "eval/mean_ep_length")
 
 
 class _EventFile(KVWriter):
@@ -78,12 +81,33 @@ class _EventFile(KVWriter):
                 before.close()
 
 
-def make_logger(folder: Path, warn: Callable[[str], None], resumed_at: int | None = None) -> Logger:
+def make_logger(
+    folder: Path,
+    warn: Callable[[str], None],
+    resumed_at: int | None = None,
+    parameters: Mapping[str, bool | str | float] | None = None,
+) -> Logger:
     """Return a logger that writes to a TensorBoard folder; `warn` is called if it cannot.
 
-    What was written after the step that a training resumes at is not shown any more.
+    What was written after the step that a training resumes at is not shown any more. `parameters` are the
+    hyperparameters that TensorBoard compares runs by, with their evaluations.
     """
     events = _EventFile(folder, warn)
     if resumed_at is not None:
         events.add(Event(step=resumed_at + 1, session_log=SessionLog(status=SessionLog.START)))
+    elif parameters:
+        for summary in hparams(dict(parameters), dict.fromkeys(_COMPARED, 0.0)):  # type: ignore[no-untyped-call]
+            events.add(Event(summary=summary))
     return Logger(str(folder), [events])
+
+
+def list_parameters(recipe: Recipe) -> dict[str, bool | str | float]:
+    """Return what TensorBoard compares runs by: the algorithm, its parameters, seed and size of a training."""
+    values: dict[str, Any] = {
+        "algo": recipe.algo,
+        "seed": recipe.seed,
+        "n_envs": recipe.n_envs,
+        "total_timesteps": recipe.total_timesteps,
+        **recipe.algo_kwargs,
+    }
+    return {name: value for name, value in values.items() if isinstance(value, bool | str | int | float)}

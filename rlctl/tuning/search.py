@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import json
 import math
 import signal
 import sys
@@ -13,6 +15,7 @@ from typing import Any
 import optuna
 from optuna.trial import TrialState
 
+from rlctl.environments import registry
 from rlctl.environments.spec import merge
 from rlctl.errors import RunTaken, UsageError
 from rlctl.run.directory import RunDirectory
@@ -27,6 +30,8 @@ _EVALUATIONS_UNJUDGED = 2
 _TRIALS_UNJUDGED = 3
 _MOST_REPEATS = 50
 _KILLED = 128 + signal.SIGKILL
+_LABEL = "trial"
+"""User attribute of Optuna's trials: which of which tuning it is."""
 _STATES = {"done": TrialState.COMPLETE, "pruned": TrialState.PRUNED, "failed": TrialState.FAIL}
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -43,24 +48,49 @@ class StepSearch:
         best = find_best([each for each in tuning.trials if each.step < number])
         assert best is not None  # the recipe as it is
         self._recipe, self._kept = recipe, best.values
-        self._study = optuna.create_study(
+        self._study = self._open_study()
+        self._lock = threading.Lock()
+        own = [trial for trial in tuning.trials if trial.step == number]
+        self._begun = [trial for trial in own if trial.state == "begun"]
+        # What the best so far has of these dimensions is known already.
+        for trial in (best, *(trial for trial in own if trial.state != "begun")):
+            self._add(trial)
+
+    def _open_study(self) -> optuna.Study:
+        """Return Optuna's study: the one that all tuners of an equal search share, if there is a storage."""
+        tuning = self._tuning
+        study = optuna.create_study(
+            storage=tuning.storage,
+            study_name=self._name_study() if tuning.storage else None,
+            load_if_exists=True,
             direction="maximize",
             sampler=optuna.samplers.TPESampler(
-                seed=tuning.seed + number, n_startup_trials=max(2, tuning.trials_per_step // _RANDOM_SHARE)
+                # Tuners that share a study are not to propose the same.
+                seed=None if tuning.storage else tuning.seed + self._number,
+                n_startup_trials=max(2, tuning.trials_per_step // _RANDOM_SHARE),
             ),
             pruner=optuna.pruners.MedianPruner(0, n_warmup_steps=_EVALUATIONS_UNJUDGED, n_min_trials=_TRIALS_UNJUDGED),
         )
-        self._lock = threading.Lock()
-        own = [each for each in tuning.trials if each.step == number]
-        self._begun = [each for each in own if each.state == "begun"]
-        # What the best so far has of these dimensions is known already.
-        for trial in (best, *(each for each in own if each.state != "begun")):
-            self._add(trial)
+        for asked in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+            if str(asked.user_attrs.get(_LABEL, "")).startswith(f"{tuning.path.name}/"):  # of a tuner that was stopped
+                study.tell(asked.number, state=TrialState.FAIL)
+        return study
+
+    def _name_study(self) -> str:
+        """Return a name that is the same for tuners whose scores can be compared, and for no others."""
+        tuning = self._tuning
+        settings = {key: value for key, value in tuning.settings.items() if key != "seed"}
+        search = [dataclasses.asdict(dimension) for dimension in self._dimensions]
+        content = [tuning.task, str(tuning.config), settings, tuning.metric, search, self._kept]
+        digest = files.digest(json.dumps(content, sort_keys=True).encode())
+        return f"{registry.make_slug(tuning.task)} {', '.join(self._distributions)} {digest[:8]}"
 
     def count_waiting(self) -> int:
         """Return how many trials are still to be trained, those that were begun included."""
         sizes = [len(each.choices) or math.inf for each in self._dimensions]
-        most = min(self._tuning.trials_per_step, math.prod(sizes) - 1)  # the best so far has one of them
+        # The recipe as it is, trained before, counts as the first trial of the first step.
+        trials = self._tuning.trials_per_step - (self._number == 1)
+        most = min(trials, math.prod(sizes) - 1)  # the best so far has one of them
         finished = [each for each in self._tuning.trials if each.step == self._number and each.state != "begun"]
         return max(0, int(most) - len(finished))
 
@@ -75,15 +105,20 @@ class StepSearch:
             train(self._tuning, trial, self._trainings, _Pruning(self._tuning, trial, asked))
             with self._lock:
                 if trial.state != "begun":
-                    self._study.tell(asked, trial.score if trial.state == "done" else None, _STATES[trial.state])
+                    self._tell(trial, asked)
                 self._tuning.save()
 
-    def _propose(self) -> tuple[Trial, optuna.Trial] | None:
-        """Return a trial and Optuna's; None where all that Optuna proposes has been tried."""
+    def _tell(self, trial: Trial, asked: optuna.Trial | None) -> None:
+        """Let Optuna know how a trial ended."""
+        if asked is None:
+            self._add(trial)
+        else:
+            self._study.tell(asked, trial.score if trial.state == "done" else None, _STATES[trial.state])
+
+    def _propose(self) -> tuple[Trial, optuna.Trial | None] | None:
+        """Return a trial and Optuna's, None for one that was begun before; None where all proposals have been tried."""
         if self._begun:
-            trial = self._begun.pop(0)
-            self._study.enqueue_trial(self._list_drawn(trial))
-            return trial, self._study.ask(self._distributions)
+            return self._begun.pop(0), None
         for _ in range(_MOST_REPEATS):
             asked = self._study.ask(self._distributions)
             drawn = {each.key: each.to_value(asked.params[each.key]) for each in self._dimensions}
@@ -94,11 +129,15 @@ class StepSearch:
                 trial = Trial(len(self._tuning.trials), self._number, values)
                 self._tuning.trials.append(trial)
                 self._tuning.save()
+                asked.set_user_attr(_LABEL, self._label(trial))
                 return trial, asked
             # A training more of the same would tell little; Optuna is told what came of the first.
             state = _STATES.get(known.state, TrialState.FAIL)
             self._study.tell(asked, known.score if state == TrialState.COMPLETE else None, state)
         return None
+
+    def _label(self, trial: Trial) -> str:
+        return f"{self._tuning.path.name}/{trial.number}"
 
     def _list_drawn(self, trial: Trial) -> dict[str, Any]:
         """Return what Optuna would have drawn for a trial; None for a value that it never draws."""
@@ -107,16 +146,17 @@ class StepSearch:
 
     def _add(self, trial: Trial) -> None:
         """Let Optuna know of a trial that has ended, if it could have drawn its values."""
-        drawn = self._list_drawn(trial)
-        if None in drawn.values():
+        drawn, label, state = self._list_drawn(trial), self._label(trial), _STATES[trial.state]
+        known = (asked.user_attrs.get(_LABEL) for asked in self._study.get_trials(deepcopy=False, states=(state,)))
+        if None in drawn.values() or label in known:
             return
-        state = _STATES[trial.state]
         self._study.add_trial(
             optuna.trial.create_trial(
                 state=state,
                 value=trial.score if state == TrialState.COMPLETE else None,
                 params=drawn,
                 distributions=self._distributions,
+                user_attrs={_LABEL: label},
                 intermediate_values=dict(enumerate(self._tuning.list_scores(trial))),
             )
         )
@@ -125,13 +165,15 @@ class StepSearch:
 class _Pruning:
     """Whether a trial is so far behind the others that it is not worth its time: asked while it trains."""
 
-    def __init__(self, tuning: Tuning, trial: Trial, asked: optuna.Trial) -> None:
+    def __init__(self, tuning: Tuning, trial: Trial, asked: optuna.Trial | None) -> None:
         self._tuning, self._trial, self._asked = tuning, trial, asked
         self._reported = 0
         self.decided = False
 
     def is_hopeless(self) -> bool:
         """Report the evaluations since the last call; decide."""
+        if self._asked is None:
+            return False
         scores = self._tuning.list_scores(self._trial)
         for number in range(self._reported, len(scores)):
             self._asked.report(scores[number], number)

@@ -48,6 +48,8 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
 def _begin(request: TuneRequest, task: str) -> Tuning:
     with preserve_process_state():
         recipe = resolve_with_stages(task, request.config, request.settings)
+    if request.storage is not None:
+        _check_storage(request.storage)
     steps = [parse_search(request.search)] if request.search else list_usual_steps(recipe)
     for dimension in (dimension for step in steps for dimension in step):
         _check(dimension, task, request)
@@ -60,6 +62,7 @@ def _begin(request: TuneRequest, task: str) -> Tuning:
         trials_per_step=request.trials,
         seed=recipe.seed,
         steps=steps,
+        storage=request.storage,
     )
     tuning.save()
     return tuning
@@ -70,6 +73,16 @@ def _require_optuna() -> None:
         import optuna  # noqa: F401
     except ModuleNotFoundError as error:
         raise UsageError(explain_missing_package("rlctl tune", error.name, "tune")) from None
+
+
+def _check_storage(url: str) -> None:
+    """Raise `UsageError` for a storage that cannot be opened."""
+    import optuna
+
+    try:
+        optuna.storages.get_storage(url)
+    except Exception as error:  # any of SQLAlchemy's and its drivers'
+        raise UsageError(f"--storage {url}: cannot be opened: {str(error).splitlines()[0]}") from None
 
 
 def _check(dimension: Dimension, task: str, request: TuneRequest) -> None:

@@ -26,8 +26,16 @@ class TuneRequest:
             default_text="learning rate; then n_steps and batch_size; then gamma",
         ),
     ] = dataclasses.field(default_factory=list)
-    trials: Annotated[int, Option("Trainings per step of the search, at most.", min=1, max=1000)] = 8
+    trials: Annotated[
+        int, Option("Trainings per step of the search, at most; the first is the recipe as it is.", min=2, max=1000)
+    ] = 8
     metric: Annotated[Metric, Option("What to maximise.", metavar="return|success")] = "return"
+    storage: Annotated[
+        str | None,
+        Option(
+            "Optuna's storage, e.g. sqlite:///tune.db; equal searches with the same storage share it.", metavar="URL"
+        ),
+    ] = None
     config: Config = None
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Keys of the recipe and their values, for every trial; they go over `config`."""

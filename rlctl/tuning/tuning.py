@@ -53,6 +53,8 @@ class Tuning:
     seed: int
     """Of the first trial; every other one has the next, and Optuna's draws follow from it."""
     steps: list[list[Dimension]]
+    storage: str | None = None
+    """The URL of Optuna's storage, which its dashboard reads and equal searches share; None: no other process does."""
     trials: list[Trial] = dataclasses.field(default_factory=list)
 
     @property

@@ -1,8 +1,10 @@
 """TensorBoard's files: a step is shown once, and a disk that does not take them costs a warning."""
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from rlctl.training.tensorboard import make_logger
+from tests.training.conftest import TINY
 
 
 def log(logger, values):
@@ -31,3 +33,17 @@ def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").unlink()
     log(logger, {30: 3.0})
     assert len(list((tmp_path / "file" / "tensorboard").iterdir())) == 1
+
+
+def test_runs_are_compared_by_their_hyperparameters(train):
+    settings = {**TINY, "algo_kwargs": {**TINY["algo_kwargs"], "learning_rate": "lin_1e-3"}}
+    run = train("Line", settings).run
+    events = EventAccumulator(str(run.tensorboard))
+    events.Reload()
+    content = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    values = {
+        name: value.string_value or value.number_value
+        for name, value in HParamsPluginData.FromString(content).session_start_info.hparams.items()
+    }
+    assert (values["algo"], values["learning_rate"], values["n_steps"]) == ("ppo", "lin_1e-3", 16)
+    assert {"eval/mean_reward", "eval/mean_ep_length"} <= set(events.Tags()["scalars"])

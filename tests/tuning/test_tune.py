@@ -8,6 +8,7 @@ import signal
 import threading
 from pathlib import Path
 
+import optuna
 import pytest
 import yaml
 
@@ -79,7 +80,9 @@ def played(monkeypatch):
 
 
 def begin(tmp_path, *search, jobs=1, **options):
+    """Tune with so many `trials` besides the first, which is the recipe as it is."""
     settings = {**TINY, **options.pop("settings", {})}
+    options["trials"] = options.get("trials", 8) + 1
     return tune(TuneRequest(LINE, settings=settings, search=list(search), root=tmp_path / "runs", **options), jobs=jobs)
 
 
@@ -230,6 +233,28 @@ def test_nothing_is_removed_in_a_run_that_another_process_holds(played, tmp_path
     assert run.checkpoints()
 
 
+def test_tuners_share_a_storage_and_nothing_is_lost_on_resume(played, tmp_path):
+    url = f"sqlite:///{tmp_path}/tune.db"
+    one = begin(tmp_path, RATES, trials=3, storage=url)
+    played.killed_at = len(played.calls) + 3
+    other = begin(tmp_path, RATES, trials=3, storage=url)  # at another time, on another machine
+    (study,) = optuna.get_all_study_summaries(url)
+    assert study.study_name.startswith("Line algo_kwargs.learning_rate ")
+    assert [trial.state for trial in other.trials].count("begun") == 1
+    resumed = resume(other.path, jobs=1)
+    assert {trial.state for trial in resumed.trials} <= {"done", "pruned"}
+    trials = optuna.load_study(study_name=study.study_name, storage=url).get_trials()
+    ended = [trial for trial in trials if trial.state != optuna.trial.TrialState.FAIL]
+    labels = {f"{tuning.path.name}/{trial.number}" for tuning in (one, resumed) for trial in tuning.trials}
+    assert sorted(trial.user_attrs["trial"] for trial in ended) == sorted(labels)
+
+
+def test_a_storage_that_cannot_be_opened(tmp_path):
+    with pytest.raises(UsageError, match="--storage nothing://x: cannot be opened"):
+        begin(tmp_path, RATES, storage="nothing://x")
+    assert not (tmp_path / "runs").exists()
+
+
 def test_several_at_a_time(played, tmp_path):
     tuning = begin(tmp_path, RATES, trials=8, jobs=4)
     assert sorted(each.number for each in tuning.trials) == list(range(9))
@@ -284,7 +309,7 @@ def test_without_optuna(monkeypatch, tmp_path):
 
 def test_trainings_that_are_real(rlctl):
     settings = ["-n", "128", "--n-envs", "2", "--set", "algo_kwargs.n_steps=16", "--set", "eval.episodes=1"]
-    search = ["--search", "algo_kwargs.gamma=0.5,0.99", "--trials", "1", "--jobs", "2"]
+    search = ["--search", "algo_kwargs.gamma=0.5,0.99", "--trials", "2", "--jobs", "2"]
     result = rlctl("tune", LINE, *settings, *search, "--json", "-")
     assert result.returncode == 0, result.stderr
     content = json.loads(result.stdout)
