@@ -98,7 +98,8 @@ def evaluate(
     `pandas.DataFrame(result.episodes)` is a table of the episodes.
     """
     from rlctl.errors import UsageError
-    from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+    from rlctl.evaluation.evaluate import Gates, run_evaluation
+    from rlctl.evaluation.request import EvalRequest
     from rlctl.recipe.sources import check_changes
 
     if task is not None and not isinstance(task, str):

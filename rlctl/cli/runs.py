@@ -92,7 +92,7 @@ def compare_runs(
 ) -> None:
     """Say whether a policy, or a recipe trained with several seeds, is better than another."""
     claim_stdout()
-    from rlctl.evaluation.evaluate import EvalRequest
+    from rlctl.evaluation.request import EvalRequest
     from rlctl.runs.comparison import compare
     from rlctl.runs.comparison_report import show
 

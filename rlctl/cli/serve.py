@@ -55,7 +55,7 @@ def serve(
     )
     server = make_server(found.file, settings)
     if self_test:
-        from rlctl.evaluation.evaluate import EvalRequest
+        from rlctl.evaluation.request import EvalRequest
         from rlctl.evaluation.self_test import run_self_test
         from rlctl.evaluation.self_test import show as show_test
 

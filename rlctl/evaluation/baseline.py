@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, explain_missing_package
+from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.players.baselines import BASELINES, load_function
 from rlctl.policy.players.named import SERVER
 from rlctl.rollout.workers import Workers
-
-if TYPE_CHECKING:
-    from rlctl.evaluation.evaluate import EvalRequest
 
 
 @dataclasses.dataclass(frozen=True)

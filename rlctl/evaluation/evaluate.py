@@ -9,7 +9,7 @@ from typing import Any
 
 from rlctl import output
 from rlctl.environments.info import EnvInfo
-from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.baseline import Baseline, choose_task, load_baseline
 from rlctl.evaluation.episode_statistics import (
@@ -20,6 +20,7 @@ from rlctl.evaluation.episode_statistics import (
     success_interval,
     success_rate,
 )
+from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable, load_policy
 from rlctl.policy.players.player import Exploration
@@ -28,32 +29,6 @@ from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import lookup
-
-
-@dataclasses.dataclass(frozen=True)
-class EvalRequest:
-    """What the command line asks for."""
-
-    run: str | None
-    """The task, where `baseline` is given."""
-    task: str | None = None
-    checkpoint: str = "best"
-    episodes: int = 100
-    seed: int = 0
-    changes: EnvChanges = UNCHANGED
-    stage: int | None = None
-    """Stage of the curriculum, from 1; None: the last."""
-    deterministic: bool = True
-    n_envs: int | None = None
-    env_timeout_s: float = 60.0
-    baseline: str | None = None
-    """What to play instead of a trained policy: `zero`, `random`, `module:function` or `file.py:function`."""
-    spec: EnvSpec | None = None
-    """What to play in, where it is not what the policy, or for a baseline the task's recipe, was trained in."""
-    limits: Path | None = None
-    """Limits that the policy acts within; it is evaluated without them too."""
-    measure_actions: bool = False
-    """Whether to measure how much actions change, for which episodes are kept in memory."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,8 @@ from pydantic_core import to_jsonable_python
 from rlctl import output
 from rlctl.errors import AnswerIsNo, ArtifactError, RlctlError
 from rlctl.evaluation.episode_statistics import Spread
-from rlctl.evaluation.evaluate import EvalRequest, Gates
+from rlctl.evaluation.evaluate import Gates
+from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.score import measure_score
 from rlctl.policy.shipped import MeasuredScore
 from rlctl.run.group import Group

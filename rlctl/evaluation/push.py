@@ -5,20 +5,18 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.evaluation.cells import CellPlayer
 from rlctl.evaluation.episode_statistics import summarize
 from rlctl.policy.shipped import Interval
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.robustness import PushLevel, PushTest
-
-if TYPE_CHECKING:
-    from rlctl.evaluation.vary import CellPlayer
 
 _DURATION_S = 0.1
 _FIRST_SPEED = 0.25  # [m/s], by which the smallest push would change the speed of the whole robot

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 from rlctl.evaluation.episode_statistics import mean_interval
-from rlctl.evaluation.evaluate import EvalRequest, run_evaluation
+from rlctl.evaluation.evaluate import run_evaluation
+from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.shipped import MeasuredScore
 
 

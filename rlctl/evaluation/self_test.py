@@ -16,7 +16,8 @@ from rlctl.deploy.server.serve import make_loop, serve_until
 from rlctl.deploy.server.server import PolicyServer
 from rlctl.errors import AnswerIsNo
 from rlctl.evaluation import report
-from rlctl.evaluation.evaluate import EvalRequest, Evaluation, run_evaluation
+from rlctl.evaluation.evaluate import Evaluation, run_evaluation
+from rlctl.evaluation.request import EvalRequest
 from rlctl.rollout.workers import available_cores
 
 

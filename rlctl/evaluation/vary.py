@@ -12,45 +12,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rlctl import output
-from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation import axes as axes_of
+from rlctl.evaluation.cells import CellPlayer
 from rlctl.evaluation.episode_statistics import summarize
-from rlctl.evaluation.evaluate import NO_GATES, EvalRequest, Gates, LoadedPolicy, find_player, start_workers
+from rlctl.evaluation.evaluate import NO_GATES, Gates, find_player, start_workers
 from rlctl.evaluation.push import measure_push
-from rlctl.policy.players.player import Exploration
-from rlctl.rollout.collect import play_episodes
-from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Workers
+from rlctl.evaluation.request import EvalRequest
 from rlctl.run import robustness
 from rlctl.run.robustness import Axis, Cell, Robustness, RobustnessMap
 from rlctl.version import collect_versions
 
 ASK_ABOVE_S = 600.0
 """A measurement that takes longer than this [s] is begun only after asking."""
-
-
-class CellPlayer:
-    """Plays the same episodes in one environment after the other, in workers that stay."""
-
-    def __init__(self, workers: Workers, policy: LoadedPolicy, request: EvalRequest) -> None:
-        self.workers = workers
-        self._policy = policy
-        self._seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
-        self._exploration = Exploration(stochastic=not request.deterministic)
-        self._has_events = is_task(workers.spec.constructor())
-
-    def play(self, spec: EnvSpec, push: dict[str, object] | None = None) -> list[EpisodeResult]:
-        """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`."""
-        workers = self.workers
-        if spec.parameters != workers.spec.parameters:
-            workers.rebuild(spec)
-            self._policy.give_to(workers)
-        if self._has_events:
-            workers.set_events(spec, push)
-        return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration)]
 
 
 def measure_robustness(

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, UsageError
-from rlctl.evaluation.evaluate import EvalRequest, Evaluation, run_evaluation
+from rlctl.evaluation.evaluate import Evaluation, run_evaluation
+from rlctl.evaluation.request import EvalRequest
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
 from rlctl.run.directory import RunDirectory

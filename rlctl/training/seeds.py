@@ -12,8 +12,8 @@ from pathlib import Path
 from rlctl import output
 from rlctl.environments import registry
 from rlctl.errors import RlctlError, UsageError
-from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.group import GroupScore, as_json, evaluate_group
+from rlctl.evaluation.request import EvalRequest
 from rlctl.recipe.sources import resolve
 from rlctl.rollout.workers import available_cores
 from rlctl.run.directory import RunLock

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.environments import installed, registry
-from rlctl.evaluation.evaluate import EvalRequest
 from rlctl.evaluation.group import as_json, evaluate_group
+from rlctl.evaluation.request import EvalRequest
 from rlctl.run.directory import GROUP_FILE
 from rlctl.run.group import Group, parse_seeds, read_group
 from rlctl.run.train_request import TrainRequest

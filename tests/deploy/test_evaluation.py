@@ -14,8 +14,9 @@ from gymnasium import spaces
 from rlctl.deploy.server import messages
 from rlctl.deploy.server.client import PolicyClient, RemotePlayer
 from rlctl.errors import PolicyError, RecipeError, UsageError
-from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.evaluate import Gates, run_evaluation
 from rlctl.evaluation.report import as_json, count_interventions
+from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.self_test import run_self_test
 from rlctl.policy.shipped import PRETRAINED
 from tests.deploy.server.serving import RunningServer

@@ -8,7 +8,7 @@ from rlctl.deploy.identify.follow import describe_expected, open_world
 from rlctl.deploy.identify.identify import identify
 from rlctl.deploy.identify.log import Log, read_log, write_log
 from rlctl.environments.spec import EnvChanges, EnvSpec
-from rlctl.evaluation.evaluate import EvalRequest
+from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.score import measure_score
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.request import run_training

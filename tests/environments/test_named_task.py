@@ -10,7 +10,8 @@ from safetensors.numpy import load_file, save
 from rlctl.environments import named_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.file import PolicyFile, compute_digest
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.run.train_request import TrainRequest

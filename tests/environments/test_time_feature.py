@@ -10,7 +10,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError
-from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.request import EvalRequest
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
 from rlctl.importing.import_model import import_model

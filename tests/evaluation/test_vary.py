@@ -9,7 +9,8 @@ from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.axes import change, read_axes
 from rlctl.evaluation.episode_statistics import mean_interval
-from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.robustness_report import format_command
 from rlctl.evaluation.vary import check_gates, measure_robustness
 from rlctl.output import format_duration

@@ -5,7 +5,8 @@ import typer
 
 from rlctl.cli import build_app
 from rlctl.errors import UsageError
-from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.request import EvalRequest
 from rlctl.replaying.replay import Choice, ReplayRequest, run_replay, select
 from rlctl.rollout.messages import EpisodeResult
 

@@ -8,7 +8,8 @@ from rich.console import Console
 
 from rlctl import load_policy
 from rlctl.errors import RecipeError, UsageError
-from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.file import PolicyFile
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.rollout.workers import available_cores

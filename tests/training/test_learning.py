@@ -3,7 +3,8 @@
 import pytest
 
 from rlctl.environments.spec import EnvChanges
-from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.request import EvalRequest
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.request import run_training
 from tests.training.conftest import ENVS

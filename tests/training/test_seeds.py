@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, UsageError
-from rlctl.evaluation.evaluate import EvalRequest, Gates
+from rlctl.evaluation.evaluate import Gates
 from rlctl.evaluation.group import as_json, evaluate_group
+from rlctl.evaluation.request import EvalRequest
 from rlctl.run.directory import RunLock, is_being_written
 from rlctl.run.group import create_group, find_group, parse_seeds, read_group
 from rlctl.run.lookup import find_policy, find_run

@@ -12,7 +12,7 @@ import numpy as np
 
 from rlctl.environments import installed
 from rlctl.errors import ArtifactError, RlctlError, UsageError, short_repr
-from rlctl.evaluation.evaluate import EvalRequest
+from rlctl.evaluation.request import EvalRequest
 from rlctl.output import format_duration
 from rlctl.recipe.recipe import NOT_SET, Recipe
 from rlctl.recipe.stages import format_value

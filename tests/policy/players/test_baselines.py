@@ -5,8 +5,9 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.errors import PolicyError, UsageError
-from rlctl.evaluation.evaluate import EvalRequest, Gates, run_evaluation
+from rlctl.evaluation.evaluate import Gates, run_evaluation
 from rlctl.evaluation.report import as_json
+from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.players.baselines import load_function
 from rlctl.policy.players.named import make_player
 
