@@ -104,9 +104,9 @@ def mean_action_change(episodes: Sequence[Episode]) -> float:
     It is 0 for actions that are no real numbers, and for episodes of one step.
     """
     changes = [
-        np.abs(np.diff(each.trajectory.actions, axis=0)).ravel()
-        for each in episodes
-        if each.trajectory is not None and each.trajectory.actions.dtype.kind == "f"
+        np.abs(np.diff(episode.trajectory.actions, axis=0)).ravel()
+        for episode in episodes
+        if episode.trajectory is not None and episode.trajectory.actions.dtype.kind == "f"
     ]
     together = np.concatenate([np.zeros(0), *changes])
     return float(together.mean()) if together.size else 0.0
@@ -121,4 +121,6 @@ def mean_terms(results: Sequence[EpisodeResult]) -> dict[str, float]:
 def mean_metrics(results: Sequence[EpisodeResult]) -> dict[str, float]:
     """Return the mean over episodes of each metric's mean per step."""
     names = dict.fromkeys(name for result in results for name in result.metrics)
-    return {name: float(np.mean([each.metrics[name] for each in results if name in each.metrics])) for name in names}
+    return {
+        name: float(np.mean([result.metrics[name] for result in results if name in result.metrics])) for name in names
+    }

@@ -41,7 +41,7 @@ class GroupScore:
 
     def spread(self, quantity: str) -> Spread | None:
         """Return how `success` or `mean_return` is distributed over seeds; None where no seed has it."""
-        values = [getattr(each.score, quantity) for each in self.seeds if each.score is not None]
+        values = [getattr(seed.score, quantity) for seed in self.seeds if seed.score is not None]
         known = [value for value in values if value is not None]
         return Spread.of(known) if known else None
 
@@ -50,18 +50,18 @@ class GroupScore:
 
         Raises `UsageError` for a gate on success where the task does not report it.
         """
-        if failed := [each for each in self.seeds if each.score is None]:
+        if failed := [seed for seed in self.seeds if seed.score is None]:
             raise ArtifactError(
                 f"{self.group.path}: {len(failed)} of {len(self.seeds)} seeds without a score, the first seed "
                 f"{failed[0].seed}: {failed[0].problem}"
             )
         missed = []
-        for each in self.seeds:
-            score = each.score
+        for seed in self.seeds:
+            score = seed.score
             assert score is not None
             gates.check_possible(score.success is not None)
-            found = gates.list_missed(score.success, score.success_interval, score.mean_return)
-            missed += [f"seed {each.seed}: {gate}" for gate in found]
+            gates_missed = gates.list_missed(score.success, score.success_interval, score.mean_return)
+            missed += [f"seed {seed.seed}: {gate}" for gate in gates_missed]
         if missed:
             raise AnswerIsNo("gate missed: " + "; ".join(missed))
 
@@ -89,27 +89,27 @@ def show(result: GroupScore, json: str | None) -> None:
     if output.present(as_json(result), json):
         return
     out = output.out()
-    scores = [each.score for each in result.seeds if each.score is not None]
+    scores = [seed.score for seed in result.seeds if seed.score is not None]
     episodes = f", {output.format_count(scores[0].episodes, 'episode')} each, seed {scores[0].seed}" if scores else ""
     seeds = output.format_count(len(result.seeds), "seed")
     out.print(f"{result.group.task}: {result.group.path}, {seeds}{episodes}")
     success, returns = result.spread("success"), result.spread("mean_return")
-    rows = [_list_cells(each) for each in result.seeds]
+    rows = [_list_cells(seed) for seed in result.seeds]
     for label in ("mean", "IQM", "std"):
-        rate, value = (None if each is None else getattr(each, label.lower()) for each in (success, returns))
+        rate, value = (None if spread is None else getattr(spread, label.lower()) for spread in (success, returns))
         rows.append((label, "-" if rate is None else f"{rate:.1%}", "-" if value is None else f"{value:.4g}"))
     output.print_table(("seed", "success", "return", "steps", "seconds", ""), rows, left=("",))
 
 
-def _list_cells(each: SeedScore) -> tuple[str, ...]:
-    score = each.score
+def _list_cells(seed: SeedScore) -> tuple[str, ...]:
+    score = seed.score
     return (
-        str(each.seed),
+        str(seed.seed),
         "-" if score is None or score.success is None else f"{score.success:.1%}",
         "-" if score is None else f"{score.mean_return:.4g}",
-        "-" if each.steps is None else f"{each.steps:,}",
-        "-" if each.seconds is None else f"{each.seconds:.0f}",
-        each.problem,
+        "-" if seed.steps is None else f"{seed.steps:,}",
+        "-" if seed.seconds is None else f"{seed.seconds:.0f}",
+        seed.problem,
     )
 
 

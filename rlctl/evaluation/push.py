@@ -61,11 +61,11 @@ def find_pushed(spec: EnvSpec) -> PushedBody:
             )
         bodies = list(inner.sim.bodies.values())
         robots = [body for body in bodies if body.joint_names] or bodies
-        found = [(body, link) for body in robots if (link := body.find_trunk()) is not None]
-        if not found:
+        movable = [(body, link) for body in robots if (link := body.find_trunk()) is not None]
+        if not movable:
             names = ", ".join(body.name for body in robots)
             raise UsageError(f"--push: {spec.task} has no base that could be pushed: {names} is fixed to the world")
-        body, link = max(found, key=lambda each: each[0].total_mass())
+        body, link = max(movable, key=lambda pair: pair[0].total_mass())
         dt, steps = inner.task.control_dt, inner.max_steps
         return PushedBody(
             body=body.name,
@@ -141,7 +141,7 @@ def find_threshold(impulses: Sequence[float], held: NDArray[np.bool_]) -> tuple[
     rng = np.random.default_rng(0)  # the same episodes give the same interval
     episodes = held.shape[1]
     samples = [held[:, rng.integers(episodes, size=episodes)].mean(axis=1) for _ in range(_RESAMPLES)]
-    crossings = [impulses[-1] if (found := _cross(impulses, rates)) is None else found for rates in samples]
+    crossings = [impulses[-1] if (crossing := _cross(impulses, rates)) is None else crossing for rates in samples]
     low, high = np.percentile(crossings, [2.5, 97.5])
     return threshold, (float(low), float(high))
 
@@ -167,7 +167,7 @@ def _judge(
         return f"cannot tell: without a push {held[0.0].mean():.0%} of the episodes {goes_well}"
     largest = max(held)
     if threshold is None or interval is None:
-        if measure == "upright" and all(each.all() for each in held.values()):
+        if measure == "upright" and all(outcomes.all() for outcomes in held.values()):
             return "cannot tell: this task reports no success, and no episode ended early"
         return f"more than half of the episodes {goes_well} with every push tried, up to {largest:.3g} N s"
     return (

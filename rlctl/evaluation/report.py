@@ -101,15 +101,15 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         "episodes": [
             {
                 "index": index,
-                "seed": each.seed,
-                "success": each.success,
-                "return": each.total_reward,
-                "length": each.length,
-                "terms": each.terms,
-                "metrics": each.metrics,
-                "final_distance": each.final_distance,
+                "seed": outcome.seed,
+                "success": outcome.success,
+                "return": outcome.total_reward,
+                "length": outcome.length,
+                "terms": outcome.terms,
+                "metrics": outcome.metrics,
+                "final_distance": outcome.final_distance,
             }
-            for index, each in enumerate(episode.result for episode in result.played)
+            for index, outcome in enumerate(episode.result for episode in result.played)
         ],
     }
     if result.spec.stage:

@@ -29,19 +29,19 @@ def show(result: Robustness, target: str | None) -> None:
     )
     out.print(f"nominal: {format_outcome(result.nominal)}")
     worst = result.find_worst()
-    for each in result.maps:
+    for varied in result.maps:
         out.print()
-        _show_map(each, worst[1] if worst else None)
+        _show_map(varied, worst[1] if worst else None)
     if worst is not None:
-        found, cell = worst
-        out.print(f"\nworst: {found.name_cell(cell)}: {format_outcome(cell)}")
-        out.print(f"the same episodes alone: {format_command(result, found, cell)}")
+        varied, cell = worst
+        out.print(f"\nworst: {varied.name_cell(cell)}: {format_outcome(cell)}")
+        out.print(f"the same episodes alone: {format_command(result, varied, cell)}")
     if result.push is not None:
         out.print()
         _show_push(result.push)
 
 
-def format_command(result: Robustness, found: RobustnessMap, cell: Cell) -> str:
+def format_command(result: Robustness, varied: RobustnessMap, cell: Cell) -> str:
     """Return the command that plays the episodes of one cell."""
     settings = {f"task.{name}": json.dumps(value) for name, value in result.parameters.items()}
     settings |= {f"reward_weights.{name}": json.dumps(value) for name, value in result.reward_weights.items()}
@@ -50,7 +50,7 @@ def format_command(result: Robustness, found: RobustnessMap, cell: Cell) -> str:
             f"events.{name}": "{}"
         }
     settings["randomize"] = "false"
-    for axis, value in zip(found.axes, cell.values, strict=True):
+    for axis, value in zip(varied.axes, cell.values, strict=True):
         settings[axis.setting] = str(int(value) if value.is_integer() else value)
     words = ["rlctl", "eval", result.policy_file, "--episodes", str(result.episodes), "--seed", str(result.seed)]
     words += [] if result.deterministic else ["--stochastic"]
@@ -67,23 +67,23 @@ def format_outcome(outcome: Outcome) -> str:
     return ", ".join([*parts, f"return {outcome.mean_return:.4g} ({low:.4g} to {high:.4g})"])
 
 
-def _show_map(found: RobustnessMap, worst: Cell | None) -> None:
+def _show_map(varied: RobustnessMap, worst: Cell | None) -> None:
     out = output.out()
-    columns, rows = len(found.axes[-1].values), len(found.cells) // len(found.axes[-1].values)
-    if len(found.axes) == 1 and columns <= _MOST_ROWS:
-        _show_list(found, worst)
+    columns, rows = len(varied.axes[-1].values), len(varied.cells) // len(varied.axes[-1].values)
+    if len(varied.axes) == 1 and columns <= _MOST_ROWS:
+        _show_list(varied, worst)
     elif columns <= _MOST_COLUMNS and rows <= _MOST_ROWS:
-        _show_grid(found, worst)
+        _show_grid(varied, worst)
     else:
-        names = " x ".join(axis.name for axis in found.axes)
-        out.print(f"{names}: {len(found.cells):,} cells, too many to draw; --json has them all")
+        names = " x ".join(axis.name for axis in varied.axes)
+        out.print(f"{names}: {len(varied.cells):,} cells, too many to draw; --json has them all")
 
 
-def _show_list(found: RobustnessMap, worst: Cell | None) -> None:
-    has_success = found.cells[0].success_rate is not None
+def _show_list(varied: RobustnessMap, worst: Cell | None) -> None:
+    has_success = varied.cells[0].success_rate is not None
     successes = ("success", "95 % interval") if has_success else ()
     rows = []
-    for cell, color in zip(found.cells, _color_cells(found), strict=True):
+    for cell, color in zip(varied.cells, _color_cells(varied), strict=True):
         cells: list[str | Text] = [f"{cell.values[0]:g}"]
         if cell.success_rate is not None:
             cells += [_paint(f"{cell.success_rate:.1%}", color), _format_interval(cell.success_interval, percent=True)]
@@ -91,7 +91,7 @@ def _show_list(found: RobustnessMap, worst: Cell | None) -> None:
         cells += [value if has_success else _paint(value, color), _format_interval(cell.return_interval)]
         marks = [*(["nominal"] if cell.nominal else []), *(["worst"] if cell is worst else [])]
         rows.append([*cells, ", ".join(marks)])
-    output.print_table((found.axes[0].name, *successes, "return", "95 % interval", ""), rows, left=("",))
+    output.print_table((varied.axes[0].name, *successes, "return", "95 % interval", ""), rows, left=("",))
 
 
 def _format_interval(interval: tuple[float, float] | None, *, percent: bool = False) -> str:
@@ -101,11 +101,11 @@ def _format_interval(interval: tuple[float, float] | None, *, percent: bool = Fa
     return f"{low:.1%} to {high:.1%}" if percent else f"{low:.4g} to {high:.4g}"
 
 
-def _show_grid(found: RobustnessMap, worst: Cell | None) -> None:
+def _show_grid(varied: RobustnessMap, worst: Cell | None) -> None:
     """Print a heat map: the first axis downwards, the second across."""
-    down, across = found.axes
-    has_success = found.cells[0].success_rate is not None
-    cells = list(zip(found.cells, _color_cells(found), strict=True))
+    down, across = varied.axes
+    has_success = varied.cells[0].success_rate is not None
+    cells = list(zip(varied.cells, _color_cells(varied), strict=True))
     width = len(across.values)
     rows: list[list[str | Text]] = [
         [f"{value:.3g} ", *(_draw_cell(cell, color, cell is worst) for cell, color in cells[start : start + width])]
@@ -114,7 +114,7 @@ def _show_grid(found: RobustnessMap, worst: Cell | None) -> None:
     columns = [f"{down.name} \\ {across.name} ", *(f" {value:.3g} " for value in across.values)]
     output.print_table(columns, rows, gap="")
     out = output.out()
-    marks = [*([f"{_NOMINAL} nominal"] if any(cell.nominal for cell in found.cells) else []), f"{_WORST} worst"]
+    marks = [*([f"{_NOMINAL} nominal"] if any(cell.nominal for cell in varied.cells) else []), f"{_WORST} worst"]
     out.print(f"{'success [%]' if has_success else 'mean return'}; {', '.join(marks)}")
 
 
@@ -130,10 +130,10 @@ def _paint(text: str, color: str) -> Text:
     return Text(text, style=f"black on {color}")
 
 
-def _color_cells(found: RobustnessMap) -> list[str]:
+def _color_cells(varied: RobustnessMap) -> list[str]:
     """Return a colour per cell, from red over yellow to green: of success rates from 0 to 1, else of the returns."""
-    rates = [cell.success_rate for cell in found.cells]
-    returns = [cell.mean_return for cell in found.cells]
+    rates = [cell.success_rate for cell in varied.cells]
+    returns = [cell.mean_return for cell in varied.cells]
     low, high = min(returns), max(returns)
     parts = [
         (mean - low) / (high - low or 1.0) if rate is None else rate for rate, mean in zip(rates, returns, strict=True)

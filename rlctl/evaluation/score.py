@@ -19,11 +19,11 @@ def measure_score(request: EvalRequest) -> MeasuredScore:
         episodes=len(results),
         seed=evaluation.seed,
         mean_return=evaluation.returns.mean,
-        return_interval=mean_interval([each.total_reward for each in results]),
+        return_interval=mean_interval([result.total_reward for result in results]),
         success=evaluation.success_rate,
         success_interval=evaluation.success_interval,
         mean_length=evaluation.lengths.mean,
-        ended_early=None if limit is None else sum(each.length < limit for each in results) / len(results),
+        ended_early=None if limit is None else sum(result.length < limit for result in results) / len(results),
         action_change=evaluation.action_change or 0.0,
     )
 
@@ -32,7 +32,7 @@ def describe_score(score: MeasuredScore) -> str:
     """Return `success 100.0 % (96.3 to 100.0), return 96.7 (95.1 to 98.2), action change 0.031`."""
     parts = []
     if score.success is not None and score.success_interval is not None:
-        low, high = (100 * each for each in score.success_interval)
+        low, high = (100 * bound for bound in score.success_interval)
         parts.append(f"success {score.success:.1%} ({low:.1f} to {high:.1f})")
     low, high = score.return_interval
     parts.append(f"return {score.mean_return:.4g} ({low:.4g} to {high:.4g})")

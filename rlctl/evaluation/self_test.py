@@ -97,7 +97,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
         loop.call_soon_threadsafe(end.set)
         thread.join(5.0)
     reports = [episode.result.report for episode in served.played]
-    times = np.concatenate([np.asarray(each["round_trips_s"]) for each in reports])
+    times = np.concatenate([np.asarray(answers["round_trips_s"]) for answers in reports])
     p50, p99 = np.quantile(times, (0.5, 0.99)).tolist()
     return SelfTest(
         direct,
@@ -106,8 +106,8 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
         p50,
         p99,
         len(times),
-        sum(each["misses"] for each in reports),
-        sum(each["not_running"] for each in reports),
+        sum(answers["misses"] for answers in reports),
+        sum(answers["not_running"] for answers in reports),
         os.getloadavg()[0],
     )
 

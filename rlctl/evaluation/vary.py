@@ -57,7 +57,7 @@ def measure_robustness(
         task=spec.task,
         parameters=dict(spec.parameters),
         reward_weights=dict(spec.reward_weights),
-        events={name: dict(each) for name, each in spec.events.items()},
+        events={name: dict(event) for name, event in spec.events.items()},
         policy_file=str(found.file),
         algo=policy.info.algo,
         training_steps=policy.info.training_steps,
@@ -128,7 +128,7 @@ def _keep(file: Path, result: Robustness) -> None:
 
 def check_gates(result: Robustness, gates: Gates) -> None:
     """Raise `AnswerIsNo` if the worst cell of all maps misses a gate; without maps, the nominal one."""
-    found = result.find_worst()
-    where, outcome = ("nominal", result.nominal) if found is None else (found[0].name_cell(found[1]), found[1])
+    worst = result.find_worst()
+    where, outcome = ("nominal", result.nominal) if worst is None else (worst[0].name_cell(worst[1]), worst[1])
     if missed := gates.list_missed(outcome.success_rate, outcome.success_interval, outcome.mean_return):
         raise AnswerIsNo(f"gate missed in the worst cell, {where}: " + "; ".join(missed))

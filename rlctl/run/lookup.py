@@ -32,7 +32,7 @@ class FoundPolicy:
     file: Path
     run: RunDirectory | None
     notes: tuple[str, ...] = ()
-    """What to tell a user who did not name the run: which it is, what was passed over, which older one was better."""
+    """What to tell a user who did not name the run: which it is, which were skipped, which older one was better."""
 
     def locate(self, spec: EnvSpec) -> EnvSpec:
         """Return `spec` with its task where it was when the run was trained; see `locate_task`."""
@@ -60,8 +60,8 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
     refuse_tuning(Path(text))
     if is_group(Path(text)):
         raise UsageError(f"{text}: a group of runs; name one of them: {text.rstrip('/')}/..._s0")
-    if found := _list_newest_first(root / registry.make_slug(text), *_IN_TASK):
-        return found[0]
+    if runs := _list_newest_first(root / registry.make_slug(text), *_IN_TASK):
+        return runs[0]
     if text and Path(text).is_dir():
         raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
     if Path(text).is_file() and Path(text).suffix != ".zip":
@@ -78,7 +78,7 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
         option = f"rlctl train {text} --from {text}" if to_train else "--pretrained"
         shipped = f"; for the policy that it ships: {option}" if entry.policy_file else ""
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
-    names = {each.name for each in root.glob("*/")} | {each.name for each in installed.list_installed()}
+    names = {folder.name for folder in root.glob("*/")} | {folder.name for folder in installed.list_installed()}
     hint = did_you_mean(text, sorted(names)) or " All runs: rlctl runs"
     raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{hint}")
 
@@ -135,8 +135,9 @@ def _find_policy(text: str | None, which: str, root: Path) -> FoundPolicy:
         return FoundPolicy(run.policy_file(which), run)
     in_group = is_group(run.path.parent)
     runs = _list_newest_first(run.path.parent.parent if in_group else run.path.parent, *_IN_TASK)
-    older = [each for each in runs if each.path.name < run.path.name] if text in (None, "latest") else runs[1:]
-    candidates = [run] if text in (None, "latest") else runs
+    candidates, older = runs, runs[1:]
+    if text in (None, "latest"):
+        candidates, older = [run], [other for other in runs if other.path.name < run.path.name]
     for number, candidate in enumerate(candidates):
         with contextlib.suppress(ArtifactError):
             file = candidate.policy_file(which)
@@ -159,7 +160,7 @@ def _find_shipped(task: str | None) -> FoundPolicy:
 def find_owner(file: Path) -> RunDirectory | None:
     """Return the run that a policy, a checkpoint's policy or a recorded episode belongs to; None for a file alone."""
     folders = file.absolute().parents[1:3]
-    return next((RunDirectory(each) for each in folders if (each / "run.json").is_file()), None)
+    return next((RunDirectory(folder) for folder in folders if (folder / "run.json").is_file()), None)
 
 
 def locate_task(task: str, run: RunDirectory | None) -> str:
@@ -197,7 +198,7 @@ def _describe_choice(
     if is_group(run.path.parent):
         notes.append(f"it is one of a group: {run.path.parent}")
     if passed_over:
-        notes.append(f"passed over, without such a policy: {', '.join(str(each.path) for each in passed_over)}")
+        notes.append(f"skipped {', '.join(str(skipped.path) for skipped in passed_over)}: no such policy yet")
     if (better := _find_better(info, older)) is not None:
         notes.append(better)
     return tuple(notes)
@@ -205,7 +206,7 @@ def _describe_choice(
 
 def _find_better(info: PolicyInfo, older: Sequence[RunDirectory]) -> str | None:
     """Describe the best older run of the same task, parameters and rewards, if it was better in its evaluations."""
-    found: list[tuple[float, RunDirectory, str]] = []
+    better: list[tuple[float, RunDirectory, str]] = []
     for run in older[:_MOST_COMPARED]:
         with contextlib.suppress(ArtifactError):
             other = PolicyFile.read_info(run.policy_file("best"))
@@ -217,10 +218,10 @@ def _find_better(info: PolicyInfo, older: Sequence[RunDirectory]) -> str | None:
                 ours, theirs = info.evaluation.mean_return, other.evaluation.mean_return
                 form = "return {:.4g} against {:.4g}"
             if theirs > ours:
-                found.append((theirs, run, form.format(theirs, ours)))
-    if not found:
+                better.append((theirs, run, form.format(theirs, ours)))
+    if not better:
         return None
-    _, run, scores = max(found, key=lambda each: each[0])
+    _, run, scores = max(better, key=lambda scored: scored[0])
     return f"an older run was better in its evaluations: {run.path} ({scores})"
 
 

@@ -130,8 +130,8 @@ class Robustness(_Content):
 
     def find_worst(self) -> tuple[RobustnessMap, Cell] | None:
         """Return the worst cell of all maps with its map; None where nothing was varied."""
-        worst = [(each, each.find_worst()) for each in self.maps]
-        return min(worst, key=lambda found: found[1].score) if worst else None
+        worst = [(varied, varied.find_worst()) for varied in self.maps]
+        return min(worst, key=lambda pair: pair[1].score) if worst else None
 
 
 def write(path: Path, result: Robustness) -> None:

@@ -22,7 +22,7 @@ from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import describe_source_change
 from rlctl.runs.selection import find_runs_of
-from rlctl.runs.significance import Difference, Quantity, Verdict, compare_episodes, compare_seeds
+from rlctl.runs.significance import MeanDifference, Quantity, Verdict, compare_episodes, compare_seeds
 from rlctl.runs.summary import read_table, summarize
 
 THRESHOLD = 0.9
@@ -42,7 +42,7 @@ class EvaluatedRun:
     def values(self, quantity: Quantity) -> NDArray[np.float64]:
         """Return the success (0 or 1) or return of each episode, shape (episodes,); NaN where it is not reported."""
         results = [episode.result for episode in self.evaluation.played]
-        values = [each.success if quantity == "success" else each.total_reward for each in results]
+        values = [result.success if quantity == "success" else result.total_reward for result in results]
         return np.array([np.nan if value is None else value for value in values], np.float64)
 
 
@@ -69,7 +69,7 @@ class Candidate:
     """A side beside the baseline: by how much it differs, and in what."""
 
     side: Side
-    differences: Mapping[Quantity, Difference]
+    differences: Mapping[Quantity, MeanDifference]
     """`success`, where the task reports it, then `return`."""
     recipe_changes: dict[str, tuple[Any, Any]]
     """Per dotted key, the value here and the baseline's."""
@@ -82,7 +82,7 @@ class Candidate:
 
 
 @dataclasses.dataclass(frozen=True)
-class Comparison:
+class RunComparison:
     """The baseline and what was compared with it."""
 
     of_recipes: bool
@@ -106,14 +106,14 @@ class Comparison:
 
     def check(self) -> None:
         """Raise `AnswerIsNo` if a candidate is worse than the baseline."""
-        worse = [each.side.name for each in self.candidates if each.verdict is Verdict.WORSE]
+        worse = [candidate.side.name for candidate in self.candidates if candidate.verdict is Verdict.WORSE]
         if worse:
             raise AnswerIsNo(f"gate missed: {', '.join(worse)} worse than {self.baseline.name}")
 
 
 def compare(
     texts: Sequence[str], request: EvalRequest, threshold: float | None = None, *, force: bool = False
-) -> Comparison:
+) -> RunComparison:
     """Evaluate every run as `request` says, without its `run`, and compare each side with the first.
 
     `texts` are runs, groups, globs, or folders of runs; the first is the baseline. `threshold` is a success rate, or a
@@ -140,7 +140,7 @@ def compare_runs(
     threshold: float | None = None,
     *,
     force: bool = False,
-) -> Comparison:
+) -> RunComparison:
     """Compare sides that have these names and runs; see `compare`."""
     _refuse_unequal(names, groups)
     task = _common_task([run for group in groups for run in group], request.task)
@@ -160,7 +160,7 @@ def compare_runs(
     ]
     baseline, *others = sides
     of_recipes = len(groups[0]) > 1
-    return Comparison(
+    return RunComparison(
         of_recipes=of_recipes,
         task=task,
         baseline=baseline,
@@ -248,10 +248,10 @@ def _default_threshold(threshold: float | None, has_success: bool) -> float | No
     return THRESHOLD if threshold is None and has_success else threshold
 
 
-def _differences(baseline: Side, side: Side, of_recipes: bool, comparisons: int) -> Mapping[Quantity, Difference]:
+def _differences(baseline: Side, side: Side, of_recipes: bool, comparisons: int) -> Mapping[Quantity, MeanDifference]:
     quantities: list[Quantity] = ["success", "return"] if baseline.has_success and side.has_success else ["return"]
     if of_recipes:
-        one, two = ({quantity: each.scores(quantity) for quantity in quantities} for each in (baseline, side))
+        one, two = ({quantity: own.scores(quantity) for quantity in quantities} for own in (baseline, side))
         return compare_seeds(one, two, comparisons)
-    one, two = ({quantity: each.runs[0].values(quantity) for quantity in quantities} for each in (baseline, side))
+    one, two = ({quantity: own.runs[0].values(quantity) for quantity in quantities} for own in (baseline, side))
     return compare_episodes(one, two, comparisons)

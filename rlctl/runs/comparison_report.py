@@ -10,10 +10,10 @@ from rich.text import Text
 from rlctl import output
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.recipe.stages import format_value
-from rlctl.runs.comparison import Candidate, Comparison, EvaluatedRun, Side
+from rlctl.runs.comparison import Candidate, EvaluatedRun, RunComparison, Side
 from rlctl.runs.significance import (
     ALPHA,
-    Difference,
+    MeanDifference,
     Quantity,
     SeedDifference,
     Verdict,
@@ -22,7 +22,7 @@ from rlctl.runs.significance import (
 )
 
 
-def show(result: Comparison, json: str | None) -> None:
+def show(result: RunComparison, json: str | None) -> None:
     """Print which question is answered, the scores, the differences and the verdicts; or JSON alone for `-`."""
     if output.present(as_json(result), json):
         return
@@ -41,7 +41,7 @@ def show(result: Comparison, json: str | None) -> None:
         _show_candidate(result, candidate)
 
 
-def _show_seeds(result: Comparison) -> None:
+def _show_seeds(result: RunComparison) -> None:
     columns = ["recipe", "seed", "success", "return"]
     if result.threshold is not None:
         columns += [f"steps to {result.threshold:g}", f"seconds to {result.threshold:g}"]
@@ -80,7 +80,7 @@ def _format_aggregate(side: Side, quantity: Quantity) -> str:
     return f"{quantity} mean {mean}, IQM {middle} (95 % interval {low} to {high})"
 
 
-def _show_candidate(result: Comparison, candidate: Candidate) -> None:
+def _show_candidate(result: RunComparison, candidate: Candidate) -> None:
     out = output.out()
     question = f"\n{candidate.side.name} against {result.baseline.name}: "
     out.print(Text.assemble(question, (candidate.verdict, "bold")))
@@ -92,7 +92,7 @@ def _show_candidate(result: Comparison, candidate: Candidate) -> None:
         out.print("  recipe: the same")
 
 
-def describe_candidate(result: Comparison, candidate: Candidate) -> list[str]:
+def describe_candidate(result: RunComparison, candidate: Candidate) -> list[str]:
     """Return a line per difference, and how much data would decide where these cannot tell."""
     lines = [
         f"{quantity}: {format_difference(difference, as_percent=quantity == 'success')}"
@@ -103,7 +103,7 @@ def describe_candidate(result: Comparison, candidate: Candidate) -> list[str]:
     return lines
 
 
-def format_difference(difference: Difference, *, as_percent: bool) -> str:
+def format_difference(difference: MeanDifference, *, as_percent: bool) -> str:
     """Return `+3.0 points (95 % interval +1.0 to +5.0), p = 0.012`; points are percentage points, of success."""
 
     def number(value: float) -> str:
@@ -142,7 +142,7 @@ def format_needed(candidate: Candidate, comparisons: int) -> str:
     return "; ".join(parts) or "no difference at all: more of the same would not decide"
 
 
-def describe_tests(result: Comparison) -> str:
+def describe_tests(result: RunComparison) -> str:
     """Return what is tested, and how often equals are called different."""
     quantities = " and ".join(result.candidates[0].differences)
     count = len(result.candidates)
@@ -151,7 +151,7 @@ def describe_tests(result: Comparison) -> str:
     return f"tested: {quantities}{of}{together}; where all are equal, {ALPHA:.0%} of comparisons report a difference"
 
 
-def as_json(result: Comparison) -> dict[str, Any]:
+def as_json(result: RunComparison) -> dict[str, Any]:
     """Return the result as plain data."""
     return {
         "question": "recipes" if result.of_recipes else "policies",
@@ -179,7 +179,7 @@ def as_json(result: Comparison) -> dict[str, Any]:
     }
 
 
-def _side_as_json(side: Side, result: Comparison) -> dict[str, Any]:
+def _side_as_json(side: Side, result: RunComparison) -> dict[str, Any]:
     runs = [
         {
             "run": str(run.path),

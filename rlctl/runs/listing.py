@@ -35,16 +35,16 @@ def list_runs(
 
     Raises `UsageError` for a task without runs, which may be one of `commands` misspelt.
     """
-    found = [summarize(path) for path in find_runs(root)]
+    runs = [summarize(path) for path in find_runs(root)]
     if task is not None:
-        every = found
+        every = runs
         slug = registry.make_slug(task)
-        found = [run for run in every if run.task == task or run.name.partition("/")[0] == slug]
-        if not found:
+        runs = [run for run in every if run.task == task or run.name.partition("/")[0] == slug]
+        if not runs:
             names = sorted({run.task for run in every})
             close = did_you_mean(task, [*names, *commands])
             raise UsageError(f"no run of {task!r} under {root.resolve()}, and no such command of rlctl runs.{close}")
-    return sorted(found, key=_SORT_KEYS[sort], reverse=True)
+    return sorted(runs, key=_SORT_KEYS[sort], reverse=True)
 
 
 def show(runs: list[RunSummary], json: str | None) -> None:

@@ -39,7 +39,7 @@ def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Pat
         return _measured([run.path for run in _all_but_best(list_runs(root=root), keep_best)])
     paths = [_checked(Path(text), root) for text in runs]
     for path in paths:
-        if any(is_being_written(each) for each in (path, *(lock.parent for lock in path.glob("*/.lock")))):
+        if any(is_being_written(folder) for folder in (path, *(lock.parent for lock in path.glob("*/.lock")))):
             raise UsageError(f"{path}: this run is being trained; nothing was removed")
     return _measured(list(dict.fromkeys(paths)))
 
@@ -47,14 +47,14 @@ def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Pat
 def _checked(path: Path, root: Path) -> Path:
     """Return a run's folder; only a folder with a run.json of ours, or a damaged one where runs are, is one."""
     below = root / path
-    found = path if path.is_dir() else below
-    is_run = (found / "run.json").is_file()
-    is_below_root = found.resolve().parent.parent == root.resolve() and found.is_dir()
-    if found.is_symlink() or not (is_run or is_below_root):
+    folder = path if path.is_dir() else below
+    is_run = (folder / "run.json").is_file()
+    is_below_root = folder.resolve().parent.parent == root.resolve() and folder.is_dir()
+    if folder.is_symlink() or not (is_run or is_below_root):
         raise ArtifactError(f"{path}: not the folder of a run; `rlctl runs` lists them")
     if is_run and not is_below_root:
-        RunDirectory(found).status()
-    return found.resolve()
+        RunDirectory(folder).status()
+    return folder.resolve()
 
 
 def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:

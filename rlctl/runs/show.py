@@ -61,8 +61,8 @@ def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
 
 def describe_robustness(result: Robustness) -> Iterator[str]:
     """Yield the worst cell of all maps, what a push does, and how both were measured."""
-    if (found := result.find_worst()) is not None:
-        where, cell = found[0].name_cell(found[1]), found[1]
+    if (worst := result.find_worst()) is not None:
+        where, cell = worst[0].name_cell(worst[1]), worst[1]
         rate = "" if cell.success_rate is None else f"success {cell.success_rate:.1%}, "
         yield f"worst of {result.episodes} episodes each at {where}: {rate}return {cell.mean_return:.4g}"
     if result.push is not None:
@@ -73,9 +73,10 @@ def describe_robustness(result: Robustness) -> Iterator[str]:
 
 def _measure_sizes(run: RunDirectory) -> dict[str, int]:
     """Return the bytes of each file or folder of a run."""
-    entries = [each for each in sorted(run.path.iterdir()) if not each.name.startswith(".")]
+    entries = [entry for entry in sorted(run.path.iterdir()) if not entry.name.startswith(".")]
     return {
-        each.name: sum(file.stat().st_size for file in (each, *each.rglob("*")) if file.is_file()) for each in entries
+        entry.name: sum(file.stat().st_size for file in (entry, *entry.rglob("*")) if file.is_file())
+        for entry in entries
     }
 
 
@@ -85,9 +86,9 @@ def show(run: RunDescription, json: str | None) -> None:
     source = run.status.get("from")
     if json is not None:
         content = {**as_json(summary), "evaluations": run.evaluations, "metrics": run.metrics}
-        found = {"warnings": run.warnings, "findings": run.findings}
+        notes = {"warnings": run.warnings, "findings": run.findings}
         measured = None if run.robustness is None else run.robustness.model_dump(mode="json")
-        if output.present({**content, **found, "robustness": measured, "bytes": sizes}, json):
+        if output.present({**content, **notes, "robustness": measured, "bytes": sizes}, json):
             return
     what = f": {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}"
     out.print(Text.assemble((summary.name, "bold"), what))

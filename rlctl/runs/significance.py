@@ -40,7 +40,7 @@ class Verdict(enum.StrEnum):
 
 
 @dataclasses.dataclass(frozen=True)
-class Difference:
+class MeanDifference:
     """A candidate's mean minus the baseline's."""
 
     mean: float
@@ -60,7 +60,7 @@ class Difference:
 
 
 @dataclasses.dataclass(frozen=True)
-class SeedDifference(Difference):
+class SeedDifference(MeanDifference):
     """The same between two recipes, over training seeds."""
 
     probability_of_improvement: float
@@ -69,12 +69,12 @@ class SeedDifference(Difference):
     """The smallest p-value that so many seeds can reach at all."""
 
 
-_Kind = TypeVar("_Kind", bound=Difference)
+_Kind = TypeVar("_Kind", bound=MeanDifference)
 
 
 def compare_episodes(
     baseline: Mapping[Quantity, Array], candidate: Mapping[Quantity, Array], comparisons: int = 1
-) -> dict[Quantity, Difference]:
+) -> dict[Quantity, MeanDifference]:
     """Compare two policies by success and return on the same episodes, each of shape (episodes,), NaN where unknown.
 
     `comparisons` is how many candidates are compared with this baseline.
@@ -162,7 +162,7 @@ def find_least_seeds(comparisons: int) -> tuple[int, float]:
     raise AssertionError
 
 
-def success_difference(baseline: Array, candidate: Array) -> Difference:
+def success_difference(baseline: Array, candidate: Array) -> MeanDifference:
     """Compare two policies' successes, 0 or 1, on the same episodes: McNemar's exact test (McNemar, 1947).
 
     Both of shape (episodes,). The interval is that of Agresti and Min (2005), which is not empty where no episode
@@ -176,10 +176,10 @@ def success_difference(baseline: Array, candidate: Array) -> Difference:
     centre = (gained - lost) / (episodes + 2)
     half = _quantiles()[0] * math.sqrt((gained + lost + 1) / (episodes + 2) - centre**2) / math.sqrt(episodes + 2)
     needed = _episodes_for_success(gained, lost, episodes)
-    return Difference(float(difference.mean()), max(-1.0, centre - half), min(1.0, centre + half), p, needed)
+    return MeanDifference(float(difference.mean()), max(-1.0, centre - half), min(1.0, centre + half), p, needed)
 
 
-def return_difference(baseline: Array, candidate: Array) -> Difference:
+def return_difference(baseline: Array, candidate: Array) -> MeanDifference:
     """Compare two policies' returns on the same episodes: a paired permutation test and a bootstrap interval.
 
     Both of shape (episodes,). Raises `ValueError` if the shapes differ.
@@ -189,13 +189,13 @@ def return_difference(baseline: Array, candidate: Array) -> Difference:
     difference = candidate - baseline
     mean = float(difference.mean())
     if not difference.any():
-        return Difference(0.0, 0.0, 0.0, 1.0, None)
+        return MeanDifference(0.0, 0.0, 0.0, 1.0, None)
     test = permutation_test(
         (difference,), np.mean, permutation_type="samples", n_resamples=_RESAMPLES, vectorized=True, rng=_rng()
     )
     low, high = _interval((difference,), np.mean)
     std = float(difference.std(ddof=1)) if difference.size > 1 else math.nan
-    return Difference(mean, low, high, float(test.pvalue), _sample_size(mean, std, _LEAST_PAIRS))
+    return MeanDifference(mean, low, high, float(test.pvalue), _sample_size(mean, std, _LEAST_PAIRS))
 
 
 def seed_difference(baseline: Array, candidate: Array) -> SeedDifference:

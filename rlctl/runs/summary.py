@@ -79,10 +79,12 @@ def find_runs(root: Path = ROOT) -> Iterator[Path]:
 def _folders(path: Path) -> list[Path]:
     try:
         with os.scandir(path) as entries:
-            folders = [each for each in entries if each.is_dir(follow_symlinks=False) and not each.name.startswith(".")]
+            folders = [
+                entry for entry in entries if entry.is_dir(follow_symlinks=False) and not entry.name.startswith(".")
+            ]
     except OSError:
         return []
-    return [Path(each.path) for each in folders]
+    return [Path(folder.path) for folder in folders]
 
 
 def summarize(path: Path) -> RunSummary:

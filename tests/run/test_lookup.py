@@ -122,7 +122,7 @@ def test_a_task_stands_for_its_newest_run_with_a_policy(root, make_run, monkeypa
     assert found.file == second.best_policy
     assert found.notes == (
         f"run {second.path}: policy of step 1,000, saved 2 h ago",
-        f"passed over, without such a policy: {third.path}",
+        f"skipped {third.path}: no such policy yet",
         f"an older run was better in its evaluations: {first.path} (success 90.0% against 50.0%)",
     )
     # The newest run is what `latest` says, with a policy or not.

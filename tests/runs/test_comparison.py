@@ -11,7 +11,7 @@ from rlctl.evaluation.evaluate import choose_spec, load_player
 from rlctl.evaluation.request import EvalRequest
 from rlctl.recipe.sources import resolve
 from rlctl.run.train_request import TrainRequest
-from rlctl.runs.comparison import Candidate, Comparison, Side, compare, find_recipe_changes
+from rlctl.runs.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes
 from rlctl.runs.comparison_report import as_json, format_needed
 from rlctl.runs.report.write import write_report
 from rlctl.runs.selection import find_runs_of
@@ -55,7 +55,7 @@ def test_all_play_in_the_world_of_the_first(root):
     assert (played.randomize, played.events) == (True, {"mass": {"factor": 1.0}})
     changes = {"task.goal": (0.1, 0.5), "algo_kwargs.gamma": (0.9, 0.99), "randomize": (False, True)}
     candidate = Candidate(Side("b", [], []), {}, changes)
-    result = Comparison(False, "Line", Side("a", [], []), [candidate], 5, None)
+    result = RunComparison(False, "Line", Side("a", [], []), [candidate], 5, None)
     assert result.world_differences == ["task.goal", "randomize"]
 
 

@@ -28,19 +28,19 @@ def _actions(run: History) -> list[Array]:
     if not isinstance(space, spaces.Box) or not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         return []
     middle, half = (space.high + space.low) / 2, np.maximum((space.high - space.low) / 2, 1e-12)
-    long = [each.actions for each in run.episodes if len(each.rewards) >= _LEAST_STEPS]
+    long = [episode.actions for episode in run.episodes if len(episode.rewards) >= _LEAST_STEPS]
     return [((actions - middle) / half).reshape(len(actions), -1).astype(np.float64) for actions in long]
 
 
 def shakes(run: History) -> str | None:
     """Actions jump to and fro from step to step by a large part of their range."""
-    found = []
+    changes = []
     for actions in _actions(run):
         change = np.diff(actions, axis=0)
-        found.append((float((change[1:] * change[:-1] < 0).mean()), float(np.abs(change).mean())))
-    if not found or run.progress < 0.5:
+        changes.append((float((change[1:] * change[:-1] < 0).mean()), float(np.abs(change).mean())))
+    if not changes or run.progress < 0.5:
         return None
-    reversals, size = np.median(found, axis=0)
+    reversals, size = np.median(changes, axis=0)
     if reversals < 0.6 or size < 0.4:
         return None
     return f"actions reverse in {reversals:.0%} of the steps, by {size:.2g} half ranges on average"
@@ -66,7 +66,7 @@ def only_constant_reward(run: History) -> str | None:
 
 def _describe_constant_reward(run: History, least: float) -> str | None:
     weights = run.env.reward_weights if run.env is not None else {}
-    shares = [share for each in run.episodes if (share := _constant_share(each, weights)) is not None]
+    shares = [share for episode in run.episodes if (share := _constant_share(episode, weights)) is not None]
     if not shares or (share := float(np.median(shares))) < least:
         return None
     return f"{share:.0%} of the positive reward is the same in every step"
@@ -87,11 +87,11 @@ def impossible_motion(run: History) -> str | None:
     """Speeds, or jumps of positions, that no robot has."""
     if run.env is None:
         return None
-    found = []
+    motions = []
     for episode in run.episodes:
         for name, rows in _named_observations(episode, run).items():
-            found += _fast(name, run.env.observation_units.get(name, ""), rows, run.env.control_dt)
-    return max(found)[1] if found else None
+            motions += _fast(name, run.env.observation_units.get(name, ""), rows, run.env.control_dt)
+    return max(motions)[1] if motions else None
 
 
 def _fast(name: str, unit: str, rows: Array, control_dt: float | None) -> list[tuple[float, str]]:

@@ -88,8 +88,8 @@ def diagnose(run: RunDirectory | History) -> list[Finding]:
     def look(name: str) -> str | None:
         return functions[name](history)
 
-    found = [finding for text in _texts()["findings"] if (finding := _check(text, look, history)) is not None]
-    return sorted(found, key=lambda each: list(Grade).index(each.grade))
+    findings = [finding for text in _texts()["findings"] if (finding := _check(text, look, history)) is not None]
+    return sorted(findings, key=lambda finding: list(Grade).index(finding.grade))
 
 
 def _check(text: dict[str, Any], look: Callable[[str], str | None], history: History) -> Finding | None:
@@ -103,7 +103,7 @@ def _check(text: dict[str, Any], look: Callable[[str], str | None], history: His
         grade=Grade(text["grade"]),
         evidence=list(dict.fromkeys(evidence for name in names if (evidence := look(name)) is not None)),
         meaning=text["meaning"],
-        advice=[history.name_run(each) for each in text["try"]],
+        advice=[history.name_run(advice) for advice in text["try"]],
         settings=list(_settings(text["settings"], history)),
     )
 
@@ -139,15 +139,15 @@ def explain(code: str) -> list[str]:
 def format_finding(finding: Finding) -> list[str]:
     """Return a finding with its evidence, its meaning and what to try."""
     settings = [
-        f"  {each.name} is {'not set' if each.value is None else each.value}: {each.advice}"
-        for each in finding.settings
+        f"  {setting.name} is {'not set' if setting.value is None else setting.value}: {setting.advice}"
+        for setting in finding.settings
     ]
-    return [finding.line, f"  {finding.meaning}", *(f"  try: {each}" for each in finding.advice), *settings]
+    return [finding.line, f"  {finding.meaning}", *(f"  try: {advice}" for advice in finding.advice), *settings]
 
 
 def format_end(findings: Sequence[Finding], run: str) -> list[str]:
     """Return what a training says at its end: warnings in full, the rest in one line; nothing where all is well."""
-    warnings = [each for each in findings if each.grade == Grade.WARNING]
-    others = [f"{each.id} {each.name}" for each in findings if each.grade != Grade.WARNING]
-    lines = [line for each in warnings for line in format_finding(each)]
+    warnings = [finding for finding in findings if finding.grade == Grade.WARNING]
+    others = [f"{finding.id} {finding.name}" for finding in findings if finding.grade != Grade.WARNING]
+    lines = [line for finding in warnings for line in format_finding(finding)]
     return [*lines, f"noted: {', '.join(others)}; more: rlctl runs show {run}"] if others else lines

@@ -122,7 +122,7 @@ class History:
     @property
     def is_good(self) -> bool:
         """Whether nearly all episodes succeeded once."""
-        return any(len(each) and each.values.max() >= _GOOD for each in self.successes)
+        return any(len(curve) and curve.values.max() >= _GOOD for curve in self.successes)
 
     @functools.cached_property
     def progress(self) -> float:
@@ -156,12 +156,12 @@ class History:
     @functools.cached_property
     def episodes(self) -> list[RecordedEpisode]:
         """The newest recorded episodes of evaluations, at most `EPISODES`."""
-        found: list[RecordedEpisode] = []
+        episodes: list[RecordedEpisode] = []
         files = [file for file in self.run.episodes.glob("*.npz") if file.stem.isdecimal()]
         for file in sorted(files, reverse=True)[:EPISODES]:
             with contextlib.suppress(RlctlError, OSError):
-                found.append(load_episode(file))
-        return [episode for episode in found if len(episode.rewards)]
+                episodes.append(load_episode(file))
+        return [episode for episode in episodes if len(episode.rewards)]
 
 
 def _curve(rows: Rows, name: str) -> Curve:

@@ -70,8 +70,8 @@ def success_rises(run: History) -> str | None:
 
 def never_succeeds(run: History) -> str | None:
     """Success is reported, and there is hardly any."""
-    found = [each for each in run.successes if len(each)]
-    if not found or run.progress < 0.5 or (best := max(float(each.values.max()) for each in found)) > _NEVER:
+    curves = [curve for curve in run.successes if len(curve)]
+    if not curves or run.progress < 0.5 or (best := max(float(curve.values.max()) for curve in curves)) > _NEVER:
         return None
     return f"success at most {best:.1%}"
 

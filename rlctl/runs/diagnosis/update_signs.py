@@ -47,7 +47,9 @@ def _largest_value(run: History) -> float | None:
     if not isinstance(gamma, float) or not 0 <= gamma < 1 or not run.episodes:
         return None
     normalized = isinstance(settings, dict) and settings.get("reward", True)
-    largest = _MOST_NORMALIZED_REWARD if normalized else max(float(np.abs(each.rewards).max()) for each in run.episodes)
+    largest = (
+        _MOST_NORMALIZED_REWARD if normalized else max(float(np.abs(episode.rewards).max()) for episode in run.episodes)
+    )
     return max(largest / (1 - gamma), float(np.abs(run.curve("return").values).max(initial=0.0)))
 
 

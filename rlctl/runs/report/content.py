@@ -17,7 +17,7 @@ from rlctl.output import format_duration
 from rlctl.recipe.recipe import NOT_SET, Recipe
 from rlctl.recipe.stages import format_value
 from rlctl.run.episode import RecordedEpisode
-from rlctl.runs.comparison import Comparison, compare_runs, find_recipe_changes
+from rlctl.runs.comparison import RunComparison, compare_runs, find_recipe_changes
 from rlctl.runs.diagnosis import Finding
 from rlctl.runs.selection import find_runs_of
 from rlctl.runs.show import RunDescription
@@ -117,7 +117,7 @@ def _name_recipe(settings: Mapping[str, Any]) -> str:
     return ", ".join(names[:_SETTINGS_NAMED]) + (", ..." if len(names) > _SETTINGS_NAMED else "")
 
 
-def compare_recipes(report: RunReport, episodes: int) -> Comparison | None:
+def compare_recipes(report: RunReport, episodes: int) -> RunComparison | None:
     """Evaluate and compare the recipes of a report, the first as the baseline; None for a single recipe.
 
     Raises `RlctlError` where they cannot be compared.
@@ -194,13 +194,13 @@ def describe_absence(report: RunReport) -> str:
 
 def collect_findings(report: RunReport) -> list[tuple[Finding, list[str]]]:
     """Return what the runs' records show, each finding once, with its evidence; of several runs with their seeds."""
-    found: dict[str, tuple[Finding, list[str]]] = {}
+    findings: dict[str, tuple[Finding, list[str]]] = {}
     for run in report.runs:
         for finding in run.findings:
             seed = f"seed {run.summary.seed}: " if len(report.runs) > 1 else ""
-            _, evidence = found.setdefault(f"{finding.id} {finding.name}", (finding, []))
+            _, evidence = findings.setdefault(f"{finding.id} {finding.name}", (finding, []))
             evidence.append(seed + "; ".join(finding.evidence))
-    return list(found.values())
+    return list(findings.values())
 
 
 def list_commands(report: RunReport) -> list[str]:
