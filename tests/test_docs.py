@@ -272,11 +272,9 @@ def test_the_page_on_runs_has_every_file(tmp_path):
 def test_files_named_by_the_page_on_the_architecture_exist():
     text = (ROOT / "docs/architecture.md").read_text()
     paths = {code for code in CODE.findall(FENCE.sub("", text)) if re.fullmatch(r"[\w/]+(\.py|\.yaml|/)", code)}
-    assert len(paths) > 20
-    folders = (ROOT, ROOT / "rlctl", ROOT / "rlctl/task", ROOT / "rlctl/replay", ROOT / "rlctl/task/events")
+    assert len(paths) > 60
+    folders = (ROOT, ROOT / "rlctl", ROOT / "rlctl/task", ROOT / "rlctl/task/events")
     assert [path for path in paths if not any((folder / path).exists() for folder in folders)] == []
-    layers = re.findall(r"[\w/]+(?:\.py|/)", FENCE.search(text)[2])
-    assert [path for path in layers if not (ROOT / "rlctl" / path).exists()] == []
 
 
 def test_the_readme_is_short():

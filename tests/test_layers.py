@@ -95,6 +95,36 @@ def test_imports_run_downwards():
     assert wrong == []
 
 
+CIRCLES_LEFT = {
+    *(f"rlctl.deploy.server.{name}" for name in ("routes", "serve", "server")),
+    *(f"rlctl.training.{name}" for name in ("own_networks", "snapshot")),
+}
+NAMED_TWICE = {"_Actor", "Comparison", "Difference", "Limits", "RecordedEpisode"}
+
+
+def list_imported_modules(module: str, modules: dict[str, Path]) -> set[str]:
+    names = {name if name in modules else name.rpartition(".")[0] for name in imports(modules[module])}
+    return (names & set(modules)) - {module, "rlctl"}
+
+
+def test_no_two_modules_import_each_other():
+    modules = {module_of(file): file for file in files("rlctl")}
+    left = {module: list_imported_modules(module, modules) for module in modules}
+    while leaves := [module for module, others in left.items() if not others & set(left)]:
+        for module in leaves:
+            del left[module]
+    while tops := set(left) - {other for others in left.values() for other in others}:  # only import a circle
+        for module in tops:
+            del left[module]
+    assert set(left) <= CIRCLES_LEFT
+
+
+def test_a_class_name_means_one_thing():
+    trees = [ast.parse(file.read_text()) for file in files("rlctl")]
+    names = [node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    assert {name for name in names if names.count(name) > 1} <= NAMED_TWICE
+
+
 def test_who_imports_torch():
     found = [
         f"{name} imports {module}"

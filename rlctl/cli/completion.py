@@ -13,13 +13,13 @@ def complete_task(incomplete: str) -> list[str]:
     from rlctl.environments import installed  # only here: every command's help imports this module
 
     names = [entry.name for entry in installed.list_installed() if entry.problem is None]
-    return [each for each in (*dict.fromkeys(names), *_list_paths(incomplete, "*.py")) if each.startswith(incomplete)]
+    return [name for name in (*dict.fromkeys(names), *_list_paths(incomplete, "*.py")) if name.startswith(incomplete)]
 
 
 def complete_algorithm(incomplete: str) -> list[str]:
     """Return the algorithms that begin so."""
     known = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo")
-    return [each for each in known if each.startswith(incomplete)]
+    return [name for name in known if name.startswith(incomplete)]
 
 
 def complete_run(incomplete: str) -> list[str]:
@@ -29,9 +29,9 @@ def complete_run(incomplete: str) -> list[str]:
     latest = ["latest"] if runs else []
     files = [*_list_paths(incomplete, "*.safetensors"), *_list_paths(incomplete, "*.onnx")]
     found = [*latest, *tasks, *(str(run) for run in runs[:_MOST]), *files]
-    return [each for each in found if each.startswith(incomplete)]
+    return [text for text in found if text.startswith(incomplete)]
 
 
 def _list_paths(incomplete: str, pattern: str) -> list[str]:
     folder = Path(incomplete).parent if "/" in incomplete else Path()
-    return [str(each) for each in sorted(folder.glob(pattern))[:_MOST]]
+    return [str(path) for path in sorted(folder.glob(pattern))[:_MOST]]

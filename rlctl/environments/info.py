@@ -50,7 +50,7 @@ class EnvInfo(pydantic.BaseModel):
         for name in ("observation", "action"):
             ours, theirs = getattr(self, f"{name}_space"), getattr(other, f"{name}_space")
             if ours != theirs:
-                own, foreign = (format_space(space_from_json(each), 120) for each in (ours, theirs))
+                own, foreign = (format_space(space_from_json(space), 120) for space in (ours, theirs))
                 return f"its {name} space is {own}, {whose} is {foreign}"
         return None
 
@@ -146,14 +146,14 @@ def space_from_json(data: dict[str, Any]) -> spaces.Space[Any]:
 
 def _count_elements(data: dict[str, Any]) -> int:
     if data["type"] == "Dict":
-        return sum(_count_elements(each) for each in data["spaces"].values())
+        return sum(_count_elements(inner) for inner in data["spaces"].values())
     if data["type"] == "Box":
         return math.prod(_check_shape(data["shape"]))
     if data["type"] == "MultiBinary":
         return math.prod(_check_shape(data["n"]))
     # Networks want them one-hot, as numbers of eight bytes, for a whole batch.
     alternatives = [data["n"]] if data["type"] == "Discrete" else data["nvec"]
-    return _ONE_HOT * sum(_check_whole(each) for each in alternatives)
+    return _ONE_HOT * sum(_check_whole(count) for count in alternatives)
 
 
 def _build(data: dict[str, Any]) -> spaces.Space[Any]:

@@ -92,7 +92,7 @@ def _defines(source: str, name: str) -> bool:
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == name:
             return True
-        if isinstance(node, ast.ImportFrom) and {name, "*"} & {each.asname or each.name for each in node.names}:
+        if isinstance(node, ast.ImportFrom) and {name, "*"} & {alias.asname or alias.name for alias in node.names}:
             return True
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id == name:
             return True

@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rlctl.environments.plugin_code import call_plugin
-from rlctl.errors import RecipeError, did_you_mean, short_repr
-from rlctl.storage.validation import explain_first
+from rlctl.errors import RecipeError, did_you_mean, explain_invalid, short_repr
 
 
 def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
@@ -61,7 +60,7 @@ def check_fields(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
         try:
             checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
         except pydantic.ValidationError as error:
-            raise RecipeError(explain_first(error, f"task.{key}")) from None
+            raise RecipeError(explain_invalid(error, f"task.{key}")) from None
     return checked
 
 

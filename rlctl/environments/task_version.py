@@ -20,9 +20,9 @@ def identify_task(task: str) -> dict[str, Any]:
 def describe_task_changes(before: Mapping[str, Any], task: str, since: str = "the run began") -> list[str]:
     """Describe how a task differs from what `identify_task` returned before; empty if it does not."""
     now = identify_task(task)
-    earlier, later = (each if isinstance(each, dict) else {} for each in (before.get("origin"), now["origin"]))
+    earlier, later = (origin if isinstance(origin, dict) else {} for origin in (before.get("origin"), now["origin"]))
     if earlier != later:
-        names = (" ".join(map(str, each.values())) or "no installed package" for each in (earlier, later))
+        names = (" ".join(map(str, origin.values())) or "no installed package" for origin in (earlier, later))
         return ["task {} came from {} when {since}, and comes from {} now".format(task, *names, since=since)]
     if before.get("source_sha256") != now["source_sha256"]:
         file = registry.find_source_file(task)

@@ -32,7 +32,7 @@ _MOST_STEPS = 10**12
 _MOST_ENVS = 10_000
 
 
-class Normalize(Section):
+class NormalizeSettings(Section):
     """Running normalisation, as SB3's VecNormalize does it."""
 
     observation: Switch = True
@@ -45,7 +45,7 @@ class Normalize(Section):
     """Bound of normalised rewards."""
 
     @pydantic.model_validator(mode="after")
-    def _check_bounds(self) -> Normalize:
+    def _check_bounds(self) -> NormalizeSettings:
         for name, normalized in (("observation", self.observation), ("reward", self.reward)):
             bound = f"clip_{name}"
             if not normalized and getattr(self, bound) != type(self).model_fields[bound].default:
@@ -53,7 +53,7 @@ class Normalize(Section):
         return self
 
 
-class Evaluation(Section):
+class EvalSettings(Section):
     """Evaluation while training; steps are environment steps, all environments together."""
 
     every_steps: Whole | None = Field(
@@ -75,7 +75,7 @@ class Hindsight(Section):
     """Which of the goals that an episode reached are taken."""
 
 
-class Checkpoints(Section):
+class CheckpointSettings(Section):
     """Which checkpoints are kept."""
 
     keep: Whole = Field(3, ge=1, le=1_000_000)
@@ -101,7 +101,7 @@ class Recipe(Section):
     """Parameters of the networks; see the algorithm's own table."""
     her: Hindsight | None = None
     """Hindsight experience replay, for tasks with goals; null: none."""
-    normalize: Normalize | None = Field(
+    normalize: NormalizeSettings | None = Field(
         None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; else neither")
     )
     """Running normalisation of observations and rewards."""
@@ -117,11 +117,11 @@ class Recipe(Section):
     """Environment steps, all environments together."""
     seed: Whole = Field(0, ge=0, lt=2**32)
     """Seed of everything random."""
-    eval: Evaluation = Evaluation()
+    eval: EvalSettings = EvalSettings()
     """Evaluation while training."""
     stop_success: Number | None = Field(None, gt=0, le=1)
     """Stop after two evaluations in a row at this success rate; null: never."""
-    checkpoint: Checkpoints = Checkpoints()
+    checkpoint: CheckpointSettings = CheckpointSettings()
     """Which checkpoints are kept."""
     stages: Annotated[list[Stage], pydantic.AfterValidator(check_promotions)] = []
     """Curriculum: what each stage changes, and when it ends."""
@@ -216,8 +216,8 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
         schema = build_schema(values.get("algo", "ppo"))
 
         def explain(problem: Any, path: validation.Place) -> str:
-            origins = (each if isinstance(each, str) else each.find(path) for each in sources)
-            origin = next((each for each in origins if each is not None), "recipe")
+            origins = (source if isinstance(source, str) else source.find(path) for source in sources)
+            origin = next((origin for origin in origins if origin is not None), "recipe")
             return (f"{origin}: " if origin else "") + _explain(problem, path, schema, values)
 
         raise RecipeError(validation.explain_all(error, schema, explain)) from None
@@ -250,7 +250,7 @@ def _explain(problem: Any, path: Sequence[str | int], schema: validation.Schema,
 
 def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:
     """Return per dotted key that differs the value in `recipe` and the one in `base`; the seed is not compared."""
-    ours, theirs = (dict(_flatten(each.model_dump(mode="json", by_alias=True))) for each in (recipe, base))
+    ours, theirs = (dict(_flatten(one.model_dump(mode="json", by_alias=True))) for one in (recipe, base))
     keys = dict.fromkeys([*theirs, *ours])
     pairs = {key: (ours.get(key, NOT_SET), theirs.get(key, NOT_SET)) for key in keys if key != "seed"}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}

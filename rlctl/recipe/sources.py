@@ -11,7 +11,7 @@ from rlctl.environments import registry
 from rlctl.environments.spec import EnvChanges, merge
 from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
 from rlctl.recipe.hyperparameters import ON_POLICY
-from rlctl.recipe.recipe import Normalize, Recipe, Source, validate
+from rlctl.recipe.recipe import NormalizeSettings, Recipe, Source, validate
 from rlctl.storage import yaml_text
 
 _PRESETS = Path(__file__).with_name("presets")
@@ -76,7 +76,7 @@ def fill_defaults(recipe: Recipe) -> Recipe:
         kwargs.setdefault("buffer_size", min(1_000_000, max(recipe.total_timesteps, 1_000)))
     changes["algo_kwargs"] = kwargs
     if recipe.normalize is None:
-        changes["normalize"] = Normalize(observation=on_policy, reward=on_policy)
+        changes["normalize"] = NormalizeSettings(observation=on_policy, reward=on_policy)
     if recipe.eval.every_steps is None:
         changes["eval"] = recipe.eval.model_copy(update={"every_steps": max(1, recipe.total_timesteps // 10)})
     return recipe.model_copy(update=changes)

@@ -78,7 +78,7 @@ def check_promotions(stages: list[Stage]) -> list[Stage]:
 def format_value(key: str, value: Any) -> str:
     """Return the value of a recipe's key for people: of stages, as plain data, only what they change."""
     try:
-        stages = [Stage.model_validate(each) for each in value] if key == "stages" else []
+        stages = [Stage.model_validate(stage) for stage in value] if key == "stages" else []
     except (TypeError, ValueError):  # not set, or what a file by hand holds
         stages = []
     return f"{len(stages)} stages: " + "; ".join(map(str, stages)) if stages else str(value)

@@ -37,7 +37,7 @@ def _read_control_groups() -> list[int]:
         return []
     own = next((entry[3:] for entry in entries if entry.startswith("0::")), "/")
     folder = _CGROUPS / own.strip("/")
-    groups = [each for each in (folder, *folder.parents) if each.is_relative_to(_CGROUPS)]
+    groups = [group for group in (folder, *folder.parents) if group.is_relative_to(_CGROUPS)]
     found = [_read_group(group, "memory.max", "memory.current", "file") for group in groups]
     found.append(_read_group(_CGROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "cache"))
     return [value for value in found if value is not None]

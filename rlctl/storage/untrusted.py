@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 from rich.filesize import decimal as format_bytes
 
-from rlctl.errors import ArtifactError, short_repr
+from rlctl.errors import ArtifactError, explain_invalid, short_repr
 from rlctl.storage import memory
 from rlctl.version import __version__
 
@@ -101,9 +101,7 @@ def _explain_error(error: ValueError) -> str:
     """Return in a line what is wrong with a description; of pydantic's report the first problem, with its place."""
     import pydantic
 
-    from rlctl.storage.validation import explain_first
-
-    return short_repr(explain_first(error) if isinstance(error, pydantic.ValidationError) else str(error), 200)
+    return short_repr(explain_invalid(error) if isinstance(error, pydantic.ValidationError) else str(error), 200)
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -118,10 +116,10 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         members = archive.infolist()
         if len(members) > _MEMBERS:
             raise ValueError(f"it has {len(members):,} members, at most {_MEMBERS:,} are read")
-        for each in members:
-            if not each.filename.endswith(".npy") or each.compress_type not in _PACKED:
-                raise ValueError(f"{each.filename!r} is not an array, or not packed as numpy does it")
-        _check_size(path, sum(each.file_size for each in members), "unpacked ")
+        for member in members:
+            if not member.filename.endswith(".npy") or member.compress_type not in _PACKED:
+                raise ValueError(f"{member.filename!r} is not an array, or not packed as numpy does it")
+        _check_size(path, sum(member.file_size for member in members), "unpacked ")
         arrays: dict[str, NDArray[Any]] = dict(np.load(path, allow_pickle=False))
     for name, content in arrays.items():
         if not isinstance(content, np.ndarray):  # numpy gives back the bytes of what has no header

@@ -25,7 +25,14 @@ def _descend(root: Schema, path: Sequence[str | int]) -> tuple[Schema, int]:
     # How many parts of `path` a schema has comes with it: what comes after are names that pydantic has for types.
     node = root
     for depth, part in enumerate(path):
-        inner = next((each for each in (_find_part(one, part) for one in _list_alternatives(root, node)) if each), None)
+        inner = next(
+            (
+                part_schema
+                for part_schema in (_find_part(one, part) for one in _list_alternatives(root, node))
+                if part_schema
+            ),
+            None,
+        )
         if inner is None:
             return node, depth
         node = inner
@@ -42,12 +49,19 @@ def _find_part(node: Schema, part: str | int) -> Schema | None:
 
 def list_keys(root: Schema, node: Schema) -> list[str]:
     """Return the keys that a mapping may have; none if `node` describes no mapping, or one of any keys."""
-    return next((list(each["properties"]) for each in _list_alternatives(root, node) if "properties" in each), [])
+    return next(
+        (
+            list(alternative["properties"])
+            for alternative in _list_alternatives(root, node)
+            if "properties" in alternative
+        ),
+        [],
+    )
 
 
 def describe_value(root: Schema, node: Schema) -> str:
     """Return what a value must be: `a number in (0, 1]`, `a whole number in [1, 1e9] or -1`."""
-    return " or ".join(dict.fromkeys(_describe(root, each) for each in _list_alternatives(root, node)))
+    return " or ".join(dict.fromkeys(_describe(root, alternative) for alternative in _list_alternatives(root, node)))
 
 
 def explain_all(error: pydantic.ValidationError, root: Schema, explain: Callable[[Any, Place], str]) -> str:
@@ -57,13 +71,6 @@ def explain_all(error: pydantic.ValidationError, root: Schema, explain: Callable
         problems.setdefault(_locate(problem, root), problem)  # pydantic has one for each type that a value may be of
     lines = [explain(problem, place) for place, problem in problems.items()]
     return "\n".join(lines if len(lines) <= _MOST_LINES else [*lines[:2], f"and {len(lines) - 2} more mistakes"])
-
-
-def explain_first(error: pydantic.ValidationError, label: str = "") -> str:
-    """Return the first problem in one line: `LABEL: should be a valid number, got 'abc'`; without a label its place."""
-    problem = error.errors(include_url=False)[0]
-    place = label or ".".join(map(str, problem["loc"])) or "it"
-    return f"{place}: {problem['msg'].removeprefix('Input ')}, got {short_repr(repr(problem['input']))}"
 
 
 def _locate(problem: Any, root: Schema) -> Place:
@@ -77,16 +84,18 @@ def explain(
     """Say what is wrong with the value at `path`, which is called `key`: what was expected, and the closest name."""
     if problem["type"] == "extra_forbidden":
         keys = list_keys(root, find_schema(root, path[:-1]))
-        name, outer = path[-1], (find_schema(root, [*path[:-1], each]) for each in keys)
-        inner = [f"{each}.{name}" for each, node in zip(keys, outer, strict=True) if name in list_keys(root, node)]
+        name, outer = path[-1], (find_schema(root, [*path[:-1], key_here]) for key_here in keys)
+        inner = [
+            f"{key_here}.{name}" for key_here, node in zip(keys, outer, strict=True) if name in list_keys(root, node)
+        ]
         hint = f" Did you mean {inner[0]!r}?" if inner else did_you_mean(str(name), keys)
         return f"no key {key!r}{of}.{hint} Keys here: {', '.join(keys)}."
     label = f"{key}: " if key else ""
     if problem["type"] == "value_error":  # of a check of ours that needs more than a type
         return f"{label}{problem['ctx']['error']}"
     part, given = find_schema(root, path), values
-    for each in path:
-        given = given[each]
+    for part_key in path:
+        given = given[part_key]
     expected = describe_value(root, part)
     if unit:
         expected = f"{expected.removesuffix(' or null')} [{unit}]"
@@ -100,8 +109,8 @@ def _list_alternatives(root: Schema, node: Schema) -> Iterator[Schema]:
     if "$ref" in node:
         yield from _list_alternatives(root, root["$defs"][node["$ref"].rpartition("/")[2]])
     elif "anyOf" in node:
-        for each in node["anyOf"]:
-            yield from _list_alternatives(root, each)
+        for alternative in node["anyOf"]:
+            yield from _list_alternatives(root, alternative)
     else:
         yield node
 
@@ -114,7 +123,7 @@ def _describe(root: Schema, node: Schema) -> str:
     if "pattern" in node:
         return str(node.get("text", node["pattern"]))
     if "prefixItems" in node:
-        return f"[{', '.join(describe_value(root, each) for each in node['prefixItems'])}]"
+        return f"[{', '.join(describe_value(root, item) for item in node['prefixItems'])}]"
     kind = node.get("type")
     if kind in ("integer", "number"):
         return f"{'a whole number' if kind == 'integer' else 'a number'}{_describe_range(node)}"

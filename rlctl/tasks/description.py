@@ -175,7 +175,9 @@ def _list_parameters(constructor: Callable[..., Any]) -> list[dict[str, Any]]:
 
 
 def _find_origin(task: str, target: str) -> tuple[str | None, str | None]:
-    entry = installed.find(task) or next((each for each in installed.list_installed() if each.target == target), None)
+    entry = installed.find(task) or next(
+        (candidate for candidate in installed.list_installed() if candidate.target == target), None
+    )
     if entry is not None:
         return entry.distribution, entry.version
     if task.rpartition(":")[0].endswith(".py"):  # any package may have a module of that name

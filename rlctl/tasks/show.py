@@ -36,11 +36,11 @@ def show(description: Description, json: str | None) -> None:
     _print_section("parameters  --set task.NAME=VALUE", parameters, none="none")
     if definition is not None:
         _print_section("reward terms", _list_rewards(definition["rewards"]))
-        _print_section("events", [_format_event(each) for each in definition["events"]], none="none")
+        _print_section("events", [_format_event(event) for event in definition["events"]], none="none")
         if definition["model_faults"]:
             _print_section("model files", [(fault,) for fault in definition["model_faults"]])
     if recipe.stages:
-        _print_section("stages", [_format_stage(number, each) for number, each in enumerate(recipe.stages, 1)])
+        _print_section("stages", [_format_stage(number, stage) for number, stage in enumerate(recipe.stages, 1)])
     _print_section(f"recipe  {content['recipe_file'] or 'none packaged; the defaults'}", ())
     for line in recipe.to_yaml().splitlines():
         out.print(Text(f"  {line}"))
@@ -103,9 +103,14 @@ def _shorten(space: str) -> str:
 
 def _list_quantities(quantities: list[Json]) -> list[Row]:
     return [
-        (each["name"], _format_size(each), each["unit"] or "", _format_bounds(each["low"], each["high"]))
-        for each in quantities
-        if each["name"]  # without one it is the whole space, which the title has
+        (
+            quantity["name"],
+            _format_size(quantity),
+            quantity["unit"] or "",
+            _format_bounds(quantity["low"], quantity["high"]),
+        )
+        for quantity in quantities
+        if quantity["name"]  # without one it is the whole space, which the title has
     ]
 
 
@@ -139,12 +144,12 @@ def _list_joints(joints: Json | None) -> list[Row]:
 def _list_parameters(parameters: list[Json], trained: Mapping[str, Any]) -> list[Row]:
     return [
         (
-            (name := each["name"]),
-            each["type"],
-            "required" if each["required"] else _format_value(each["default"]),
+            (name := parameter["name"]),
+            parameter["type"],
+            "required" if parameter["required"] else _format_value(parameter["default"]),
             f"{_format_value(trained[name])} in the recipe" if name in trained else "",
         )
-        for each in parameters
+        for parameter in parameters
     ]
 
 
@@ -178,7 +183,7 @@ def _format_range(value: Any) -> str:
     """Write what an event draws from: `0.8..1.2`, or `0.9..1.1 -> 0.8..1.2` for a range that widens."""
     if isinstance(value, Mapping) and value.keys() == {"from", "to"}:
         return f"{_format_range(value['from'])} -> {_format_range(value['to'])}"
-    if isinstance(value, list) and len(value) == 2 and all(isinstance(each, int | float) for each in value):
+    if isinstance(value, list) and len(value) == 2 and all(isinstance(bound, int | float) for bound in value):
         return f"{value[0]:.6g}..{value[1]:.6g}"
     return _format_value(value)
 

@@ -18,7 +18,7 @@ from rlctl.environments.dict_spaces import split_space
 from rlctl.errors import RecipeError, RlctlError, UsageError, short_repr
 from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
-from rlctl.recipe.recipe import ON_POLICY, Normalize, Recipe
+from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
 from rlctl.storage import memory
 from rlctl.training.hindsight import replay_arguments
 from rlctl.training.own_networks import write_graph
@@ -151,7 +151,7 @@ def _policy_kwargs(recipe: Recipe) -> dict[str, Any]:
     return kwargs
 
 
-def wrap_normalize(env: VecEnv, settings: Normalize | None, gamma: float) -> VecEnv:
+def wrap_normalize(env: VecEnv, settings: NormalizeSettings | None, gamma: float) -> VecEnv:
     """Wrap environments in SB3's VecNormalize, as far as their observations are real numbers."""
     if settings is None:
         return env

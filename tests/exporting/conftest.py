@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.policy.torch_policy import ALGORITHMS, policy_name
-from rlctl.recipe.recipe import Normalize
+from rlctl.recipe.recipe import NormalizeSettings
 from rlctl.training.algorithms import keep_compiler_out, wrap_normalize
 from rlctl.training.snapshot import pack
 
@@ -46,7 +46,7 @@ def train():
     """Return a model of `steps` steps and its environments, normalised as far as the recipe's default would."""
 
     def trained(algo, spec, steps=32, **kwargs):
-        env = wrap_normalize(DummyVecEnv([spec.make]), Normalize(), 0.99)
+        env = wrap_normalize(DummyVecEnv([spec.make]), NormalizeSettings(), 0.99)
         name = policy_name(algo, env.observation_space)
         network = {"net_arch": [16, 16], **({"lstm_hidden_size": 16} if algo == "recurrent_ppo" else {})}
         settings = {**ON_POLICY.get(algo, OFF_POLICY), "policy_kwargs": network, **kwargs}

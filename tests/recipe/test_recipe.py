@@ -74,7 +74,7 @@ def test_defaults_for_an_environment_without_a_recipe():
     result = resolve("Pendulum-v1", None, {})
     assert (result.algo, result.n_envs) == ("ppo", 8)
     assert 2048 <= result.algo_kwargs["n_steps"] * result.n_envs <= 16_384
-    assert result.normalize == recipe.Normalize()
+    assert result.normalize == recipe.NormalizeSettings()
     assert result.eval.every_steps == result.total_timesteps // 10
 
 

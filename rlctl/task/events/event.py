@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 
 from numpy.typing import NDArray
 
-from rlctl.errors import RecipeError, RlctlError, TaskError, check_name
+from rlctl.errors import RecipeError, RlctlError, TaskError, check_name, explain_invalid
 from rlctl.task.events.ranges import Limits, Range, Widening, read_range
 
 When = Literal["reset", "start", "interval", "observation", "action"]
@@ -165,9 +165,7 @@ def _check_type(where: str, hint: Any, value: Any, error: type[RlctlError]) -> N
     try:
         pydantic.TypeAdapter(hint).validate_python(value)
     except pydantic.ValidationError as problem:
-        from rlctl.storage.validation import explain_first
-
-        raise error(explain_first(problem, where)) from None
+        raise error(explain_invalid(problem, where)) from None
     except pydantic.errors.PydanticSchemaGenerationError:
         return  # a type of the author's own
 
