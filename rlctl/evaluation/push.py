@@ -82,17 +82,17 @@ def measure_push(player: CellPlayer, spec: EnvSpec, unpushed: Sequence[EpisodeRe
     pushed = find_pushed(spec)
     has_success = any(result.success is not None for result in unpushed)
 
-    def judge(results: Sequence[EpisodeResult]) -> NDArray[np.bool_]:
+    def find_held(results: Sequence[EpisodeResult]) -> NDArray[np.bool_]:
         return np.array(
             [result.success if has_success else result.length >= pushed.max_steps for result in results], bool
         )
 
-    held = {0.0: judge(unpushed)}
+    held = {0.0: find_held(unpushed)}
     outcomes = {0.0: summarize(unpushed)}
 
     def fails(impulse: float) -> bool:
         results = player.play(spec, pushed.parameters(impulse))
-        held[impulse], outcomes[impulse] = judge(results), summarize(results)
+        held[impulse], outcomes[impulse] = find_held(results), summarize(results)
         return float(held[impulse].mean()) <= 0.5
 
     if held[0.0].mean() > 0.5:
@@ -112,7 +112,7 @@ def measure_push(player: CellPlayer, spec: EnvSpec, unpushed: Sequence[EpisodeRe
         ],
         threshold=threshold,
         threshold_interval=interval,
-        verdict=_judge(pushed, measure, held, threshold, interval),
+        verdict=_describe_result(pushed, measure, held, threshold, interval),
     )
 
 
@@ -155,7 +155,7 @@ def _cross(impulses: Sequence[float], rates: NDArray[np.float64]) -> float | Non
     return float(np.interp(-0.5, -falling, impulses))  # which needs rising values
 
 
-def _judge(
+def _describe_result(
     pushed: PushedBody,
     measure: str,
     held: dict[float, NDArray[np.bool_]],

@@ -57,6 +57,7 @@ class Side:
 
     @property
     def has_success(self) -> bool:
+        """Whether the task reports success to every run."""
         return all(run.evaluation.success_rate is not None for run in self.runs)
 
     def scores(self, quantity: Quantity) -> NDArray[np.float64]:

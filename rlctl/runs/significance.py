@@ -54,6 +54,7 @@ class MeanDifference:
 
     @property
     def verdict(self) -> Verdict:
+        """Whether the candidate is better or worse, where the p-value is below `ALPHA`."""
         if self.p >= ALPHA or self.mean == 0:
             return Verdict.CANNOT_TELL
         return Verdict.BETTER if self.mean > 0 else Verdict.WORSE

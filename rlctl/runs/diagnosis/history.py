@@ -68,6 +68,7 @@ class History:
 
     @functools.cached_property
     def status(self) -> Mapping[str, Any]:
+        """What `run.json` holds."""
         try:
             return self.run.status()
         except (RlctlError, OSError):
@@ -79,6 +80,7 @@ class History:
 
     @functools.cached_property
     def recipe(self) -> Mapping[str, Any]:
+        """The recipe as plain data."""
         try:
             return sources.read(self.run.recipe_file)
         except (RlctlError, OSError):
@@ -86,10 +88,12 @@ class History:
 
     @functools.cached_property
     def metrics(self) -> Rows:
+        """The rows of `metrics.csv`."""
         return read_table(self.run.metrics_file)
 
     @functools.cached_property
     def evaluations(self) -> Rows:
+        """The rows of `evals.csv`."""
         return read_table(self.run.evals_file)
 
     def curve(self, name: str) -> Curve:
