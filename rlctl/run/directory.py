@@ -85,7 +85,7 @@ class RunDirectory:
         folder = self.path / "checkpoints"
         if not folder.is_dir():
             return []
-        return sorted(each for each in folder.iterdir() if each.name.isdecimal())
+        return sorted(folder for folder in folder.iterdir() if folder.name.isdecimal())
 
     def episode_file(self, number: int) -> Path:
         """Return the file of a recorded episode."""
@@ -93,7 +93,7 @@ class RunDirectory:
 
     def next_episode_number(self) -> int:
         """Return the number after the highest one there is."""
-        numbers = [int(each.stem) for each in self.episodes.glob("*.npz") if each.stem.isdecimal()]
+        numbers = [int(file.stem) for file in self.episodes.glob("*.npz") if file.stem.isdecimal()]
         return max(numbers, default=-1) + 1
 
     def recipe(self) -> Recipe:
@@ -151,13 +151,13 @@ class RunDirectory:
             raise UsageError(f"--checkpoint {short_repr(which)!r}: give best, last, or the step of a checkpoint")
         file = self.checkpoint(int(which)) / "policy.safetensors"
         if not file.is_file():
-            steps = ", ".join(str(int(each.name)) for each in self.checkpoints())
+            steps = ", ".join(str(int(checkpoint.name)) for checkpoint in self.checkpoints())
             raise ArtifactError(f"{self.path}: no checkpoint at step {which}; there are: {steps or 'none'}")
         return file
 
     def recover(self) -> None:
         """Repair what a killed process left half-done; only for the holder of the lock."""
-        for folder in [self.path, *(each for each in self.path.glob("*") if each.is_dir()), self.replay_segments]:
+        for folder in [self.path, *(path for path in self.path.glob("*") if path.is_dir()), self.replay_segments]:
             files.recover(folder)
 
     def lock(self) -> RunLock:

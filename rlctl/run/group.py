@@ -56,8 +56,8 @@ class Group:
 def find_run_of_seed(folder: Path, seed: int) -> RunDirectory | None:
     """Return the newest run of a seed in the folder of a group; None if it has not begun."""
     pattern = re.compile(rf"_s{seed}(_\d+)?$")
-    found = [file.parent for file in folder.glob("*/run.json") if pattern.search(file.parent.name)]
-    return RunDirectory(max(found, key=lambda each: each.name)) if found else None
+    folders = [file.parent for file in folder.glob("*/run.json") if pattern.search(file.parent.name)]
+    return RunDirectory(max(folders, key=lambda folder: folder.name)) if folders else None
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -76,8 +76,8 @@ def parse_seeds(text: str) -> list[int]:
             seeds.append(int(part))
         else:
             raise UsageError(f"--seeds {text}: write a range or a list, such as 0-4 or 0,3,7")
-    if twice := [each for each in seeds if seeds.count(each) > 1]:
-        raise UsageError(f"--seeds {text}: seed {twice[0]} is there twice")
+    if twice := [seed for seed in seeds if seeds.count(seed) > 1]:
+        raise UsageError(f"--seeds {text}: seed {twice[0]} is given twice")
     return seeds
 
 

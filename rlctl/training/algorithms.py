@@ -158,7 +158,7 @@ def wrap_normalize(env: VecEnv, settings: NormalizeSettings | None, gamma: float
     space = env.observation_space
     keys = None
     if isinstance(space, spaces.Dict):
-        keys = [key for key, each in space.spaces.items() if _is_real(each)]
+        keys = [key for key, box in space.spaces.items() if _is_real(box)]
     observation = settings.observation and (bool(keys) if keys is not None else _is_real(space))
     if not observation and not settings.reward:
         return env

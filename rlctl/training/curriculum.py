@@ -70,9 +70,9 @@ class Curriculum:
         if rule is None:
             return
         if rule.success is not None:
-            values = [None if each.success is None else float(each.success) for each in ended]
+            values = [None if episode.success is None else float(episode.success) for episode in ended]
         else:
-            values = [each.total_reward for each in ended]
+            values = [episode.total_reward for episode in ended]
         self._progress.stage_episodes = [*self._progress.stage_episodes, *values][-rule.window :]
 
     def measured(self) -> float | None:

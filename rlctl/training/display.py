@@ -233,8 +233,8 @@ class LiveDisplay(Display):
             terms = "  ".join(f"{name} {value:.4g}" for name, value in self._terms.items())
             lines.append(Text(f"  terms   {terms}", no_wrap=True, overflow="ellipsis"))
         mark = "✓" if output.is_utf8() else "+"
-        for each in self._evaluations[-5:]:
-            lines.append(Text(f"  {mark} {_format_evaluation(*each)}", style="green" if each[3] else ""))
+        for evaluation in self._evaluations[-5:]:
+            lines.append(Text(f"  {mark} {_format_evaluation(*evaluation)}", style="green" if evaluation[3] else ""))
         return lines
 
 

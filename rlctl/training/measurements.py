@@ -177,7 +177,7 @@ def _gradient_norm(model: BaseAlgorithm) -> float | None:
         return recent_gradient_norm(critic.optimizer)
     if not hasattr(model, "max_grad_norm"):
         return None
-    gradients = [each.grad for each in model.policy.parameters() if each.grad is not None]
+    gradients = [parameter.grad for parameter in model.policy.parameters() if parameter.grad is not None]
     return float(torch.nn.utils.get_total_norm(gradients)) if gradients else None
 
 
@@ -240,11 +240,11 @@ def training_row(
     """
     means, metrics = mean_terms(recent), mean_metrics(recent)
     return {
-        "acting": _mean(each.acting for each in recent),
+        "acting": _mean(episode.acting for episode in recent),
         "return": mean_return(recent) if recent else None,
-        "length": _mean(each.length for each in recent),
+        "length": _mean(episode.length for episode in recent),
         "success": success_rate(recent) if recent else None,
-        "distance": _mean(each.final_distance for each in recent),
+        "distance": _mean(episode.final_distance for episode in recent),
         **{f"term/{name}": means.get(name) for name in weights},
         **{f"metric/{name}": metrics.get(name) for name, weight in weights.items() if weight == 0},
         **{name: log.get(f"train/{name}") for name in _LOSSES},
@@ -262,13 +262,13 @@ def tensorboard_values(row: Mapping[str, Any]) -> dict[str, float]:
 
 def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     """Return what the episodes of an evaluation have come to."""
-    depths = [each.deepest_contact for each in results if each.deepest_contact is not None]
+    depths = [episode.deepest_contact for episode in results if episode.deepest_contact is not None]
     return {
         "episodes": len(results),
         "success": success_rate(results),
         "return": mean_return(results),
-        "length": _mean(each.length for each in results),
-        "distance": _mean(each.final_distance for each in results),
+        "length": _mean(episode.length for episode in results),
+        "distance": _mean(episode.final_distance for episode in results),
         "overlap": float(np.median(depths)) if depths else None,
         **{f"term/{name}": value for name, value in mean_terms(results).items()},
         **{f"metric/{name}": value for name, value in mean_metrics(results).items()},
@@ -277,5 +277,5 @@ def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
 
 def _mean(values: Iterable[float | None]) -> float | None:
     """Return the mean of the values that are known; None without any."""
-    known = [each for each in values if each is not None]
+    known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None

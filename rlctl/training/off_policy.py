@@ -61,7 +61,7 @@ class OffPolicyRollouts(Rollouts):
                 after = {key: rows.copy() for key, rows in after.items()}
                 for key, rows in after.items():
                     rows[ended] = final[key][ended, step]
-            infos = [{"TimeLimit.truncated": bool(each)} for each in timeouts[:, step]]
+            infos = [{"TimeLimit.truncated": bool(timeout)} for timeout in timeouts[:, step]]
             reward = segment.reward[:, step].astype(np.float32)
             model.replay_buffer.add(join(now), join(after), segment.stored[:, step], reward, ended, infos)
             model.num_timesteps += len(reward)

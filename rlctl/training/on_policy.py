@@ -107,7 +107,7 @@ class OnPolicyRollouts(Rollouts):
             policy.evaluate_actions(self._to_tensor(flat, rows), chosen[rows])[:2] for rows in _slices(len(chosen))
         ]
         values, log_probs = (
-            torch.cat([each.flatten() for each in parts]).cpu().numpy().reshape(n_envs, steps)
+            torch.cat([part.flatten() for part in parts]).cpu().numpy().reshape(n_envs, steps)
             for parts in zip(*judged, strict=True)
         )
         ends = {key: np.concatenate([rows[:, -1], final[key]]) for key, rows in observations.items()}

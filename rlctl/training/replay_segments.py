@@ -67,12 +67,12 @@ class ReplaySegments:
     def save(self, added: int) -> list[Segment]:
         """Write what is new after `added` transitions in all; return the segments that make up the buffer."""
         oldest = max(0, added - self.buffer.buffer_size)
-        segments = [each for each in self._segments if each.last > oldest]
-        if not all((self.folder / each.name).exists() for each in segments):  # somebody has removed some
+        segments = [segment for segment in self._segments if segment.last > oldest]
+        if not all((self.folder / segment.name).exists() for segment in segments):  # somebody has removed some
             segments, self._written = [], 0
         rows = self._most_rows
         first = max(self._written // rows * rows, oldest)
-        segments = [each for each in segments if each.first < first]
+        segments = [segment for segment in segments if segment.first < first]
         segments += [self._write(low, min(low + rows, added)) for low in range(first, added, rows)]
         self._segments, self._written = segments, added
         return list(segments)

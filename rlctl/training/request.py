@@ -66,7 +66,7 @@ def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> Tra
     if run.status().get("status") == "running":  # killed after all was done
         status.write_end(run, start.step, progress, best)
     _raise_if_evaluations_failed(run, progress)
-    note = "this run is finished already: nothing to do; -n makes it longer"
+    note = "this run is finished already: nothing to do; -n trains longer"
     if start.request.record:
         note += f"; to record episodes of it: rlctl replay {run.path}"
     seconds = time.monotonic() - start.began

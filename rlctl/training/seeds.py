@@ -48,7 +48,7 @@ class SeedsResult:
             group = self.score.group
             raise SeedsFailed(
                 f"{group.path}: {len(self.failed)} of {len(group.seeds)} seeds failed: {which}. "
-                f"What each said is above; to try again: rlctl train --resume {shlex.quote(str(group.path))}",
+                f"Their output is above; to try again: rlctl train --resume {shlex.quote(str(group.path))}",
                 max(self.failed.values()),
             )
 

@@ -176,7 +176,7 @@ def _refuse_errors(report: CheckReport, display: Display) -> None:
         display.message(f"check before training: {name} crashed, a bug in rlctl; what it would find is not known")
     errors = [finding for finding in found if finding.severity is Severity.ERROR]
     if errors:
-        text = "; ".join(f"{each.rule} {each.name} ({each.message})" for each in errors)
+        text = "; ".join(f"{finding.rule} {finding.name} ({finding.message})" for finding in errors)
         count = format_count(len(errors), "error")
         raise AnswerIsNo(
             f"the check before training found {count}: {text}\n"

@@ -89,6 +89,6 @@ class StopSignals(HandledSignals):
         if self._loop.stop_signal is not None:
             if number == self._loop.stop_signal and time.monotonic() - self._received_s < _SAME_S:
                 return
-            raise Interrupted("interrupted again: stopped at once, the last checkpoint stands", number)
+            raise Interrupted("interrupted again: stopped at once, the last checkpoint is intact", number)
         self._loop.stop_signal = number
         self._received_s = time.monotonic()

@@ -129,15 +129,15 @@ def _flatten(value: Any, path: str) -> tuple[Tensors, Any]:
     if isinstance(value, dict):
         tensors: Tensors = {}
         entries = []
-        for key, each in value.items():
-            below, structure = _flatten(each, f"{path}/{key}")
+        for key, item in value.items():
+            below, structure = _flatten(item, f"{path}/{key}")
             tensors.update(below)
             entries.append([key, structure])
         return tensors, {"dict": entries}
     if isinstance(value, list | tuple):
         below, structure = _flatten(dict(enumerate(value)), path)
         kind = "list" if isinstance(value, list) else "tuple"
-        return below, {kind: [each for _, each in structure["dict"]]}
+        return below, {kind: [item for _, item in structure["dict"]]}
     return {}, {"value": value}
 
 
@@ -146,9 +146,9 @@ def _unflatten(structure: Any, tensors: Tensors) -> Any:
     if kind == "tensor":
         return torch.from_numpy(tensors[content].copy())
     if kind == "dict":
-        return {key: _unflatten(each, tensors) for key, each in content}
+        return {key: _unflatten(item, tensors) for key, item in content}
     if kind in ("list", "tuple"):
-        items = [_unflatten(each, tensors) for each in content]
+        items = [_unflatten(item, tensors) for item in content]
         return items if kind == "list" else tuple(items)
     return content
 
@@ -192,8 +192,8 @@ def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
     tensors: Tensors = {"rollout/starts": np.asarray(model._last_episode_starts)}
     states: Any = getattr(model, "_last_lstm_states", None)
     for kind, pair in zip(("pi", "vf"), states or (), strict=False):
-        for index, each in enumerate(pair):
-            tensors[f"rollout/lstm/{kind}/{index}"] = _array(each)
+        for index, state in enumerate(pair):
+            tensors[f"rollout/lstm/{kind}/{index}"] = _array(state)
     return tensors
 
 

@@ -89,7 +89,7 @@ def find_start(request: TrainRequest) -> Start:
 def check_arguments(request: TrainRequest) -> None:
     """Raise `UsageError` for arguments that exclude each other, and for a device that cannot exist."""
     if (request.task is None) == (request.resume is None):
-        raise UsageError("give a task to train, or --resume RUN to go on with a run; one of the two")
+        raise UsageError("TASK and --resume exclude each other: give a task to train, or a run to resume")
     if not _DEVICE.fullmatch(request.device):  # now, and not after half a minute of imports
         raise UsageError(f"--device {request.device!r}: no such device; give cpu, cuda, cuda:1, or auto")
     if request.resume is not None:
@@ -122,9 +122,7 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         task = lookup.locate_task(status["task"], run)
         changes = describe_task_changes(status, task)
         if changes and not request.force:
-            raise UsageError(
-                f"{run.path}: {'; '.join(changes)}. What was learnt may not fit any more; --force goes on all the same"
-            )
+            raise UsageError(f"{run.path}: {'; '.join(changes)}. The policy may no longer fit; --force resumes anyway")
         run.recover()
         found, damage = checkpoint.read_newest(run)
         if found is None and status.get("status") == "finished":
@@ -137,7 +135,7 @@ def _find_checkpoint(request: TrainRequest) -> Start:
             found = _reopen(found, before, recipe)
         notes = ["no checkpoint yet: the training begins at its first step"]
         if found is not None:
-            notes = [f"warning: {each}; going on from step {found.state.step:,}" for each in damage]
+            notes = [f"warning: {problem}; going on from step {found.state.step:,}" for problem in damage]
         return Start(request, task, recipe, run, lock, found, tuple(notes), status.get("from"), tuple(changes))
     except BaseException:
         lock.release()

@@ -44,9 +44,9 @@ class Trainings:
     def run(self, calls: Sequence[Callable[[], Result]], to_go_on: str) -> list[Result]:
         """Return what each call returns. Raises `Interrupted` after a signal, with the command to go on with."""
         with HandledSignals(self._pass_on), ThreadPoolExecutor(self._jobs, initializer=self._take_cores) as pool:
-            results = [each.result() for each in [pool.submit(call) for call in calls]]
+            results = [future.result() for future in [pool.submit(call) for call in calls]]
         if self.stopped_by is not None:
-            raise Interrupted(f"interrupted; go on with: {to_go_on}", self.stopped_by)
+            raise Interrupted(f"interrupted; resume with: {to_go_on}", self.stopped_by)
         return results
 
     def _take_cores(self) -> None:

@@ -51,7 +51,7 @@ def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[
         if wrong.any():
             outside |= wrong.any(axis=2)
             env, step, element = np.argwhere(wrong)[0].tolist()
-            value, low, high = (each.ravel()[element] for each in (values[env, step], box.low, box.high))
+            value, low, high = (array.ravel()[element] for array in (values[env, step], box.low, box.high))
             name = f"observation {key!r}" if key else "observation"
             message = f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
     return int(np.count_nonzero(outside)), message
@@ -122,7 +122,7 @@ class WorkerVecEnv(VecEnv):
         segment, steps = self.workers.arrays.segment, self._steps
         for result in ended:
             self.episodes_started[result.env] += 1
-        self.history.add_segment(segment.action[:, :steps], [(each.env, each.row) for each in ended])
+        self.history.add_segment(segment.action[:, :steps], [(episode.env, episode.row) for episode in ended])
         self.ended += ended
         seen = {key: rows[:, 1 : steps + 1] for key, rows in segment.observation.items()}
         count, message = _count_outside(self.observation_space, seen)

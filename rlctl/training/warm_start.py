@@ -70,10 +70,10 @@ def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[st
     from rlctl.policy.torch_policy import describe_network
 
     ours = describe_network(model.policy)
-    network = {name: tuple(each.shape) for name, each in model.policy.state_dict().items()}
-    wrong = [name for name, each in weights.items() if network.get(name) != each.shape]
+    network = {name: tuple(tensor.shape) for name, tensor in model.policy.state_dict().items()}
+    wrong = [name for name, tensor in weights.items() if network.get(name) != tensor.shape]
     needed = list_actor_tensors(info.algo, [f"policy/{name}" for name in network])
-    wrong += [name for name in (each.removeprefix("policy/") for each in needed) if name not in weights]
+    wrong += [name for name in (key.removeprefix("policy/") for key in needed) if name not in weights]
     keys = dict.fromkeys([*info.policy_kwargs, *ours]) if wrong else _SAME_FUNCTION
     different = [key for key in keys if _as_plain(info.policy_kwargs.get(key)) != _as_plain(ours.get(key))]
     if not wrong and not different:
@@ -91,10 +91,10 @@ def _as_plain(value: Any) -> Any:
 def _load_weights(info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> None:
     import torch
 
-    state = {name: torch.from_numpy(each.copy()) for name, each in weights.items()}
+    state = {name: torch.from_numpy(tensor.copy()) for name, tensor in weights.items()}
     actor, target = _TARGETS.get(info.algo, ("", ""))
     if actor and not any(name.startswith(target) for name in state):
-        state |= {target + name.removeprefix(actor): each for name, each in state.items() if name.startswith(actor)}
+        state |= {target + name.removeprefix(actor): tensor for name, tensor in state.items() if name.startswith(actor)}
     model.policy.load_state_dict(state, strict=False)  # what may be missing is the critic
 
 
@@ -104,7 +104,9 @@ def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mappi
     normalizer = model.get_vec_normalize_env()
     statistics = observation_statistics(normalizer)
     if list(statistics) != info.normalized_keys:
-        there, here = ("normalises" if each else "does not normalise" for each in (info.normalized_keys, statistics))
+        there, here = (
+            "normalises" if normalizer else "does not normalise" for normalizer in (info.normalized_keys, statistics)
+        )
         raise UsageError(
             f"--from {file}: it {there} observations, and the recipe {here} them; "
             f"add --set normalize.observation={str(bool(info.normalized_keys)).lower()}"
@@ -114,7 +116,9 @@ def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mappi
             f"--from {file}: it clips observations at {info.clip_observation:g}, the recipe at "
             f"{normalizer.clip_obs:g}; add --set normalize.clip_observation={info.clip_observation:g}"
         )
-    for key, each in statistics.items():
-        each.mean[...] = tensors[f"normalize/{key}/mean"]
-        each.var[...] = tensors[f"normalize/{key}/var"]
-        each.count = max(float(info.training_steps), 1.0)  # observations seen; new ones count as much as each of them
+    for key, moments in statistics.items():
+        moments.mean[...] = tensors[f"normalize/{key}/mean"]
+        moments.var[...] = tensors[f"normalize/{key}/var"]
+        moments.count = max(
+            float(info.training_steps), 1.0
+        )  # observations seen; new ones count as much as each of them

@@ -14,7 +14,7 @@ from rlctl.tuning.tuning import Trial, Tuning
 
 def show(tuning: Tuning, json: str | None) -> None:
     """Print the trials, best first, and what to do with the best; or JSON alone for `-`."""
-    runs = {each.number: summarize(run.path) for each in tuning.trials if (run := tuning.find_run(each)) is not None}
+    runs = {trial.number: summarize(run.path) for trial in tuning.trials if (run := tuning.find_run(trial)) is not None}
     if output.present(as_json(tuning, runs), json):
         return
     out = output.out()
@@ -22,7 +22,9 @@ def show(tuning: Tuning, json: str | None) -> None:
     columns = ("trial", *(key.rpartition(".")[2] for key in keys), "return", "success", "min", "")
     ranked = sorted(tuning.trials, key=_rank, reverse=True)
     out.print(f"{tuning.task}: {tuning.path}, by {tuning.metric}; means over the last third of the evaluations")
-    output.print_table(columns, [_list_cells(tuning, each, keys, runs.get(each.number)) for each in ranked], left=("",))
+    output.print_table(
+        columns, [_list_cells(tuning, trial, keys, runs.get(trial.number)) for trial in ranked], left=("",)
+    )
     best = tuning.best
     assert best is not None
     task, file = shlex.quote(tuning.task), shlex.quote(str(tuning.best_file))
@@ -65,8 +67,8 @@ def _list_cells(tuning: Tuning, trial: Trial, keys: list[str], run: RunSummary |
 def as_json(tuning: Tuning, runs: dict[int, RunSummary]) -> dict[str, Any]:
     """Return every trial, with its run, as plain data."""
     trials = [
-        {**dataclasses.asdict(each), "run": runs[each.number].path if each.number in runs else None}
-        for each in tuning.trials
+        {**dataclasses.asdict(trial), "run": runs[trial.number].path if trial.number in runs else None}
+        for trial in tuning.trials
     ]
     best = tuning.best
     return {

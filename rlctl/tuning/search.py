@@ -44,8 +44,8 @@ class StepSearch:
         """Begin, or go on with, step `number`, from 1. `recipe` is the task's, with defaults, as plain data."""
         self._tuning, self._number, self._trainings = tuning, number, trainings
         self._dimensions = tuning.steps[number - 1]
-        self._distributions = {each.key: each.make_distribution() for each in self._dimensions}
-        best = find_best([each for each in tuning.trials if each.step < number])
+        self._distributions = {dimension.key: dimension.make_distribution() for dimension in self._dimensions}
+        best = find_best([trial for trial in tuning.trials if trial.step < number])
         assert best is not None  # the recipe as it is
         self._recipe, self._kept = recipe, best.values
         self._study = self._open_study()
@@ -87,11 +87,11 @@ class StepSearch:
 
     def count_waiting(self) -> int:
         """Return how many trials are still to be trained, those that were begun included."""
-        sizes = [len(each.choices) or math.inf for each in self._dimensions]
+        sizes = [len(dimension.choices) or math.inf for dimension in self._dimensions]
         # The recipe as it is, trained before, counts as the first trial of the first step.
         trials = self._tuning.trials_per_step - (self._number == 1)
         most = min(trials, math.prod(sizes) - 1)  # the best so far has one of them
-        finished = [each for each in self._tuning.trials if each.step == self._number and each.state != "begun"]
+        finished = [trial for trial in self._tuning.trials if trial.step == self._number and trial.state != "begun"]
         return max(0, int(most) - len(finished))
 
     def run_next(self) -> None:
@@ -121,10 +121,10 @@ class StepSearch:
             return self._begun.pop(0), None
         for _ in range(_MOST_REPEATS):
             asked = self._study.ask(self._distributions)
-            drawn = {each.key: each.to_value(asked.params[each.key]) for each in self._dimensions}
+            drawn = {dimension.key: dimension.to_value(asked.params[dimension.key]) for dimension in self._dimensions}
             values = {**self._kept, **drawn}
             values = {key: value for key, value in values.items() if value != get_value(self._recipe, key)}
-            known = next((each for each in self._tuning.trials if each.values == values), None)
+            known = next((trial for trial in self._tuning.trials if trial.values == values), None)
             if known is None:
                 trial = Trial(len(self._tuning.trials), self._number, values)
                 self._tuning.trials.append(trial)
@@ -142,7 +142,9 @@ class StepSearch:
     def _list_drawn(self, trial: Trial) -> dict[str, Any]:
         """Return what Optuna would have drawn for a trial; None for a value that it never draws."""
         content = merge(self._recipe, nest(trial.values))
-        return {each.key: each.from_value(get_value(content, each.key)) for each in self._dimensions}
+        return {
+            dimension.key: dimension.from_value(get_value(content, dimension.key)) for dimension in self._dimensions
+        }
 
     def _add(self, trial: Trial) -> None:
         """Let Optuna know of a trial that has ended, if it could have drawn its values."""

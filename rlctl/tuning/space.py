@@ -81,9 +81,9 @@ class Dimension:
 def parse_search(texts: Sequence[str]) -> list[Dimension]:
     """Return the dimensions of `--search KEY=LOW:HIGH` and `KEY=A,B,C`; raises `UsageError` for text that is none."""
     dimensions = [_parse_dimension(text) for text in texts]
-    keys = [each.key for each in dimensions]
+    keys = [dimension.key for dimension in dimensions]
     if twice := [key for key in keys if keys.count(key) > 1]:
-        raise UsageError(f"--search: {twice[0]} is there twice")
+        raise UsageError(f"--search: {twice[0]} is given twice")
     return dimensions
 
 
@@ -132,23 +132,25 @@ def fill_parameters(recipe: Recipe) -> dict[str, Any]:
 def _vary_learning_rate(value: Any) -> Dimension:
     prefix = "lin_" if str(value).startswith("lin_") else ""
     rate = float(str(value).removeprefix(prefix))
-    low, high = (float(f"{each:.{_DIGITS}g}") for each in (rate / 10, min(10 * rate, 1.0)))
+    low, high = (float(f"{bound:.{_DIGITS}g}") for bound in (rate / 10, min(10 * rate, 1.0)))
     return Dimension("algo_kwargs.learning_rate", low=low, high=high, prefix=prefix)
 
 
 def _vary_batches(recipe: Recipe, parameters: Mapping[str, Any]) -> list[Dimension]:
-    found = []
+    dimensions = []
     n_steps, batch_size = parameters["n_steps"], parameters.get("batch_size")
     most = math.inf
     if recipe.algo in ON_POLICY:
         most = max(n_steps, recipe.total_timesteps // (4 * recipe.n_envs))  # four updates at least
-        found.append(_choose("n_steps", {n_steps, *(each for each in _around(n_steps, 8) if each <= most)}))
+        dimensions.append(_choose("n_steps", {n_steps, *(value for value in _around(n_steps, 8) if value <= most)}))
         most = n_steps * recipe.n_envs
     elif recipe.her is None:
-        found.append(_choose("n_steps", {1, 3, 5, n_steps}))
+        dimensions.append(_choose("n_steps", {1, 3, 5, n_steps}))
     if batch_size is not None:
-        found.append(_choose("batch_size", {batch_size, *(each for each in _around(batch_size, 16) if each <= most)}))
-    return found
+        dimensions.append(
+            _choose("batch_size", {batch_size, *(value for value in _around(batch_size, 16) if value <= most)})
+        )
+    return dimensions
 
 
 def _around(value: int, least: int) -> list[int]:

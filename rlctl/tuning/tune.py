@@ -146,7 +146,7 @@ def _warn_of_long_rollouts(recipe: Recipe) -> list[str]:
 
 
 def _describe(tuning: Tuning, recipe: Recipe, jobs: int | None) -> str:
-    names = "; then ".join(" and ".join(each.name for each in step) for step in tuning.steps)
+    names = "; then ".join(" and ".join(dimension.name for dimension in step) for step in tuning.steps)
     at_a_time = choose_jobs(jobs, tuning.trials_per_step)
     return (
         f"{tuning.path}: {names}; at most {output.format_count(tuning.trials_per_step, 'trial')} "

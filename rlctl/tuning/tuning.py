@@ -100,7 +100,9 @@ class Tuning:
 
 def find_best(trials: list[Trial]) -> Trial | None:
     """Return the trial with the highest score among those that were trained to the end."""
-    done = [(each.score, -each.number, each) for each in trials if each.state == "done" and each.score is not None]
+    done = [
+        (trial.score, -trial.number, trial) for trial in trials if trial.state == "done" and trial.score is not None
+    ]
     return max(done)[2] if done else None
 
 

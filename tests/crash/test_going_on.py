@@ -48,7 +48,7 @@ def test_a_finished_run_has_nothing_to_do(trials, folders, more):
     again = trials.run(resume(run), ended.folder)
     assert_quiet(again)
     assert again.code == 0
-    assert "this run is finished already: nothing to do; -n makes it longer" in again.stdout
+    assert "this run is finished already: nothing to do; -n trains longer" in again.stdout
     assert contents(run) == before
 
 

@@ -99,9 +99,7 @@ def test_another_task_is_refused_unless_forced(plugin, resume, capfd, what):
     before = run.status_file.read_bytes()
     with pytest.raises(UsageError) as caught:
         resume(run)
-    assert str(caught.value) == (
-        f"{run.path}: {message}. What was learnt may not fit any more; --force goes on all the same"
-    )
+    assert str(caught.value) == (f"{run.path}: {message}. The policy may no longer fit; --force resumes anyway")
     assert run.status_file.read_bytes() == before
     resume(run, force=True)
     assert f"going on at step 64, not bit-exact: {message}" in capfd.readouterr().err.splitlines()

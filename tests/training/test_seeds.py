@@ -39,8 +39,8 @@ def test_seeds(text, seeds):
     ("text", "message"),
     [
         ("3-1", "--seeds 3-1: 3-1 goes down; write 1-3"),
-        ("0,0", "--seeds 0,0: seed 0 is there twice"),
-        ("0-3,2", "--seeds 0-3,2: seed 2 is there twice"),
+        ("0,0", "--seeds 0,0: seed 0 is given twice"),
+        ("0-3,2", "--seeds 0-3,2: seed 2 is given twice"),
         ("", "--seeds : write a range or a list, such as 0-4 or 0,3,7"),
         ("-1", "--seeds -1: write a range"),
         ("0-5000", "--seeds 0-5000: at most 1000 seeds"),
@@ -157,7 +157,7 @@ def test_a_signal_stops_all_with_checkpoints(tmp_path):
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
-    with pytest.raises(Interrupted, match=r"interrupted; go on with: rlctl train --resume .*_seeds") as caught:
+    with pytest.raises(Interrupted, match=r"interrupted; resume with: rlctl train --resume .*_seeds") as caught:
         train_seeds(TrainRequest(LINE, settings=settings, root=tmp_path, check=False), "0-1", jobs=2)
     assert caught.value.exit_code == 130
     (path,) = tmp_path.glob("*/*_seeds")

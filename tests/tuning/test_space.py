@@ -34,7 +34,7 @@ def test_a_search(text, dimension):
         (["algo_kwargs.gamma=0.9:0.8"], "--search 'algo_kwargs.gamma=0.9:0.8': no range"),
         (["algo_kwargs.gamma=1e-4:lin_1"], "--search 'algo_kwargs.gamma=1e-4:lin_1': no range"),
         (["algo_kwargs.gamma=a:b"], "--search 'algo_kwargs.gamma=a:b': a and b are to be numbers"),
-        (["n_envs=1,2", "n_envs=3,4"], "--search: n_envs is there twice"),
+        (["n_envs=1,2", "n_envs=3,4"], "--search: n_envs is given twice"),
     ],
 )
 def test_what_is_no_search(texts, message):

@@ -188,7 +188,7 @@ def test_a_task_without_success_is_refused_at_its_first_evaluation(played, tmp_p
 @pytest.mark.parametrize("interrupted_at", [1, 3])
 def test_an_interrupted_tuning_goes_on(played, tmp_path, interrupted_at):
     played.interrupts_at = interrupted_at
-    with pytest.raises(Interrupted, match="go on with: rlctl tune --resume"):
+    with pytest.raises(Interrupted, match="resume with: rlctl tune --resume"):
         begin(tmp_path, RATES, trials=4)
     assert len(played.calls) == interrupted_at
     (folder,) = (tmp_path / "runs").glob("*/*_tune")
