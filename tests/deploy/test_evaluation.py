@@ -70,7 +70,9 @@ def test_through_a_server_it_is_the_same(reach_server):
     served = run_evaluation(
         EvalRequest("reach", baseline=f"ws://{reach_server.address}", episodes=2, n_envs=1), Gates()
     )
-    assert [each.result.total_reward for each in served.played] == [each.result.total_reward for each in direct.played]
+    assert [episode.result.total_reward for episode in served.played] == [
+        episode.result.total_reward for episode in direct.played
+    ]
     assert len(served.played[0].result.report["round_trips_s"]) == served.played[0].result.length
 
 
@@ -132,15 +134,16 @@ def serve_answer(metadata, answer):
 
 
 def test_self_test(tmp_path):
-    from rlctl.deploy.server.serve import ServerSettings, make_server
+    from rlctl.deploy.server.request import ServeRequest
+    from rlctl.deploy.server.serve import make_server
     from rlctl.run.lookup import find_policy
 
-    server = make_server(find_policy("reach", PRETRAINED).file, ServerSettings(port=0, watchdog=False))
+    server = make_server(find_policy("reach", PRETRAINED).file, ServeRequest(port=0, watchdog=False))
     result = run_self_test(server, EvalRequest("reach", checkpoint=PRETRAINED, episodes=2, n_envs=1))
     assert result.served.returns == result.direct.returns
-    assert result.requests == sum(each.result.length for each in result.served.played)
+    assert result.requests == sum(episode.result.length for episode in result.served.played)
     assert result.round_trip_p50_s > 0
-    assert [each for each in result.list_problems() if "success" in each or "holding" in each] == []
+    assert [episode for episode in result.list_problems() if "success" in episode or "holding" in episode] == []
 
 
 @pytest.mark.slow

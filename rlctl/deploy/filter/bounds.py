@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Report = Callable[[str, Array, Array, tuple[Array, Array]], None]
+OnLimit = Callable[[str, Array, Array, tuple[Array, Array]], None]
 """Called with the name of a limit, the wanted values, the allowed ones and the two ends, where they differ."""
 
 
@@ -66,23 +66,23 @@ class Bounds:
         self._slack_low = self.low - self.precision * np.abs(self.low) - self._slack
         self._slack_high = self.high + self.precision * np.abs(self.high) + self._slack
 
-    def bound(self, x: Array, before: Array, reference: Array | None, report: Report) -> Array:
+    def bound(self, x: Array, before: Array, reference: Array | None, on_limit: OnLimit) -> Array:
         """Return the motion closest to `x` that keeps the limits.
 
         `before` is the motion of the last step, `reference` where it led; None if positions are not bounded.
         """
-        return x if self._keeps_all(x, before, reference) else self._bound_in_turn(x, before, reference, report)
+        return x if self._keeps_all(x, before, reference) else self._bound_in_turn(x, before, reference, on_limit)
 
     def keeps_ends(self, value: Array) -> bool:
         """Say whether a value is within its bounds."""
         # To compare bytes takes a tenth of the time of `(a != b).any()`.
         return np.minimum(np.maximum(value, self.low), self.high).tobytes() == value.tobytes()
 
-    def clip_ends(self, value: Array, report: Report) -> Array:
+    def clip_ends(self, value: Array, on_limit: OnLimit) -> Array:
         """Return the value or motion within the bounds of the command."""
         allowed: Array = np.minimum(np.maximum(value, self.low), self.high)
         if allowed.tobytes() != value.tobytes():
-            report(self.position_name if self.is_value else "action", value, allowed, (self.low, self.high))
+            on_limit(self.position_name if self.is_value else "action", value, allowed, (self.low, self.high))
         return allowed
 
     def keeps_limits(self, command: Array, before: Array, reference: Array | None) -> bool:
@@ -132,17 +132,17 @@ class Bounds:
         inside = np.minimum(np.maximum(end, self._quick_low), self._quick_high)
         return bool(inside.tobytes() == end.tobytes())
 
-    def _bound_in_turn(self, x: Array, before: Array, reference: Array | None, report: Report) -> Array:
+    def _bound_in_turn(self, x: Array, before: Array, reference: Array | None, on_limit: OnLimit) -> Array:
         """Apply one limit after the other: what is stricter first, what is more important last."""
         if self.change is not None:
-            x = _clip(x, before - self.change, before + self.change, "acceleration", report)
+            x = _clip(x, before - self.change, before + self.change, "acceleration", on_limit)
         if self.speed is not None:
-            x = _clip(x, -self.speed, self.speed, self.speed_name, report)
+            x = _clip(x, -self.speed, self.speed, self.speed_name, on_limit)
         if not self.is_value:
-            x = _clip(x, self.low, self.high, "action", report)
+            x = _clip(x, self.low, self.high, "action", on_limit)
         if self.bounds_position and reference is not None and not self._keeps_position(x, reference):
             room = self._find_room(reference)
-            x = _clip(x, -room[1], room[0], self.position_name, report)
+            x = _clip(x, -room[1], room[0], self.position_name, on_limit)
         return x
 
     def _find_room(self, reference: Array) -> Array:
@@ -167,8 +167,8 @@ class Bounds:
         return np.where(np.isfinite(room), room, distance)
 
 
-def _clip(x: Array, low: Array, high: Array, name: str, report: Report) -> Array:
+def _clip(x: Array, low: Array, high: Array, name: str, on_limit: OnLimit) -> Array:
     allowed: Array = np.minimum(np.maximum(x, low), high)
     if allowed.tobytes() != x.tobytes():
-        report(name, x, allowed, (low, high))
+        on_limit(name, x, allowed, (low, high))
     return allowed

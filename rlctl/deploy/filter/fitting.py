@@ -1,4 +1,4 @@
-"""Limits fitted to a policy: which elements of its observation and action they are about, and whether they can be."""
+"""Limits as arrays for one policy: joints by index, units of its commands, and a check that it can keep them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _CAN_BE_LIMITED = {
     "action": ("rate", "action"),
 }
 _SMALLEST = 1e-100  # step [unit of the command]; squares of smaller ones vanish
-_NO_CONTROL_DT = "limits: this policy does not say its control_dt; write control_dt: SECONDS"
+_NO_CONTROL_DT = "limits: this policy has no control_dt; write control_dt: SECONDS"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,23 +87,23 @@ def _make_bounds(
     listed = "Known" if named else "Write joints: [names, in the action's order], or one of"
     for name in limits.limits.keys() - {"all"}:
         check_name(name, names, "limits: no joint", RecipeError, listed=listed)
-    each = [_merge(limits, name, _list_known(limits, known, index)) for index, name in enumerate(names)]
-    for joint, name in zip(each, names, strict=True):
+    joints = [_merge(limits, name, _list_known(limits, known, index)) for index, name in enumerate(names)]
+    for joint, name in zip(joints, names, strict=True):
         _check_can_be_limited(limits, joint, name)
-    timed = limits.command == "speed" or any(joint.speed or joint.acceleration or joint.rate for joint in each)
+    timed = limits.command == "speed" or any(joint.speed or joint.acceleration or joint.rate for joint in joints)
     if timed and control_dt is None:
         raise RecipeError(_NO_CONTROL_DT)
     dt, is_value = control_dt or 1.0, limits.command in ("position", "torque", "action")
     scale, offset = _choose_units(limits, space, known, names)
     if not is_value and offset.any():
-        raise RecipeError(f"limits: offset: with command: {limits.command} action 0 is to keep still; leave it out")
+        raise RecipeError(f"limits: offset: with command: {limits.command} action 0 must be no motion; leave it out")
     factor = scale * (dt if limits.command == "speed" else 1.0)
     largest, digits = _describe_numbers(space.dtype)
-    low = offset + factor * np.maximum(np.maximum(space.low.ravel(), -largest), _gather(each, "action", -np.inf, 0))
-    high = offset + factor * np.minimum(np.minimum(space.high.ravel(), largest), _gather(each, "action", np.inf, 1))
-    position = np.array([_gather(each, "position", -np.inf, 0), _gather(each, "position", np.inf, 1)])
+    low = offset + factor * np.maximum(np.maximum(space.low.ravel(), -largest), _gather(joints, "action", -np.inf, 0))
+    high = offset + factor * np.minimum(np.minimum(space.high.ravel(), largest), _gather(joints, "action", np.inf, 1))
+    position = np.array([_gather(joints, "position", -np.inf, 0), _gather(joints, "position", np.inf, 1)])
     if is_value:
-        torque = np.array([joint.torque or np.inf for joint in each])
+        torque = np.array([joint.torque or np.inf for joint in joints])
         low = np.maximum(np.maximum(low, position[0]), -torque)
         high = np.minimum(np.minimum(high, position[1]), torque)
         position = np.array([low, high])
@@ -112,8 +112,8 @@ def _make_bounds(
     if (low > high).any():
         name = names[int(np.argmax(low > high))]
         raise RecipeError(f"limits: {name}: no action keeps these limits and the policy's own action bounds")
-    speed = np.array([joint.speed or joint.rate or np.inf for joint in each]) * dt
-    change = np.array([joint.acceleration or np.inf for joint in each]) * dt**2
+    speed = np.array([joint.speed or joint.rate or np.inf for joint in joints]) * dt
+    change = np.array([joint.acceleration or np.inf for joint in joints]) * dt**2
     if not (np.isfinite([low, high]).all() and min(factor.min(), speed.min(), change.min()) > _SMALLEST):
         raise RecipeError("limits: scale, offset, a limit or control_dt is too large or too small to calculate with")
     return Bounds(
@@ -160,19 +160,19 @@ def _list_known(limits: Limits, joints: Joints | None, index: int) -> dict[str, 
 
     Model files write a limit that is none as one of 0, or as a lower end that is not below the upper.
     """
-    found: dict[str, Any] = {}
+    known: dict[str, Any] = {}
     if joints is None:
-        return found
+        return known
     measured = limits.measured.position is not None
     moves = limits.command in ("position", "step", "speed")
     if joints.low and joints.high and (limits.command == "position" or (moves and measured)):
         low, high = joints.low[index], joints.high[index]
-        found |= {"position": (low, high)} if low < high else {}
+        known |= {"position": (low, high)} if low < high else {}
     if joints.max_speed and moves and measured:
-        found |= {"speed": speed} if (speed := joints.max_speed[index]) > 0 else {}
+        known |= {"speed": speed} if (speed := joints.max_speed[index]) > 0 else {}
     if joints.max_torque and limits.command == "torque":
-        found |= {"torque": torque} if (torque := joints.max_torque[index]) > 0 else {}
-    return found
+        known |= {"torque": torque} if (torque := joints.max_torque[index]) > 0 else {}
+    return known
 
 
 def _check_can_be_limited(limits: Limits, joint: JointLimits, name: str) -> None:
@@ -181,7 +181,7 @@ def _check_can_be_limited(limits: Limits, joint: JointLimits, name: str) -> None
             can = ", ".join(_CAN_BE_LIMITED[limits.command])
             raise RecipeError(
                 f"limits: {name}.{key}: with command: {limits.command} only {can} can be limited; "
-                "say with command: what an action is, or watch a measured value with sensors:"
+                "set command: to what an action is, or check a measured value with sensors:"
             )
 
 
@@ -232,7 +232,7 @@ def _read_list(limits: Limits, key: str, count: int) -> Array | None:
 def _check_home(limits: Limits, bounds: Bounds | None, home: Array | None) -> None:
     if home is None:
         if limits.on_fault == "home":
-            raise RecipeError("limits: on_fault: home: where that is must be said: home: [positions]")
+            raise RecipeError("limits: on_fault: home: write where home is: home: [positions]")
         return
     if limits.command in ("torque", "action") or bounds is None:
         raise RecipeError(f"limits: home: actions that command {limits.command!r} cannot bring a robot to positions")
@@ -251,15 +251,17 @@ def _check_measured(limits: Limits, bounds: Bounds | None, measured: slice | Non
         or limits.home is not None
     ):
         raise RecipeError(
-            "limits: these need to know where the joints are; write measured: {position: NAME} with the name of the "
-            f"observation, one of {', '.join(layout.slices)}"
+            "limits: these limits need the positions of the joints; write measured: {position: NAME} "
+            f"with the name of the observation, one of {', '.join(layout.slices)}"
         )
 
 
 def _make_safe_command(limits: Limits, bounds: Bounds | None, count: int) -> Array:
     safe = _read_list(limits, "safe_action", count)
     if safe is not None and limits.command not in ("torque", "action"):
-        raise RecipeError("limits: safe_action: of positions, steps and speeds it is to keep still; leave it out")
+        raise RecipeError(
+            "limits: safe_action: with positions, steps and speeds the safe action is no motion; leave it out"
+        )
     if bounds is None:
         return np.zeros(count)
     wanted = bounds.offset + (np.zeros(count) if safe is None else safe) * bounds.factor

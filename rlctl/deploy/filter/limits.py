@@ -23,13 +23,13 @@ def _check_order(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-Bounds = Annotated[tuple[Number, Number], pydantic.AfterValidator(_check_order)]
+Interval = Annotated[tuple[Number, Number], pydantic.AfterValidator(_check_order)]
 
 
 class JointLimits(Section):
     """Limits of one joint, or of all."""
 
-    position: Bounds | None = None
+    position: Interval | None = None
     """Lowest and highest position [rad or m]; for commands of position, step and speed."""
     speed: Positive | None = None
     """Highest speed [rad/s or m/s]; for commands of position, step and speed."""
@@ -39,14 +39,14 @@ class JointLimits(Section):
     """Highest torque or force [N m or N]; for commands of torque."""
     rate: Positive | None = None
     """Largest change of the command per second [1/s]; for commands of torque and action."""
-    action: Bounds | None = None
+    action: Interval | None = None
     """Lowest and highest value of the action itself, whatever it commands."""
 
 
 class Sensor(Section):
     """What is checked of one named observation; every observation must be finite in any case."""
 
-    range: Bounds | None = None
+    range: Interval | None = None
     """Lowest and highest value."""
     frozen_s: Positive | None = None
     """Time after which a value that has not changed by a single bit is a fault [s]."""
@@ -71,8 +71,8 @@ class Limits(Section):
     joints: list[str] | None = None
     """Names of the joints in the order of the action; null: the task's."""
     limits: dict[str, JointLimits] = {}
-    """Limits by joint name; `all` is for every joint, and a joint's own are put over it. What is not said is as the
-    task's model of the robot has it."""
+    """Limits by joint name; `all` is for every joint; a joint's own limits replace it. Unset limits come from the
+    task's model of the robot."""
     lowpass_hz: Positive | None = None
     """Cut-off frequency of the low-pass on the command [Hz]."""
     blend_in_s: Annotated[Number, Field(ge=0)] = 0.0
@@ -86,7 +86,7 @@ class Limits(Section):
     watchdog_periods: Annotated[Number, Field(ge=0)] = 3.0
     """Control periods without an observation after which a server stops; 0: never."""
     on_fault: Literal["hold", "home", "stop"] = "hold"
-    """What a fault of a sensor or of the policy leads to: `hold` and `home` are left when the fault is over."""
+    """What a fault of a sensor or of the policy leads to: `hold` and `home` end with the fault."""
     home: list[Number] | None = None
     """Joint positions to go to."""
     safe_action: list[Number] | None = None
@@ -114,8 +114,8 @@ def read_limits(path: Path) -> Limits:
 
 def _explain(problem: Any, place: validation.Place, schema: validation.Schema, content: Any) -> str:
     key, given = ".".join(str(part) for part in place), problem["input"]
-    found = re.search(r"\[(.+?)\]", validation.find_schema(schema, place).get("description", ""))
-    unit = found[1] if found else ""
+    match = re.search(r"\[(.+?)\]", validation.find_schema(schema, place).get("description", ""))
+    unit = match[1] if match else ""
     if isinstance(given, str) and unit and _NUMBER_WITH_UNIT.match(given):
         return f"{key}: write the number alone, in {unit}, got {short_repr(given)!r}"
     return validation.explain(problem, place, schema, content, key=key, unit=unit)

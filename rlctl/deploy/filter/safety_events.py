@@ -67,8 +67,8 @@ class Intervention:
             values, limits = self._convert()
         acted = self.acted
         return [
-            SafetyEvent(self.time_s, "limit", *each)
-            for each in zip(self.names, values[acted].tolist(), limits[acted].tolist(), strict=True)
+            SafetyEvent(self.time_s, "limit", name, value, limit)
+            for name, value, limit in zip(self.names, values[acted].tolist(), limits[acted].tolist(), strict=True)
         ]
 
     def _convert(self) -> tuple[Array, Array]:

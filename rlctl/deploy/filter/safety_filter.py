@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from rlctl.deploy.filter.command import Command, UnsafeCommand
 from rlctl.deploy.filter.fitting import fit_limits
 from rlctl.deploy.filter.limits import Limits, read_limits
+from rlctl.deploy.filter.observation import SensorChecks
 from rlctl.deploy.filter.safety_events import Intervention, Kind, SafetyEvent
-from rlctl.deploy.filter.sensors import SensorChecks
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import UsageError, short_repr
 
 Array = NDArray[Any]
-State = Literal["idle", "running", "holding", "stopped"]
+FilterState = Literal["idle", "running", "holding", "stopped"]
 
 _NO_FILE = Limits()
 _KEPT = 1000  # of the last events
@@ -63,7 +63,7 @@ class SafetyFilter:
         """Called with each event, those of one limit in a step together."""
         self.steps = 0
         """Actions since the filter was made."""
-        self.state: State = "idle"
+        self.state: FilterState = "idle"
         self.reason = ""
         """Why it is holding or stopped."""
         self._zeros = np.zeros(math.prod(fitted.space.shape or ()))
@@ -73,7 +73,7 @@ class SafetyFilter:
         self._manual: Array | None = None
 
     def reset(self) -> None:
-        """Begin an episode. A stop, a hold or a way home that was ordered, and an action by hand stay."""
+        """Begin an episode. A stop, an order to hold or to go home, and an action by hand stay."""
         self._fault, self._observed = "", False
         self._sensors.reset()
         if self._command is not None:
@@ -92,10 +92,10 @@ class SafetyFilter:
             self._ordered, self._goes_home = True, False
             self._enter("holding", reason)
 
-    def home(self, reason: str = "way home ordered") -> None:
-        """Bring the robot home and keep it there until `resume`; a stop is left. Raises `UsageError` without a home."""
+    def home(self, reason: str = "home ordered") -> None:
+        """Bring the robot home and keep it there until `resume`; ends a stop. Raises `UsageError` without a home."""
         if self._home is None:
-            raise UsageError("no home is known: write home: [positions] into the limits file")
+            raise UsageError("there is no home: write home: [positions] into the limits file")
         self._ordered = self._goes_home = True
         self.begin_blend()
         self._enter("holding", reason)
@@ -110,7 +110,7 @@ class SafetyFilter:
     def override(self, action: Any | None) -> None:
         """Give an action by hand instead of the policy's from now on; None: the policy acts again.
 
-        Both begin with a blend. The limits hold as ever, and neither a stop nor a fault is left.
+        Both begin with a blend. The limits hold, and neither a stop nor a fault ends.
         Raises `ValueError` for what is not an action of this policy.
         """
         if action is not None:
@@ -130,23 +130,22 @@ class SafetyFilter:
 
     def find_last_events(self, count: int) -> list[SafetyEvent]:
         """Return the last events, oldest first."""
-        found: list[SafetyEvent] = []
-        for each in reversed(self._history):
-            if len(found) >= count:
+        events: list[SafetyEvent] = []
+        for record in reversed(self._history):
+            if len(events) >= count:
                 break
-            found += reversed(each.list_events())
-        return found[:count][::-1]
+            events += reversed(record.list_events())
+        return events[:count][::-1]
 
     @property
     def counts(self) -> collections.Counter[str]:
         """How often each limit acted on each joint and each fault occurred, since the filter was made."""
-        found: collections.Counter[str] = collections.Counter()
+        counts = collections.Counter(self._counted)
         if self._command is not None:
             for limit, times in self._limits_acted.items():
-                each = zip(self._command.names, times.tolist(), strict=True)
-                found.update({f"{joint}.{limit}": count for joint, count in each if count})
-        found.update(self._counted)
-        return found
+                acted = zip(self._command.names, times.tolist(), strict=True)
+                counts.update({f"{joint}.{limit}": count for joint, count in acted if count})
+        return counts
 
     @property
     def is_overridden(self) -> bool:
@@ -261,7 +260,7 @@ class SafetyFilter:
             return np.full(space.shape or (), getattr(space, "start", 0), space.dtype)
         return np.asarray(action, space.dtype).reshape(space.shape or ())
 
-    def _enter(self, state: State, reason: str) -> None:
+    def _enter(self, state: FilterState, reason: str) -> None:
         if state != self.state or reason != self.reason:
             self.state, self.reason = state, reason
             self._record("state", state, reason)

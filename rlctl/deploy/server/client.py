@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlctl.deploy.server import messages
-from rlctl.deploy.server.serve import KEY_VARIABLE
+from rlctl.deploy.server.request import KEY_VARIABLE
 from rlctl.environments.info import space_from_json
 from rlctl.errors import PolicyError, UsageError, describe_exception, short_repr
 from rlctl.policy.players.player import Player
@@ -34,7 +34,7 @@ class PolicyClient:
         key = os.environ.get(KEY_VARIABLE)
         self._headers = {"Authorization": f"Api-Key {key.strip()}"} if key else {}
         self.metadata: dict[str, Any] = self._run(self._connect())
-        """What the server says of its policy."""
+        """The server's description of its policy."""
 
     def _run(self, call: Any) -> Any:
         return self._loop.run_until_complete(call)
@@ -104,6 +104,7 @@ class RemotePlayer(Player):
         self._control_dt = dt if isinstance(dt, int | float) else math.inf
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Return the server's action twice: as it is stored and as it is taken. Raises `PolicyError`."""
         request = dict(observation) if isinstance(observation, dict) else {"observation": observation}
         if step == 0:
             request["reset"] = True
@@ -130,4 +131,5 @@ class RemotePlayer(Player):
         self._client.close()
 
     def report(self) -> dict[str, Any]:
+        """Return the round trips [s] of this episode, how many missed `control_dt`, and in how many it did not run."""
         return self._report

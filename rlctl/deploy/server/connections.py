@@ -12,7 +12,7 @@ from aiohttp import web
 
 from rlctl.errors import UsageError
 
-Answer = Callable[[web.Request], Awaitable[web.StreamResponse]]
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 _Handler = web.RequestHandler
 _Times = dict[_Handler, float]
 
@@ -54,7 +54,7 @@ class Connections:
         self._clients: _Times = {}
 
     def accept(self, handler: _Handler) -> _Handler:
-        """Take in a new connection, and close another where there are too many."""
+        """Register a new connection, and close another where there are too many."""
         self._waiting[handler] = time.monotonic() + _FIRST_REQUEST_S
         if self._count() > self._allowed:
             self._forget_closed()
@@ -63,8 +63,8 @@ class Connections:
         return handler
 
     @web.middleware
-    async def follow(self, request: web.Request, handler: Answer) -> web.StreamResponse:
-        """Answer a request, and know meanwhile that its connection does not wait. A middleware of aiohttp."""
+    async def follow(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Handler a request, and know meanwhile that its connection does not wait. A middleware of aiohttp."""
         connection = request.protocol
         is_client = request.headers.get("Upgrade", "").lower() == "websocket"
         group = self._clients if is_client else self._answering
@@ -72,7 +72,7 @@ class Connections:
         group[connection] = time.monotonic()
         try:
             return await handler(request)
-        except ConnectionError:  # it died while it was read; nobody gets this
+        except ConnectionError:  # the client died in its request; nobody receives this answer
             return web.Response(status=400)
         finally:
             group.pop(connection, None)

@@ -65,7 +65,7 @@ class Measurements:
         add("connections_total", "counter", "Connections so far.", ("", self.connections))
         add("refused_total", "counter", "Connections and keys that were refused.", ("", self.refused))
         add("policy_changes_total", "counter", "Policies that took the place of another.", ("", self.policy_changes))
-        states_now = [(f'{{state="{each}"}}', states[each]) for each in ("idle", "running", "holding", "stopped")]
+        states_now = [(f'{{state="{state}"}}', states[state]) for state in ("idle", "running", "holding", "stopped")]
         add("state", "gauge", "Clients by state.", *states_now)
         counts = [(f'{{name="{_escape(name)}"}}', count) for name, count in sorted(interventions.items())]
         add("interventions_total", "counter", "How often each limit and fault occurred.", *counts)

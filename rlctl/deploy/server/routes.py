@@ -15,8 +15,8 @@ from aiohttp import web
 from aiohttp.typedefs import Middleware
 
 from rlctl.deploy.server import messages
-from rlctl.deploy.server.connections import Answer, Connections
-from rlctl.deploy.server.serve import LOOPBACK
+from rlctl.deploy.server.connections import Connections, Handler
+from rlctl.deploy.server.request import LOOPBACK
 from rlctl.deploy.server.server import PolicyServer
 from rlctl.errors import RlctlError
 
@@ -36,7 +36,7 @@ class _Routes:
         self.page = (Path(__file__).parent / "page.html").read_text("utf-8")
 
     def make_app(self) -> web.Application:
-        check = make_access_check(self.server.settings.host, self.server.api_key, self._note_refused)
+        check = make_access_check(self.server.request.host, self.server.api_key, self._note_refused)
         app = web.Application(middlewares=[self.connections.follow, check], client_max_size=_LARGEST_POLICY)
         app.add_routes(
             [
@@ -152,7 +152,7 @@ def make_access_check(host: str, key: str | None, on_refused: Callable[[], None]
     """Return what refuses requests without the key (`Authorization: Api-Key KEY`), and those of other sites' pages."""
 
     @web.middleware
-    async def check(request: web.Request, handler: Answer) -> web.StreamResponse:
+    async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
         if (problem := _find_problem(request, host in LOOPBACK, key)) is None:
             return await handler(request)
         on_refused()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import errno
 import gc
 import os
@@ -14,32 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rlctl.deploy.filter.limits import Limits, read_limits
+from rlctl.deploy.server.request import KEY_VARIABLE, LOOPBACK, ServeRequest
 from rlctl.deploy.server.served_policy import load_served_policy
 from rlctl.errors import ArtifactError, RlctlError, UsageError, explain_missing_package
 
 if TYPE_CHECKING:
     from rlctl.deploy.server.server import PolicyServer
 
-KEY_VARIABLE = "RLCTL_API_KEY"
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
-
-@dataclasses.dataclass(frozen=True)
-class ServerSettings:
-    """What a server is started with; paths are of files."""
-
-    host: str = "127.0.0.1"
-    port: int = 8000
-    limits: Path | None = None
-    log: Path | None = None
-    rerun: Path | None = None
-    """Of a Rerun recording."""
-    key_file: Path | None = None
-    max_clients: int = 64
-    watchdog: bool = True
-
-
-def make_server(file: Path, settings: ServerSettings) -> PolicyServer:
+def make_server(file: Path, request: ServeRequest) -> PolicyServer:
     """Load a policy and make its server; raises `RlctlError` for whatever would be wrong with it."""
     try:
         import uvloop  # noqa: F401
@@ -47,16 +29,16 @@ def make_server(file: Path, settings: ServerSettings) -> PolicyServer:
         from rlctl.deploy.server.server import PolicyServer
     except ModuleNotFoundError as error:
         raise UsageError(explain_missing_package("rlctl serve", error.name, "serve")) from None
-    key = _read_key(settings.key_file)
-    if settings.host not in LOOPBACK and key is None:
+    key = _read_key(request.key_file)
+    if request.host not in LOOPBACK and key is None:
         raise UsageError(
-            f"--host {settings.host}: others can reach this server, and could move the robot; give a key: "
+            f"--host {request.host}: other machines can reach this server and could move the robot; set a key: "
             f"--key-file FILE, or {KEY_VARIABLE} in the environment"
         )
-    limits = Limits() if settings.limits is None else read_limits(settings.limits)
-    if not settings.watchdog:
+    limits = Limits() if request.limits is None else read_limits(request.limits)
+    if not request.watchdog:
         limits = limits.model_copy(update={"watchdog_periods": 0.0})
-    return PolicyServer(load_served_policy(file), settings, limits, key)
+    return PolicyServer(load_served_policy(file), request, limits, key)
 
 
 def _read_key(file: Path | None) -> str | None:
@@ -95,8 +77,8 @@ async def serve_until(
     from rlctl.deploy.server.connections import BACKLOG, Connections, count_allowed_connections
     from rlctl.deploy.server.routes import make_app
 
-    settings = server.settings
-    connections = Connections(count_allowed_connections(settings.max_clients))
+    request = server.request
+    connections = Connections(count_allowed_connections(request.max_clients))
     runner = web.AppRunner(make_app(server, connections), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     web_server = runner.server
@@ -106,20 +88,20 @@ async def serve_until(
     try:
         try:
             listener = await loop.create_server(
-                lambda: connections.accept(web_server()), settings.host, settings.port, backlog=BACKLOG
+                lambda: connections.accept(web_server()), request.host, request.port, backlog=BACKLOG
             )
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
-                hint = "give another one, or --port 0 for any that is free"
-                raise UsageError(f"port {settings.port} is in use; {hint}") from None
-            place = f"--host {settings.host} --port {settings.port}"
+                hint = "choose another one, or --port 0 for any free port"
+                raise UsageError(f"port {request.port} is in use; {hint}") from None
+            place = f"--host {request.host} --port {request.port}"
             raise UsageError(f"{place}: {error.strerror or error}") from None
         if handle_signals:
             _handle_signals(server, end)
         gc.collect()
-        gc.freeze()  # what is there now stays; collections need not look at it again
+        gc.freeze()  # these objects stay until the end: the garbage collector can skip them
         port = listener.sockets[0].getsockname()[1]
-        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        host = f"[{request.host}]" if ":" in request.host else request.host
         on_start(f"{host}:{port}")
         await end.wait()
     finally:

@@ -19,10 +19,9 @@ from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.observation import ObservationLayout
 from rlctl.deploy.filter.safety_events import SafetyEvent
 from rlctl.deploy.server import messages
-from rlctl.deploy.server.event_log import EventLog
+from rlctl.deploy.server.logs import EventLog, RerunLog
 from rlctl.deploy.server.measurements import Measurements
-from rlctl.deploy.server.rerun_log import RerunLog
-from rlctl.deploy.server.serve import ServerSettings
+from rlctl.deploy.server.request import ServeRequest
 from rlctl.deploy.server.served_policy import ServedPolicy, load_served_policy
 from rlctl.deploy.server.session import Session
 from rlctl.errors import RlctlError, short_repr
@@ -36,12 +35,12 @@ _SHORTEST_TICK_S = 0.01
 class PolicyServer:
     """Serves one policy to many clients; each WebSocket connection is an episode with a filter of its own."""
 
-    def __init__(self, policy: ServedPolicy, settings: ServerSettings, limits: Limits, api_key: str | None) -> None:
-        self.settings, self.api_key = settings, api_key
+    def __init__(self, policy: ServedPolicy, request: ServeRequest, limits: Limits, api_key: str | None) -> None:
+        self.request, self.api_key = request, api_key
         self.policy = policy
         self.measurements = Measurements()
-        self._log = EventLog(settings.log)
-        self._recording = None if settings.rerun is None else RerunLog(settings.rerun)
+        self._log = EventLog(request.log)
+        self._recording = None if request.rerun is None else RerunLog(request.rerun)
         self._numbers = itertools.count(1)
         self._sessions: dict[int, Session] = {}
         self._earlier_counts: collections.Counter[str] = collections.Counter()
@@ -77,7 +76,7 @@ class PolicyServer:
 
     def _open_session(self) -> Session:
         session = Session(next(self._numbers), lambda: self.policy, self._limits)
-        if self.settings.log is not None:
+        if self.request.log is not None:
             session.safety.on_event = functools.partial(self._log.write_event, session.number)
         self._sessions[session.number] = session
         self._log.write("connected", session.number)
@@ -93,7 +92,7 @@ class PolicyServer:
 
     def count_interventions(self) -> collections.Counter[str]:
         """Return how often each limit acted and each fault occurred, of all clients so far."""
-        return sum((each.safety.counts for each in self._sessions.values()), self._earlier_counts)
+        return sum((session.safety.counts for session in self._sessions.values()), self._earlier_counts)
 
     def _write_fault(self, session: Session, name: str, value: float | str, limit: float | None = None) -> None:
         self._log.write_event(session.number, SafetyEvent(time.time(), "fault", name, value, limit))
@@ -105,13 +104,13 @@ class PolicyServer:
             self._recording.close()
 
     async def write_recording(self) -> None:
-        """Write what was recorded, once a second, for ever."""
+        """Write what was recorded, once a second; runs until it is cancelled."""
         while self._recording is not None:
             await asyncio.sleep(1.0)
             await asyncio.to_thread(self._recording.flush)
 
     async def check_watchdogs(self) -> None:
-        """Stop clients that send no observations any more; runs until it is cancelled."""
+        """Stop clients that no longer send observations; runs until it is cancelled."""
         period = max(self.posting.safety.control_dt or 1.0, _SHORTEST_TICK_S)
         while True:
             await asyncio.sleep(period)
@@ -121,9 +120,12 @@ class PolicyServer:
 
     async def serve_client(self, request: web.Request) -> web.StreamResponse:
         """Serve one WebSocket connection."""
-        if len(self._sessions) > self.settings.max_clients:  # one of them is `posting`
+        if len(self._sessions) > self.request.max_clients:  # one of them is `posting`
             self.measurements.refused += 1
-            return web.Response(status=503, text=f"{self.settings.max_clients} clients are connected, which is all\n")
+            return web.Response(
+                status=503,
+                text=f"{self.request.max_clients} clients are connected, which is the most that --max-clients allows\n",
+            )
         session = self._open_session()
         self.measurements.connections += 1
         try:
@@ -146,7 +148,7 @@ class PolicyServer:
         ready = time.perf_counter()
         async for message in socket:
             begin = time.perf_counter()
-            if begin - ready < _AT_ONCE_S:  # it was there already, as those of a flood are: the others come first
+            if begin - ready < _AT_ONCE_S:  # it was waiting, as the messages of a flood are: other clients come first
                 await asyncio.sleep(0)
             try:
                 if message.type is not aiohttp.WSMsgType.BINARY:
@@ -216,7 +218,7 @@ class PolicyServer:
     async def replace_policy(self, file: Path) -> None:
         """Act with another policy file from the next step of each client on.
 
-        Raises `RlctlError` for a file that is not a sound policy for the same robot; the old one acts on then.
+        Raises `RlctlError` for a file that is not a sound policy for the same robot; the old one keeps acting then.
         """
         try:
             policy = await asyncio.to_thread(load_served_policy, file)

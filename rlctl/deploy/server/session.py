@@ -19,9 +19,9 @@ _LONGEST_AGE_S = 1e9
 
 
 class Session:
-    """An episode after the other of one client.
+    """The episodes of one client, one after the other.
 
-    `policy` returns what is to act; another one than before acts from the next whole step on, blended in.
+    `policy` returns what is to act; a new policy acts from the next step on, blended in.
     """
 
     def __init__(self, number: int, policy: Callable[[], ServedPolicy], limits: Limits | None) -> None:
@@ -108,7 +108,7 @@ class Session:
             self.safety.begin_blend()
 
     def reset(self) -> None:
-        """Begin an episode: forget the recurrent state. Of stops only that of the watchdog is left."""
+        """Begin an episode: forget the recurrent state. A stop by the watchdog ends; other stops stay."""
         if self._by_watchdog and self.safety.state == "stopped":
             self.safety.resume()
         self._by_watchdog = False
@@ -117,7 +117,7 @@ class Session:
 
     def order(self, what: str) -> None:
         """Follow an operator: stop, home, hold or resume."""
-        self._by_watchdog = False  # what a person has ordered, a client does not leave
+        self._by_watchdog = False  # only a person ends what a person ordered
         {
             "stop": lambda: self.safety.stop("stopped by hand"),
             "home": lambda: self.safety.home("sent home by hand"),

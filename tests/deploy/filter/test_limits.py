@@ -79,11 +79,14 @@ def test_what_is_wrong_in_a_file(write, text, message):
         (("measured: {position: positions}\n", ""), "write measured: {position: NAME}"),
         (("home: [0, 0]", "home: [0]"), "home: 1 numbers, the action has 2 elements"),
         (("home: [0, 0]", "home: [0, 2]"), "home: it is outside the limits of position"),
-        (("home: [0, 0]", "on_fault: home"), "on_fault: home: where that is must be said"),
+        (("home: [0, 0]", "on_fault: home"), "on_fault: home: write where home is"),
         (("joints: [shoulder, elbow]", "joints: [elbow, elbow]"), "1 different names, the action has 2 elements"),
         (("command: position", "command: torque"), "with command: torque only torque, rate, action can be limited"),
         (("[-1, 1]", "[20, 30]"), "elbow: no action keeps these limits and the policy's own action bounds"),
-        (("home: [0, 0]", "safe_action: [0, 0]"), "safe_action: of positions, steps and speeds it is to keep still"),
+        (
+            ("home: [0, 0]", "safe_action: [0, 0]"),
+            "safe_action: with positions, steps and speeds the safe action is no motion",
+        ),
         (("home: [0, 0]", "scale: [1, 1, 1]"), "scale has 3 numbers, the action 2"),
     ],
 )
@@ -114,7 +117,7 @@ def test_what_the_task_knows_of_its_joints(write, arm):
     ]
     with pytest.raises(RecipeError, match="the action's order is hip, knee"):
         SafetyFilter(arm, write("joints: [knee, hip]"))
-    with pytest.raises(RecipeError, match="action 0 is to keep still"):
+    with pytest.raises(RecipeError, match="action 0 must be no motion"):
         SafetyFilter(arm, write("{command: speed, offset: 1}"))
 
 
@@ -138,7 +141,7 @@ def test_actions_from_minus_1_to_1_need_a_scale(write, arm):
 
 def test_without_a_control_dt(write):
     info = EnvInfo(observation_space=make_arm().observation_space, action_space=space_to_json(spaces.Box(-1, 1, (2,))))
-    with pytest.raises(RecipeError, match="does not say its control_dt"):
+    with pytest.raises(RecipeError, match="has no control_dt"):
         SafetyFilter(info, write("lowpass_hz: 2"))
 
 

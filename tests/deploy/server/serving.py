@@ -11,7 +11,8 @@ import numpy as np
 from gymnasium import spaces
 
 from rlctl.deploy.server.client import PolicyClient
-from rlctl.deploy.server.serve import ServerSettings, make_loop, make_server, serve_until
+from rlctl.deploy.server.request import ServeRequest
+from rlctl.deploy.server.serve import make_loop, make_server, serve_until
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.policy.file import PolicyFile, PolicyInfo
@@ -55,7 +56,7 @@ class RunningServer:
     """A server in a thread of this process."""
 
     def __init__(self, file, **settings):
-        self.server = make_server(file, ServerSettings(port=0, **settings))
+        self.server = make_server(file, ServeRequest(port=0, **settings))
         self._end = asyncio.Event()
         self._started = threading.Event()
         self._thread = threading.Thread(target=self._run)

@@ -10,7 +10,8 @@ import urllib.request
 
 import pytest
 
-from rlctl.deploy.server.serve import ServerSettings, make_server
+from rlctl.deploy.server.request import ServeRequest
+from rlctl.deploy.server.serve import make_server
 from rlctl.errors import RlctlError
 from tests.deploy.server.serving import write_policy
 
@@ -52,7 +53,7 @@ def test_signals(served):
 @pytest.mark.parametrize(
     ("settings", "code", "error"),
     [
-        ({"host": "0.0.0.0"}, 2, "give a key"),
+        ({"host": "0.0.0.0"}, 2, "set a key"),
         ({"limits": "limits.yaml"}, 2, "or one of: action[0], action[1]."),
         ({"log": "policy.safetensors/log"}, 5, "the log cannot be written"),
     ],
@@ -63,7 +64,7 @@ def test_errors(tmp_path, monkeypatch, settings, code, error):
     (tmp_path / "limits.yaml").write_text("limits: {elbo: {action: [0, 1]}}")
     paths = {key: value if key == "host" else tmp_path / value for key, value in settings.items()}
     with pytest.raises(RlctlError) as problem:
-        make_server(file, ServerSettings(**paths))
+        make_server(file, ServeRequest(**paths))
     assert problem.value.exit_code == code
     assert error in str(problem.value)
 
@@ -81,10 +82,11 @@ def test_starts_without_what_takes_long_to_import(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
     code = (
         "import pathlib, sys\n"
-        "from rlctl.deploy.server.serve import ServerSettings, make_server\n"
+        "from rlctl.deploy.server.request import ServeRequest\n"
+        "from rlctl.deploy.server.serve import make_server\n"
         "from rlctl.deploy.server.routes import make_app\n"
         "from rlctl.deploy.server.connections import Connections\n"
-        f"make_app(make_server(pathlib.Path({str(file)!r}), ServerSettings()), Connections(100))\n"
+        f"make_app(make_server(pathlib.Path({str(file)!r}), ServeRequest()), Connections(100))\n"
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from rlctl.deploy.server.client import PolicyClient
-from rlctl.deploy.server.serve import ServerSettings, make_server
+from rlctl.deploy.server.request import ServeRequest
+from rlctl.deploy.server.serve import make_server
 from rlctl.errors import ArtifactError, PolicyError, UsageError
 from tests.deploy.server.serving import (
     FLAT,
@@ -158,15 +159,15 @@ def test_pages_of_other_sites_are_refused(serve):
 
 def test_others_reach_a_server_with_a_key_only(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
-    with pytest.raises(UsageError, match="give a key"):
-        make_server(file, ServerSettings(host="0.0.0.0"))
+    with pytest.raises(UsageError, match="set a key"):
+        make_server(file, ServeRequest(host="0.0.0.0"))
     with pytest.raises(ArtifactError, match="the key cannot be read"):
-        make_server(file, ServerSettings(host="0.0.0.0", key_file=tmp_path / "none"))
+        make_server(file, ServeRequest(host="0.0.0.0", key_file=tmp_path / "none"))
 
 
 def test_a_port_in_use(serve):
     first = serve()
-    server = make_server(first.server.policy.file, ServerSettings(port=first.port))
+    server = make_server(first.server.policy.file, ServeRequest(port=first.port))
     import asyncio
 
     from rlctl.deploy.server.serve import run_server
@@ -215,7 +216,7 @@ def test_orders_are_for_all_clients_also_later_ones(serve):
 
 def test_actions_by_hand(serve):
     server = serve()
-    assert json.loads(server.post("/home")[1])["error"].startswith("no home is known")
+    assert json.loads(server.post("/home")[1])["error"].startswith("there is no home")
     with server.client() as client:
         client.act(OBSERVATION)
         assert server.post("/override", {"action": [1, -1]})[0] == 200
@@ -274,4 +275,4 @@ def test_each_connection_is_an_episode(serve, tmp_path):
 def test_a_file_that_is_not_a_policy(tmp_path):
     (tmp_path / "policy.onnx").write_bytes(b"onnx")
     with pytest.raises(ArtifactError, match="damaged, or not an ONNX file"):
-        make_server(tmp_path / "policy.onnx", ServerSettings())
+        make_server(tmp_path / "policy.onnx", ServeRequest())

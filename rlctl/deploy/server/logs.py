@@ -1,4 +1,4 @@
-"""A log of what happened, JSON lines, bounded: files are rotated, and what repeats is counted."""
+"""What a server writes: a log of events as JSON lines, and a Rerun recording. Both are bounded."""
 
 from __future__ import annotations
 
@@ -7,23 +7,27 @@ import json
 import logging
 import logging.handlers
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rlctl.deploy.filter.safety_events import Intervention, SafetyEvent
 from rlctl.deploy.server.messages import as_json
-from rlctl.errors import ArtifactError
+from rlctl.errors import ArtifactError, short_repr
 
 _LARGEST = 10_000_000  # [bytes] of one file
 _KEPT = 3
 _REPEAT_S = 1.0
 _MOST_NAMES = 1000
+_MOST_ROWS = 100_000  # that wait for the next `flush`
 
 
 class EventLog:
-    """Writes events as JSON lines; without a file nowhere.
+    """Writes events as JSON lines; without a file it writes nothing.
 
     The same limit or fault of a client is written at most once a second, with the number of times since.
     Raises `ArtifactError` for a file that cannot be written.
@@ -55,10 +59,10 @@ class EventLog:
             return
         counts = dict.fromkeys(event.names, 1) if event.kind == "state" else self._count(client, event.names)
         if counts:
-            for each in event.list_events():
-                if (count := counts.get(each.name)) is not None:
-                    place = {"name": each.name, "value": each.value, "limit": each.limit}
-                    self.write(each.kind, client, time_s=each.time_s, **place, count=count)
+            for record in event.list_events():
+                if (count := counts.get(record.name)) is not None:
+                    place = {"name": record.name, "value": record.value, "limit": record.limit}
+                    self.write(record.kind, client, time_s=record.time_s, **place, count=count)
 
     def _count(self, client: int, names: Sequence[str]) -> dict[str, int]:
         """Return how often each event occurred since it was written, of those that are to be written again."""
@@ -88,4 +92,56 @@ class _Handler(logging.handlers.RotatingFileHandler):
         if not self._warned:
             self._warned = True
             error = sys.exception()
-            print(f"warning: {self.baseFilename}: the log cannot be written any more: {error}", file=sys.stderr)
+            print(f"warning: {self.baseFilename}: cannot write to the log: {error}", file=sys.stderr)
+
+
+class RerunLog:
+    """Collects rows and writes them together, which costs a thousandth of writing each.
+
+    Raises `ArtifactError` for a file that cannot be written.
+    """
+
+    def __init__(self, file: Path) -> None:
+        import rerun as rr  # takes a second
+
+        self._rerun = rr
+        self._rows: dict[str, list[tuple[float, Any]]] = {}
+        self._count = 0
+        self._file, self._warned = file, False
+        self._lock = threading.Lock()
+        self._stream = rr.RecordingStream("rlctl serve")
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.open("ab").close()
+            self._stream.save(file)
+        except (OSError, RuntimeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise ArtifactError(f"{file}: the recording cannot be written: {reason}") from None
+
+    def add(self, entity: str, values: Any) -> None:
+        """Add some numbers of now; what comes faster than it can be written is dropped."""
+        with self._lock:
+            if self._count < _MOST_ROWS:
+                self._count += 1
+                self._rows.setdefault(entity, []).append((time.time(), values))
+
+    def flush(self) -> None:
+        """Write what was added; may be called in another thread."""
+        with self._lock:
+            rows, self._rows, self._count = self._rows, {}, 0
+        try:
+            for entity, samples in rows.items():
+                times = np.array([second for second, _ in samples])
+                index = self._rerun.TimeColumn("time", timestamp=times)
+                values = np.array([np.ravel(value) for _, value in samples], np.float64)
+                self._stream.send_columns(entity, [index], self._rerun.Scalars.columns(scalars=values))
+            self._stream.flush()
+        except RuntimeError as error:  # what Rerun raises when the disk is full
+            if not self._warned:
+                self._warned = True
+                print(f"warning: {self._file}: the recording has gaps: {short_repr(str(error))}", file=sys.stderr)
+
+    def close(self) -> None:
+        """Write what is left and close the file."""
+        self.flush()
+        self._stream.disconnect()
