@@ -72,8 +72,10 @@ class Connections:
         group[connection] = time.monotonic()
         try:
             return await handler(request)
-        except ConnectionError:  # the client died in its request; nobody receives this answer
-            return web.Response(status=400)
+        except (ConnectionError, web.RequestPayloadError, RuntimeError):
+            if connection.transport is not None:
+                raise
+            return web.Response(status=400)  # the client died in its request; nobody receives this answer
         finally:
             group.pop(connection, None)
             if connection.transport is not None:
