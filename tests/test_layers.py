@@ -30,6 +30,7 @@ LAYERS = [
     {"run"},
     {"policy"},
     {"recipe"},
+    {"hub"},
     {"environments"},
     {"task"},
     {"output"},

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli import check_env, eval, export, identify, recipe, replay, runs, serve, tasks, train, tune
+from rlctl.cli import check_env, eval, export, identify, push, recipe, replay, runs, serve, tasks, train, tune
 from rlctl.cli.arguments import suggest_setting
 from rlctl.errors import UsageError
 from rlctl.processes import error_boundary
@@ -39,6 +39,7 @@ COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "eval": eval.evaluate,
     "export": export.export,
     "replay": replay.replay,
+    "push": push.push,
     "serve": serve.serve,
     "identify": identify.identify,
     "tasks": tasks.app,

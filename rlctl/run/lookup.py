@@ -15,6 +15,7 @@ from rlctl.environments import installed, registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.environments.task_version import describe_task_changes
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.hub import store
 from rlctl.output import format_duration
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import PRETRAINED, find_shipped_policy
@@ -44,6 +45,8 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
 
     Where there is none the error names the policy that the task ships, `to_train` from or to use.
     """
+    if text is not None and store.is_address(text):
+        text = str(store.fetch(text))
     if text is None or text == "latest":
         # The link first: names go by a clock, which may have been set back since.
         newest = _read_latest(root) or next(iter(_list_newest_first(root, "*/*/run.json", "*/*/*_s*/run.json")), None)
@@ -98,6 +101,8 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> Fou
     A task's name stands for its newest run that has such a policy; with `pretrained` for the policy it ships. Where
     the source of the task has changed since the training a note says so.
     """
+    if text is not None and which != PRETRAINED and store.is_address(text):
+        text = str(store.fetch(text))
     policy = _find_policy(text, which, root)
     change = None if policy.run is None else describe_source_change(policy.run)
     if change is None:

@@ -64,7 +64,7 @@ class Connections:
 
     @web.middleware
     async def follow(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Handler a request, and know meanwhile that its connection does not wait. A middleware of aiohttp."""
+        """Answer a request; its connection does not count as waiting meanwhile. A middleware of aiohttp."""
         connection = request.protocol
         is_client = request.headers.get("Upgrade", "").lower() == "websocket"
         group = self._clients if is_client else self._answering

@@ -1,0 +1,193 @@
+"""Files at an address: uploaded with a manifest, downloaded into a cache that is named by content.
+
+A pushed folder has a manifest, `rlctl.json`, with the size and SHA-256 of each file. Nothing is unpickled. Only file
+types of rlctl are downloaded, and each file is checked before it gets its name in the cache.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import pydantic
+
+from rlctl.errors import ArtifactError, UsageError, describe_exception, short_repr
+from rlctl.storage import files, untrusted
+
+MANIFEST = "rlctl.json"
+_ADDRESS = re.compile(r"^(?!wss?:)[a-z][a-z0-9+.-]+://.")
+_SUFFIXES = (".safetensors", ".onnx", ".json", ".yaml", ".csv", ".md", ".rrd")
+_BUCKETS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "hf"}
+_MOST_FILES = 1000
+_LARGEST = 2 * 2**30  # [bytes] of one file
+_CHUNK = 2**20  # [bytes]
+
+
+class StoredFile(pydantic.BaseModel, extra="forbid"):
+    """A file of a manifest."""
+
+    size: int = pydantic.Field(ge=0, le=_LARGEST)
+    """[bytes]"""
+    sha256: str = pydantic.Field(pattern="^[0-9a-f]{64}$")
+
+
+class Manifest(pydantic.BaseModel, extra="forbid"):
+    """What is at an address, by the path below it."""
+
+    format: int = pydantic.Field(1, ge=1, le=1)
+    files: dict[str, StoredFile] = pydantic.Field(max_length=_MOST_FILES)
+
+
+def is_address(text: str | None) -> bool:
+    """Say whether a text is the address of a store, such as `s3://bucket/name`; `ws://` is one of a policy server."""
+    return text is not None and _ADDRESS.match(text) is not None
+
+
+def fetch(address: str) -> Path:
+    """Return the folder or file in the cache that has what is at an address; download what is not there yet.
+
+    `#sha256=HEX` after the address of a file is checked. Raises `ArtifactError` for what does not exist, is incomplete
+    or differs from its checksum, `UsageError` for a scheme that is not installed.
+    """
+    place, _, wanted = address.partition("#sha256=")
+    with _open_store(place) as (store, path):
+        if PurePosixPath(path).suffix in _SUFFIXES:
+            return _fetch_file(store, path, place, wanted)
+        content = _read_manifest(store, path, place)
+        folder = _cache() / hashlib.sha256(content).hexdigest()
+        if not folder.exists():
+            manifest = _parse_manifest(content, place)
+            with _temporary_folder() as new:
+                for name, entry in manifest.files.items():
+                    target = new / name
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    _download(store, f"{path}/{name}", f"{place}/{name}", target, entry)
+                _keep(new, folder)
+        return folder
+
+
+def push(contents: Mapping[str, Path | bytes], address: str) -> Manifest:
+    """Upload files, by their paths below an address, and last their manifest. Returns the manifest.
+
+    Raises `ArtifactError` where the address cannot be written.
+    """
+    data = {name: untrusted.read_bytes(value) if isinstance(value, Path) else value for name, value in contents.items()}
+    entries = {name: StoredFile(size=len(value), sha256=files.digest(value)) for name, value in data.items()}
+    manifest = Manifest(files=entries)
+    data[MANIFEST] = manifest.model_dump_json(indent=2).encode()
+    with _open_store(address) as (store, path):
+        protocols = (store.protocol,) if isinstance(store.protocol, str) else store.protocol
+        for name, value in data.items():
+            target = f"{path}/{name}"
+            if not _BUCKETS.intersection(protocols):  # there it would make a bucket
+                store.makedirs(target.rpartition("/")[0], exist_ok=True)
+            store.pipe_file(target, value)
+    return manifest
+
+
+@contextlib.contextmanager
+def _open_store(address: str) -> Iterator[tuple[Any, str]]:
+    """Open the file system of an address; what it raises becomes an error that names the address."""
+    scheme = address.partition("://")[0]
+    try:
+        fsspec: Any = importlib.import_module("fsspec")
+        store, path = fsspec.core.url_to_fs(address)
+    except ImportError as error:
+        raise UsageError(f"{address}: {scheme}:// needs packages: pip install 'rlctl[hub]' ({error})") from None
+    except ValueError as error:
+        raise UsageError(f"{address}: {short_repr(str(error), 200)}") from None
+    try:
+        yield store, str(path).rstrip("/")
+    except ArtifactError:
+        raise
+    except FileNotFoundError:
+        raise ArtifactError(f"{address}: there is nothing at this address, or no permission to see it") from None
+    except Exception as error:  # each file system has its own
+        raise ArtifactError(f"{address}: {short_repr(describe_exception(error), 300)}") from None
+
+
+def _read_manifest(store: Any, path: str, address: str) -> bytes:
+    try:
+        with store.open(f"{path}/{MANIFEST}", "rb") as stream:
+            content: bytes = stream.read(untrusted.JSON_LIMIT)
+    except FileNotFoundError:
+        raise ArtifactError(
+            f"{address}: no {MANIFEST} there, which rlctl push writes; give the address of a .safetensors or .onnx file"
+        ) from None
+    return content
+
+
+def _parse_manifest(content: bytes, address: str) -> Manifest:
+    try:
+        manifest = Manifest.model_validate_json(content)
+    except pydantic.ValidationError as error:
+        raise ArtifactError(f"{address}/{MANIFEST}: not a manifest of rlctl: {error.errors()[0]['msg']}") from None
+    for name in manifest.files:
+        parts = PurePosixPath(name).parts
+        is_plain = bool(parts) and "/".join(parts) == name and ".." not in parts and not name.startswith("/")
+        if not is_plain or "\\" in name or not name.isprintable() or PurePosixPath(name).suffix not in _SUFFIXES:
+            raise ArtifactError(f"{address}/{MANIFEST}: it lists {short_repr(name)}, which rlctl does not download")
+    return manifest
+
+
+def _fetch_file(store: Any, path: str, address: str, wanted: str) -> Path:
+    name = PurePosixPath(path).name
+    if wanted and (cached := _cache() / wanted / name).is_file():
+        return cached
+    with _temporary_folder() as new:
+        sha256 = _download(store, path, address, new / name, None)
+        if wanted and sha256 != wanted:
+            raise ArtifactError(f"{address}: its SHA-256 is {sha256}, not {short_repr(wanted, 80)}")
+        folder = _cache() / sha256
+        if not folder.exists():
+            _keep(new, folder)
+    return folder / name
+
+
+def _download(store: Any, path: str, address: str, target: Path, entry: StoredFile | None) -> str:
+    """Download a file and return its SHA-256; raises `ArtifactError` where it is not what the manifest says."""
+    largest, size, digest = (_LARGEST if entry is None else entry.size), 0, hashlib.sha256()
+    with store.open(path, "rb") as stream, target.open("wb") as file:
+        while size <= largest and (chunk := stream.read(_CHUNK)):
+            size += len(chunk)
+            digest.update(chunk)
+            file.write(chunk)
+    if entry is not None and size < entry.size:
+        raise ArtifactError(f"{address}: truncated: {size:,} of {entry.size:,} bytes")
+    if size > largest:
+        raise ArtifactError(f"{address}: larger than {largest:,} bytes")
+    if entry is not None and digest.hexdigest() != entry.sha256:
+        raise ArtifactError(f"{address}: its SHA-256 is not the one in {MANIFEST}: it was changed after it was pushed")
+    return digest.hexdigest()
+
+
+def _cache() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME")
+    folder = (Path(base) if base else Path.home() / ".cache") / "rlctl" / "hub"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+@contextlib.contextmanager
+def _temporary_folder() -> Iterator[Path]:
+    folder = Path(tempfile.mkdtemp(prefix="new-", dir=_cache()))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _keep(new: Path, folder: Path) -> None:
+    try:
+        new.rename(folder)
+    except OSError:
+        if not folder.is_dir():  # another process has downloaded the same
+            raise
