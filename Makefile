@@ -1,5 +1,7 @@
-# `make demo` and `make test` do all set-up on a fresh machine with Python 3.11.
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+# `make demo` and `make test` do all set-up on a fresh machine, with Python 3.11 or with uv, which downloads it.
+PYTHON ?= $(shell python3.11 -c 'import sys; print(sys.executable)' 2> /dev/null)
+# `make demo TORCH=cuda` installs PyTorch with CUDA: some gigabytes more.
+TORCH ?= cpu
 VENV ?= .venv
 BIN := $(VENV)/bin
 # Tests start hundreds of processes, which would each compile all modules where writing them compiled is turned off.
@@ -49,12 +51,25 @@ train-all: $(VENV)/.dev
 clean:
 	rm -rf $(VENV) dist build .mypy_cache .ruff_cache .pytest_cache
 
-$(VENV)/.installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
+$(BIN)/python:
+	@if [ -n "$(PYTHON)" ]; then \
+		$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] > (3, 11))' || \
+			echo "PyBullet has no wheels for this Python: tasks that need it, as the one of make demo, are left out"; \
+		$(PYTHON) -m venv $(VENV); \
+	elif command -v uv > /dev/null; then \
+		uv venv --quiet --seed --python 3.11 $(VENV); \
+	else \
+		echo "Python 3.11 is missing: install it, or uv (https://docs.astral.sh/uv), and run make again"; exit 1; \
+	fi
+	@echo "installing into $(VENV): about 2.4 GB, of which PyTorch ($(TORCH)) 0.8 GB and Rerun 0.5 GB"
+	@if [ "$(TORCH)" = cpu ]; then $(BIN)/pip install -q --no-deps --retries 1 --timeout 15 -c constraints.txt \
+		--index-url https://download.pytorch.org/whl/cpu torch || \
+		echo "PyTorch for the CPU was not found; pip takes its default, which may bring gigabytes of CUDA"; fi
+
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt -e .
 	touch $@
 
-$(VENV)/.dev: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
+$(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt -e '.[dev]'
 	touch $(VENV)/.installed $@

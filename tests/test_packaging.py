@@ -3,6 +3,8 @@
 import ast
 import importlib.metadata
 import re
+import shutil
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -78,3 +80,41 @@ def test_what_an_extra_needs_is_named_without_an_index_that_has_rlctl():
     assert text.startswith("rlctl serve needs aiohttp: pip install 'aiohttp<4,>=3.11' 'msgpack>=1.1'")
     assert ";" not in text
     assert explain_missing_package("rlctl fly", "wings", "fly") == "rlctl fly needs wings: pip install wings"
+
+
+def make_environment(folder: Path, **programs: str) -> subprocess.CompletedProcess[str]:
+    """Run the rule that makes `.venv`, where nothing but the shell and these programs is found."""
+    tools = folder / "bin"
+    tools.mkdir()
+    for name in ("sh", "mkdir", "cat", "chmod"):
+        (tools / name).symlink_to(shutil.which(name))
+    for name, script in programs.items():
+        (tools / name).write_text(f"#!/bin/sh\n{script}\n")
+        (tools / name).chmod(0o755)
+    command = [shutil.which("make"), "-f", ROOT / "Makefile", ".venv/bin/python", "SHELL=/bin/sh"]
+    return subprocess.run(command, cwd=folder, env={"PATH": str(tools)}, capture_output=True, text=True, check=False)
+
+
+INSTALL = """mkdir -p .venv/bin
+cat > .venv/bin/pip <<'END'
+#!/bin/sh
+echo "pip $@"
+END
+chmod +x .venv/bin/pip"""
+
+
+def test_make_says_what_is_missing(tmp_path):
+    done = make_environment(tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == (
+        "Python 3.11 is missing: install it, or uv (https://docs.astral.sh/uv), and run make again\n"
+    )
+
+
+def test_make_uses_uv_where_python_is_missing(tmp_path):
+    done = make_environment(tmp_path, uv=f'echo "uv $@"; {INSTALL}')
+    assert done.returncode == 0, done.stderr
+    first, size, torch = done.stdout.splitlines()
+    assert first == "uv venv --quiet --seed --python 3.11 .venv"
+    assert size == "installing into .venv: about 2.4 GB, of which PyTorch (cpu) 0.8 GB and Rerun 0.5 GB"
+    assert torch.endswith("--index-url https://download.pytorch.org/whl/cpu torch")
