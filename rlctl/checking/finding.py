@@ -45,8 +45,12 @@ class Rule:
 def _load() -> tuple[dict[str, str], dict[str, Rule]]:
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where PyYAML has it
     content = yaml.load(Path(__file__).with_name("rules.yaml").read_text(encoding="utf-8"), loader)  # noqa: S506
-    rules = [Rule(**{**text, "severity": Severity(text["severity"])}) for text in content["rules"]]
-    return content["families"], {rule.id: rule for rule in rules}
+    rules = {}
+    for key, texts in content["rules"].items():
+        head, _, name = key.partition(": ")
+        rule_id, severity = head.split()
+        rules[rule_id] = Rule(rule_id, name, Severity(severity), **texts)
+    return content["families"], rules
 
 
 FAMILIES, RULES = _load()
