@@ -36,6 +36,7 @@ class Budget:
 
     @property
     def seconds_left(self) -> float:
+        """How much time there is [s]."""
         return self.deadline - read_clock()
 
     @property

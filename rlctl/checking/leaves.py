@@ -33,6 +33,7 @@ class Leaf:
 
     @property
     def supported(self) -> bool:
+        """Whether rules can look into it."""
         return self.low is not None
 
 

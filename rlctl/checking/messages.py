@@ -121,10 +121,12 @@ class RecordedEpisode:
 
     @property
     def steps(self) -> int:
+        """How many steps were recorded."""
         return len(self.rewards)
 
     @property
     def has_ended(self) -> bool:
+        """Whether the environment ended it."""
         return self.ended in ENDS
 
     def at(self, step: int, **more: Any) -> dict[str, Any]:

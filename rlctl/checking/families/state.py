@@ -18,7 +18,7 @@ from rlctl.checking.attributes import (
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments import check, experiment
 from rlctl.checking.failures import EnvironmentRaised
-from rlctl.checking.families.determinism import COMPARED_STEPS, find_difference, report
+from rlctl.checking.families.determinism import COMPARED_STEPS, LATE, find_difference, report
 from rlctl.checking.families.rewards import has_succeeded
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.instance import Context, Instance
@@ -40,6 +40,8 @@ SHOWN = 0.9
 """Part of an attribute's variance that the observation explains, from which it is taken as shown there."""
 MOST_SECOND_STEPS = 1_000
 """An ordinary episode is left after so many steps: most time limits are shorter."""
+FAINT = 0.01
+"""A late difference that is smaller is a residue of a simulation, not a counter or a flag."""
 AFTER_ENDS = ("after success", "after termination", "after truncation")
 
 
@@ -173,7 +175,9 @@ def compare_after_ends(records: Records) -> Iterator[RuleFinding]:
         for episode in records.role(role):
             difference = find_difference(built, again, episode)
             if difference is not None and "raised" not in (again.ended, episode.ended):
-                yield report("RL310", records, again, difference, f"played again {_name_end(role)}")
+                is_mild = difference.step > LATE and difference.size < FAINT
+                what = f"played again {_name_end(role)}"
+                yield report("RL310", records, again, difference, what, is_mild=is_mild)
                 return
 
 
