@@ -19,9 +19,12 @@ if TYPE_CHECKING:
 
 def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
     """Return `model` and `data` of an environment that has them, None of any other."""
-    library = sys.modules.get("mujoco")
-    model, data = (getattr(env.unwrapped, name, None) for name in ("model", "data"))
-    if library is None or not isinstance(model, library.MjModel) or not isinstance(data, library.MjData):
+    library, inner = sys.modules.get("mujoco"), env.unwrapped
+    if library is None:
+        return None
+    world = getattr(inner, "sim", None) if type(getattr(inner, "sim", None)).__name__ == "MujocoSim" else inner
+    model, data = (getattr(world, name, None) for name in ("model", "data"))
+    if not isinstance(model, library.MjModel) or not isinstance(data, library.MjData):
         return None
     return model, data
 

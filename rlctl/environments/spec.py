@@ -47,6 +47,8 @@ class EnvSpec:
     """Stage of the curriculum, from 1; 0 where there is none."""
     level: Annotated[float, Ge(0), Le(1)] = 1.0
     """How far the ranges of events that widen have done so, in [0, 1]."""
+    sim: str = "pybullet"
+    """The physics engine of a task: `pybullet`, `mujoco`, or `mujoco:0.01` with the time constant of contacts [s]."""
     named_by: str = dataclasses.field(default="", compare=False)
     """The kind of file that names the task; empty where a person did. A file may name environments only."""
 
@@ -60,7 +62,7 @@ class EnvSpec:
         if is_task(constructor):
             env = self._make_task_env(constructor, render_mode)
         else:
-            for key in ("reward_weights", "randomize", "events", "level"):
+            for key in ("reward_weights", "randomize", "events", "level", "sim"):
                 if getattr(self, key) != getattr(EnvSpec(self.task), key):
                     raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
             env = self._make_plain_env(constructor, render_mode)
@@ -92,6 +94,7 @@ class EnvSpec:
                 render_mode=render_mode,
                 reward_weights=self.reward_weights,
                 events=EventSettings(self.randomize, self.events),
+                sim=self.sim,
             ),
         )
         env.set_level(self.level)

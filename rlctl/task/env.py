@@ -13,10 +13,11 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean, short_repr
+from rlctl.errors import RecipeError, TaskError, UsageError, check_name, did_you_mean, short_repr
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
 from rlctl.task.joints import Joints
+from rlctl.task.mujoco_sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_methods, check_parameters
@@ -36,6 +37,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         render_mode: Literal["human", "rgb_array"] | None = None,
         reward_weights: Mapping[str, float] | None = None,
         events: EventSettings | None = None,
+        sim: str = "pybullet",
     ) -> None:
         check_parameters(type(task))
         check_methods(type(task))
@@ -59,12 +61,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.action_space = copy.deepcopy(task.action_space)
         self._acting = ActingEvents(self.events, task.control_dt)
         self.level = self._episode_level = 1.0
-        self.sim = Sim(
-            control_dt=task.control_dt,
-            substeps=task.substeps,
-            solver_iterations=task.solver_iterations,
-            gui=render_mode == "human",
-        )
+        self.sim = _make_world(task, sim, render_mode)
         self._step = 0
         self._running = False
         self._streams: Streams = {}
@@ -240,6 +237,16 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def close(self) -> None:
         """End the simulation."""
         self.sim.close()
+
+
+def _make_world(task: Task, sim: str, render_mode: str | None) -> Sim:
+    if (solref := read_solref(sim)) is None:
+        iterations, gui = task.solver_iterations, render_mode == "human"
+        return Sim(control_dt=task.control_dt, substeps=task.substeps, solver_iterations=iterations, gui=gui)
+    if render_mode is not None:
+        raise UsageError("--sim mujoco: no pictures and no window; a recording shows it in 3-D")
+    world: Any = MujocoSim(control_dt=task.control_dt, substeps=task.substeps, solref=solref)
+    return world  # type: ignore[no-any-return]  # has the methods of Sim, or says which it has not
 
 
 def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:

@@ -1,0 +1,261 @@
+"""A body of a task's world in MuJoCo, with the methods of `Body`."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError, UsageError, check_name
+from rlctl.task.body import MassState
+from rlctl.task.joints import Joints
+from rlctl.task.motors import Motors
+
+if TYPE_CHECKING:
+    from rlctl.task.mujoco_sim import MujocoSim
+
+Array = NDArray[np.float64]
+
+_XYZW, _WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
+_FRICTION = 0.5  # PyBullet's, of a link whose file gives none
+
+
+def refuse(name: str) -> NoReturn:
+    """Raise `UsageError` for what has no equal in MuJoCo."""
+    raise UsageError(f"{name}: not in MuJoCo; this task runs in PyBullet only")
+
+
+class MujocoBody:
+    """What `Body` is, in MuJoCo."""
+
+    def __init__(self, sim: MujocoSim, name: str, file: Path, fixed: bool, base: str) -> None:
+        self._sim, self.name, self.file, self.fixed, self.base_name = sim, name, file, fixed, base
+        self.terrain = None
+        root = ElementTree.fromstring(file.read_bytes().strip())
+        self._limits = {joint.get("name"): _read_limits(joint) for joint in root.findall("joint")}
+        self.friction = {str(link.get("name")): _read_friction(link) for link in root.findall("link")}
+        """By link."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        if name not in _BOUND or self._sim.is_compiled:
+            refuse(name)
+        _ = self._sim.model  # a task may ask a body for its joints as soon as it is loaded
+        return self.__dict__[name]
+
+    def bind(self, model: Any) -> None:
+        """Look up joints, links and geoms in a compiled model."""
+        prefix = f"{self.name}/"
+        joints = [
+            joint
+            for joint in range(model.njnt)
+            if model.joint(joint).name.startswith(prefix) and int(model.jnt_type[joint]) >= 2
+        ]
+        self.joint_names = [model.joint(joint).name.removeprefix(prefix) for joint in joints]
+        self._positions, self._velocities = model.jnt_qposadr[joints].astype(int), model.jnt_dofadr[joints].astype(int)
+        limited = model.jnt_limited[joints].astype(bool)
+        self.joint_low = np.where(limited, model.jnt_range[joints, 0], -np.inf)
+        self.joint_high = np.where(limited, model.jnt_range[joints, 1], np.inf)
+        limits = [self._limits.get(name, {}) for name in self.joint_names]
+        self.joint_max_force = np.array([limit.get("effort", 0.0) for limit in limits])
+        self.joint_max_speed = np.array([limit.get("velocity", 0.0) for limit in limits])
+        names = {body: model.body(body).name for body in range(model.nbody)}
+        self.links = {name.removeprefix(prefix): body for body, name in names.items() if name.startswith(prefix)}
+        self.link_names = {body: name for name, body in self.links.items()}
+        geoms = [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in self.link_names]
+        self.geoms = {geom: self.link_names[int(model.geom_bodyid[geom])] for geom in geoms}
+        self.save()
+        if self.fixed and self.joint_max_speed.size and (self.joint_max_speed > 0).all():
+            self.cap_joint_speed(float(self.joint_max_speed.max()))
+
+    def save(self) -> None:
+        """Take the friction of now for that of the built world."""
+        self._built_friction = dict(self.friction)
+        self._strength = np.ones(len(self.joint_names))
+
+    def restore(self) -> None:
+        """Go back to the built world's friction and motor strength."""
+        self.friction = dict(self._built_friction)
+        self._strength[:] = 1.0
+
+    def find_link(self, link: str) -> int:
+        """Return MuJoCo's number of a link; raises `TaskError` for one that is not there."""
+        check_name(link, self.links, f"{self.file.name} has no link", TaskError)
+        return self.links[link]
+
+    def find_joints(self, joints: Sequence[str] = ()) -> list[int]:
+        """As `Body.find_joints`."""
+        for joint in joints:
+            check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
+        return [self.joint_names.index(joint) for joint in joints] or list(range(len(self.joint_names)))
+
+    def find_trunk(self) -> str | None:
+        """As `Body.find_trunk`, of free bodies."""
+        return None if self.fixed else self.base_name
+
+    @property
+    def joint_positions(self) -> Array:
+        """As `Body.joint_positions`."""
+        return self._sim.forward().qpos[self._positions]  # type: ignore[no-any-return]
+
+    @property
+    def joint_velocities(self) -> Array:
+        """As `Body.joint_velocities`."""
+        return self._sim.forward().qvel[self._velocities]  # type: ignore[no-any-return]
+
+    @property
+    def joint_torques(self) -> Array:
+        """As `Body.joint_torques`."""
+        return self._sim.given[self._velocities]  # type: ignore[no-any-return]
+
+    def link_position(self, link: str) -> Array:
+        """As `Body.link_position`."""
+        return self._sim.forward().xpos[self.find_link(link)].copy()  # type: ignore[no-any-return]
+
+    def link_orientation(self, link: str) -> Array:
+        """As `Body.link_orientation`."""
+        return self._sim.forward().xquat[self.find_link(link)][_XYZW]  # type: ignore[no-any-return]
+
+    def mass_state(self, link: str) -> MassState:
+        """As `Body.mass_state`, at the end of the last physics step."""
+        mujoco, data, number, velocity = self._sim.mujoco, self._sim.forward(), self.find_link(link), np.zeros(6)
+        mujoco.mj_objectVelocity(self._sim.model, data, mujoco.mjtObj.mjOBJ_BODY, number, velocity, 0)
+        # Not MuJoCo's inertial frame: its axes may be in another order than the file's.
+        frame = data.xquat[number][_XYZW]
+        return MassState(*(tuple(part.tolist()) for part in (data.xipos[number], frame, velocity[3:], velocity[:3])))
+
+    @property
+    def base_position(self) -> Array:
+        """As `Body.base_position`."""
+        return self._sim.forward().xipos[self.find_link(self.base_name)].copy()  # type: ignore[no-any-return]
+
+    @property
+    def base_orientation(self) -> Array:
+        """As `Body.base_orientation`."""
+        return self.link_orientation(self.base_name)
+
+    def links_touching(self, other: MujocoBody) -> set[str]:
+        """As `Body.links_touching`."""
+        data, touching = self._sim.forward(), set()
+        for first, second in self._sim.model.geom_bodyid[data.contact.geom].tolist() if data.ncon else ():
+            if first in self.link_names and second in other.link_names:
+                touching.add(self.link_names[first])
+            if second in self.link_names and first in other.link_names:
+                touching.add(self.link_names[second])
+        return touching
+
+    def set_base(self, position: Sequence[float], orientation: Sequence[float] = (0, 0, 0, 1)) -> None:
+        """As `Body.set_base`: `position` is that of the centre of mass."""
+        data, model, number = self._sim.touch(), self._sim.model, self.find_link(self.base_name)
+        turn, offset = np.array(orientation, float)[_WXYZ], np.zeros(3)
+        self._sim.mujoco.mju_rotVecQuat(offset, model.body_ipos[number], turn)
+        if self.fixed:
+            model.body_pos[number], model.body_quat[number] = np.array(position) - offset, turn
+            return
+        joint = model.joint(f"{self.name}/free").id
+        start, velocity = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+        data.qpos[start : start + 7] = [*(np.array(position) - offset), *turn]
+        data.qvel[velocity : velocity + 6] = 0.0
+
+    def add_velocity(self, velocity: Sequence[float]) -> None:
+        """As `Body.add_velocity`."""
+        if self.fixed:
+            return
+        start = self._sim.model.jnt_dofadr[self._sim.model.joint(f"{self.name}/free").id]
+        self._sim.touch().qvel[start : start + 3] += velocity
+
+    def set_joints(self, positions: Array, velocities: Array | None = None) -> None:
+        """As `Body.set_joints`."""
+        data = self._sim.touch()
+        data.qpos[self._positions] = positions
+        data.qvel[self._velocities] = 0.0 if velocities is None else velocities
+
+    def drive_to(
+        self,
+        positions: Array,
+        *,
+        max_speed: float | Sequence[float] | None = None,
+        max_force: float | Sequence[float] | None = None,
+        gain: float = 0.1,
+        joints: Sequence[str] = (),
+    ) -> None:
+        """As `Body.drive_to`."""
+        chosen, sim = self.find_joints(joints), self._sim
+        moved = self._velocities[chosen]
+        sim.target[moved], sim.speed[moved], sim.gain[moved] = positions, np.nan, gain
+        speeds = self.joint_max_speed[chosen] if max_speed is None else np.array(max_speed, float)
+        sim.top_speed[moved] = np.where(speeds > 0, speeds, np.inf)
+        self._set_force(chosen, max_force)
+
+    def drive_at(
+        self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()
+    ) -> None:
+        """As `Body.drive_at`."""
+        chosen, sim = self.find_joints(joints), self._sim
+        moved = self._velocities[chosen]
+        sim.target[moved], sim.speed[moved], sim.top_speed[moved] = np.nan, velocities, np.inf
+        self._set_force(chosen, max_force)
+
+    def _set_force(self, joints: list[int], max_force: float | Sequence[float] | None) -> None:
+        forces = self.joint_max_force[joints] if max_force is None else np.array(max_force, float)
+        self._sim.force[self._velocities[joints]] = forces * self._strength[joints]
+
+    def disable_motors(self, joints: Sequence[str] = ()) -> None:
+        """As `Body.disable_motors`: MuJoCo gives joints no motors."""
+
+    def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
+        """As `Body.set_torques`."""
+        chosen = self.find_joints(joints)
+        self._sim.torque[self._velocities[chosen]] = np.array(torques) * self._strength[chosen]
+
+    def cap_joint_speed(self, speed: float) -> None:
+        """As `Body.cap_joint_speed`, of the joints alone."""
+        _ = self.joint_names  # compiles
+        self._sim.velocity_cap[self._velocities] = speed
+
+    def set_friction(self, friction: float, links: Sequence[str] = ()) -> None:
+        """As `Body.set_friction`."""
+        for link in links:
+            self.find_link(link)
+        self.friction |= dict.fromkeys(links or self.friction, friction)
+        self._sim.spread_friction()
+
+    def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
+        """As `Body.scale_mass`."""
+        model, nominal = self._sim.model, self._sim.nominal
+        for number in {self.find_link(link) for link in links} or set(self.link_names):
+            for name in ("body_mass", "body_inertia"):
+                getattr(model, name)[number] = factor * nominal[name][number]
+
+    def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
+        """As `Body.scale_motor_strength`."""
+        self._strength[self.find_joints(joints)] = factor
+
+    def describe_joints(
+        self, joints: Sequence[str], *, default_positions: Sequence[float] = (), action_scale: Sequence[float] = ()
+    ) -> Joints:
+        """As `Body.describe_joints`."""
+        describe: Any = Motors.describe_joints
+        return describe(self, joints, default_positions=default_positions, action_scale=action_scale)  # type: ignore[no-any-return]
+
+
+_BOUND = (
+    "joint_names", "joint_low", "joint_high", "joint_max_force", "joint_max_speed", "links", "link_names", "geoms",
+    "_positions", "_velocities", "_strength",
+)  # fmt: skip
+
+
+def _read_limits(joint: ElementTree.Element) -> Mapping[str, float]:
+    limit = joint.find("limit")
+    return {} if limit is None else {name: float(value) for name, value in limit.attrib.items()}
+
+
+def _read_friction(link: ElementTree.Element) -> float:
+    # MuJoCo ignores PyBullet's `contact` tags.
+    friction = link.find("contact/lateral_friction")
+    return _FRICTION if friction is None else float(friction.get("value", _FRICTION))
