@@ -35,6 +35,10 @@ def evaluate(
         ),
     ] = [],
     push: Annotated[bool, typer.Option("--push", help="Find from which push on it fails.")] = False,
+    sim: Annotated[
+        str | None,
+        typer.Option(metavar="mujoco[:SOLREF]", help="Play in MuJoCo too, with soft, medium and stiff contacts."),
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a long --vary.")] = False,
     json: Json = None,
 ) -> None:
@@ -48,14 +52,14 @@ def evaluate(
     gates = Gates(min_success, min_success_lower, min_return)
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings))
-    if vary or push:
+    if vary or push or sim is not None:
         if request.baseline is not None or request.limits is not None:
             given = "--limits" if request.baseline is None else "--policy"
-            raise UsageError(f"{given} plays a task as it is: leave out --vary and --push")
+            raise UsageError(f"{given} plays a task as it is: leave out --vary, --push and --sim")
         from rlctl.evaluation import robustness_report
         from rlctl.evaluation.vary import check_gates, measure_robustness
 
-        robustness = measure_robustness(request, vary, push=push, yes=yes, gates=gates)
+        robustness = measure_robustness(request, vary, push=push, sim=sim, yes=yes, gates=gates)
         robustness_report.show(robustness, json)
         return check_gates(robustness, gates)
     if request.run is not None and request.baseline is None and is_group(folder := Path(request.run)):

@@ -76,6 +76,9 @@ def replay(
         Path | None, typer.Option(metavar="EPISODE", help="Replay a recorded episode; exit 1 unless identical.")
     ] = None,
     gui: Annotated[bool, typer.Option("--gui", help="Show it in PyBullet's window instead of recording.")] = False,
+    sim: Annotated[
+        str | None, typer.Option(metavar="mujoco[:SOLREF]", help="Play in MuJoCo instead of PyBullet.")
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="PATH", help="An .rrd file or a folder. Default: episodes/ of the run."),
@@ -100,6 +103,7 @@ def replay(
             gui=gui,
             output=output,
             video=video,
+            sim=sim,
             choice=_read_choice(worst=worst, best=best, failures=failures),
         )
     )

@@ -26,6 +26,17 @@ _WIDER = 2.0  # how much wider than its range an event is varied with `--vary al
 _FORM = "write NAME=LOWEST:HIGHEST:VALUES, for example --vary mass=0.6:1.4:9"
 
 
+SIM = "sim"
+"""The setting of the axis whose values are MuJoCo's contacts."""
+_SOLREFS = [0.02, 0.01, 0.005]  # [s], from MuJoCo's default to contacts about as stiff as PyBullet's
+
+
+def make_contact_axis(sim: str) -> Axis:
+    """Return the axis of `mujoco`, three stiffnesses of contacts, or of `mujoco:SOLREF`, that one."""
+    values = [float(sim.partition(":")[2])] if ":" in sim else _SOLREFS
+    return Axis(name="mujoco solref", setting=SIM, values=values, nominal=None)
+
+
 def read_axes(texts: Sequence[str], spec: EnvSpec) -> list[list[Axis]]:
     """Return the axes of each map that `--vary` asks for: one map, or with `all` one per event of the task.
 

@@ -26,7 +26,7 @@ class CellPlayer:
     def play(self, spec: EnvSpec, push: dict[str, object] | None = None) -> list[EpisodeResult]:
         """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`."""
         workers = self.workers
-        if spec.parameters != workers.spec.parameters:
+        if (spec.parameters, spec.sim) != (workers.spec.parameters, workers.spec.sim):
             workers.rebuild(spec)
             self._policy.give_to(workers)
         if self._has_events:

@@ -7,6 +7,7 @@ import shlex
 from typing import TYPE_CHECKING
 
 from rlctl import output
+from rlctl.evaluation.axes import SIM
 from rlctl.run.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
 
 if TYPE_CHECKING:
@@ -50,10 +51,14 @@ def format_command(result: Robustness, varied: RobustnessMap, cell: Cell) -> str
             f"events.{name}": "{}"
         }
     settings["randomize"] = "false"
+    engine = []
     for axis, value in zip(varied.axes, cell.values, strict=True):
+        if axis.setting == SIM:
+            engine = ["--sim", f"mujoco:{value:g}"]
+            continue
         settings[axis.setting] = str(int(value) if value.is_integer() else value)
     words = ["rlctl", "eval", result.policy_file, "--episodes", str(result.episodes), "--seed", str(result.seed)]
-    words += [] if result.deterministic else ["--stochastic"]
+    words += [*engine, *([] if result.deterministic else ["--stochastic"])]
     return shlex.join([*words, *(word for key, value in settings.items() for word in ("--set", f"{key}={value}"))])
 
 

@@ -29,17 +29,27 @@ ASK_ABOVE_S = 600.0
 
 
 def measure_robustness(
-    request: EvalRequest, vary: Sequence[str] = (), *, push: bool = False, yes: bool = False, gates: Gates = NO_GATES
+    request: EvalRequest,
+    vary: Sequence[str] = (),
+    *,
+    push: bool = False,
+    sim: str | None = None,
+    yes: bool = False,
+    gates: Gates = NO_GATES,
 ) -> Robustness:
     """Measure a policy in every cell of the maps that `vary` asks for, and with pushes, and keep the result in its run.
 
-    `vary` is `NAME=LOWEST:HIGHEST:VALUES`, one or two, or `all`; `yes` begins a long measurement without asking.
+    `vary` is `NAME=LOWEST:HIGHEST:VALUES`, one or two, or `all`. `sim` is `mujoco`, or `mujoco:SOLREF` with a time
+    constant of contacts [s]: the same episodes in another physics engine. `yes` begins a long measurement unasked.
     Random changes that the policy was trained with do not act, unless the request's own changes say so.
     """
     if request.changes.randomize is None:
         request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
     found, policy, spec = find_player(request)
     maps = axes_of.read_axes(vary, spec) if vary else []
+    if sim is not None:
+        dataclasses.replace(spec, sim=sim).make().close()  # raises, before anything is played, for what MuJoCo has not
+        maps.append([axes_of.make_contact_axis(sim)])
     cells = axes_of.count_cells(maps)  # raises for too many, before one is played
     with start_workers(spec, request) as workers:
         policy.give_to(workers)
@@ -91,7 +101,10 @@ def _play_map(player: CellPlayer, spec: EnvSpec, axes: list[Axis], on_cell: Call
 
 def _apply(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> EnvSpec:
     for axis, value in zip(axes, values, strict=True):
-        spec = axes_of.change(axis, value).apply(spec)
+        is_engine = axis.setting == axes_of.SIM
+        spec = (
+            dataclasses.replace(spec, sim=f"mujoco:{value:g}") if is_engine else axes_of.change(axis, value).apply(spec)
+        )
     return spec
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rlctl.environments.mujoco_model import find_mujoco, joint_name
 from rlctl.replaying.mjcf import Mesh, Shape, ShapeKind
 from rlctl.replaying.scene import BodyMotion, Env, Scene
+from rlctl.task.env import TaskEnv
 
 if TYPE_CHECKING:
     import mujoco
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _VISIBLE_GROUPS = 3  # of geoms: those that MuJoCo's viewer shows; the others are for collisions
+_GROUND_SIZE = 8.0  # [m]
 _RAIL = 100.0  # [m]; a sliding joint that is longer has no limits
 _SHORTEST_PATH = 0.3  # [m]; a trunk that moves less stays where it is
 _NO_COLOR = [0.5, 0.5, 0.5, 1.0]  # of a geom that has a material, or none
@@ -41,33 +43,40 @@ class MujocoReader:
     def __init__(self, env: Env) -> None:
         self._env = env
         self._states: list[_State] = []
-        self._goals: list[Array] = []
+        self._markers: dict[str, list[Array]] = {}
 
     def read(self, step: int) -> None:
         """Read the world after a step; 0 is the reset."""
         if step == 0:  # only now: a reset may load the model anew
-            self._states, self._goals = [], []
+            self._states, self._markers = [], {}
         self._model, data = find_mujoco(self._env)  # type: ignore[misc]
         self._states.append(_State(*(getattr(data, field.name).copy() for field in dataclasses.fields(_State))))
-        goal = getattr(self._env.unwrapped, "goal", None)
-        if isinstance(goal, np.ndarray) and goal.shape == (3,):
-            self._goals.append(goal.copy())
+        inner = self._env.unwrapped
+        if isinstance(inner, TaskEnv):
+            markers = inner.task.markers()
+        else:
+            goal = getattr(inner, "goal", None)
+            markers = {"goal": goal} if isinstance(goal, np.ndarray) and goal.shape == (3,) else {}
+        for name, position in markers.items():
+            self._markers.setdefault(name, []).append(np.array(position, np.float64))
 
     def scene(self) -> Scene:
         """Return what was read since the last reset."""
-        planes = _find_ground(self._model)
-        bodies = [_describe_ground(self._model, geom, len(self._states)) for geom in planes]
-        robot, sites = _move_bodies(self._model, self._states, planes)
-        markers = {"goal": np.stack(self._goals)} if len(self._goals) == len(self._states) else sites
-        return Scene([*bodies, robot], markers)
+        grounds = _find_ground(self._model)
+        bodies = [_describe_ground(self._model, geom, len(self._states)) for geom in grounds]
+        robot, sites = _move_bodies(self._model, self._states, grounds)
+        complete = {name: np.stack(rows) for name, rows in self._markers.items() if len(rows) == len(self._states)}
+        return Scene([*bodies, robot], complete or sites)
 
 
 def _find_ground(model: mujoco.MjModel) -> list[int]:
     import mujoco
 
-    plane = model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)  # MuJoCo 4 compares its own numbers one way only
-    fixed = (model.geom_bodyid == 0) & (model.geom_group < _VISIBLE_GROUPS)
-    return [int(geom) for geom in np.flatnonzero(plane & fixed)]
+    # MuJoCo 4 compares its own numbers one way only.
+    plane, box = (model.geom_type == int(kind) for kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
+    wide = box & (model.geom_size[:, :2].min(axis=1) > _GROUND_SIZE / 2)  # what PyBullet's plane.urdf is
+    fixed = (model.body_weldid[model.geom_bodyid] == 0) & (model.geom_group < _VISIBLE_GROUPS)
+    return [int(geom) for geom in np.flatnonzero((plane | wide) & fixed)]
 
 
 def _describe_ground(model: mujoco.MjModel, geom: int, rows: int) -> BodyMotion:
@@ -75,7 +84,7 @@ def _describe_ground(model: mujoco.MjModel, geom: int, rows: int) -> BodyMotion:
     return BodyMotion(
         name=name,
         file=Path(name),
-        ground_height=float(model.geom_pos[geom][2]),
+        ground_height=_find_height(model, geom),
         terrain=None,
         joint_names=[],
         joint_positions=np.zeros((rows, 0)),
@@ -89,12 +98,23 @@ def _describe_ground(model: mujoco.MjModel, geom: int, rows: int) -> BodyMotion:
     )
 
 
-def _move_bodies(model: mujoco.MjModel, states: list[_State], planes: list[int]) -> tuple[BodyMotion, dict[str, Array]]:
+def _find_height(model: mujoco.MjModel, geom: int) -> float:
+    import mujoco
+
+    scratch = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, scratch)
+    thickness = model.geom_size[geom][2] if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_BOX) else 0.0
+    return float(scratch.geom_xpos[geom][2] + thickness)
+
+
+def _move_bodies(
+    model: mujoco.MjModel, states: list[_State], grounds: list[int]
+) -> tuple[BodyMotion, dict[str, Array]]:
     """Return the motion of all bodies, and of the sites that are called goal or target."""
     import mujoco
 
     scratch = mujoco.MjData(model)
-    shown = [geom for geom in range(model.ngeom) if model.geom_group[geom] < _VISIBLE_GROUPS and geom not in planes]
+    shown = [geom for geom in range(model.ngeom) if model.geom_group[geom] < _VISIBLE_GROUPS and geom not in grounds]
     names = {model.site(site).name: site for site in range(model.nsite)}
     sites = {name: site for name, site in names.items() if "goal" in name or "target" in name}
     site_positions: dict[str, list[Array]] = {name: [] for name in sites}

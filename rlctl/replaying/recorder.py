@@ -80,10 +80,10 @@ def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
 
 def _make_reader(env: Env, warn: Warn) -> SceneReader | MujocoReader | Camera:
     """Return what reads the world of a task or of MuJoCo, or takes the pictures of any other environment."""
+    if find_mujoco(env):
+        return MujocoReader(env)
     inner = env.unwrapped
-    if isinstance(inner, TaskEnv):
-        return SceneReader(inner)
-    return MujocoReader(env) if find_mujoco(env) else Camera(env, warn)
+    return SceneReader(inner) if isinstance(inner, TaskEnv) else Camera(env, warn)
 
 
 class _Step(NamedTuple):

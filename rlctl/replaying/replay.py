@@ -92,6 +92,8 @@ class ReplayRequest:
     """Write a film instead of recordings."""
     choice: Choice | None = None
     """Play `episodes` fast and replay those with certain outcomes."""
+    sim: str | None = None
+    """Another physics engine: `mujoco`, or `mujoco:SOLREF`."""
 
     @property
     def shown(self) -> int:
@@ -142,6 +144,8 @@ def _check_request(request: ReplayRequest) -> None:
     recorded = request.verify or (source if _is_episode(source) else None)
     if recorded and request.checkpoint != "best":
         raise UsageError("a recorded episode is replayed as it was: leave out --checkpoint and --pretrained")
+    if recorded and request.sim is not None:
+        raise UsageError(f"--sim plays new episodes of a policy; {recorded} is a recorded one")
     if recorded and (request.task is not None or request.changes or request.episodes not in (None, 1)):
         raise UsageError("a recorded episode is replayed as it was: leave out --task, --set and --episodes")
     if recorded and (choice := request.choice) is not None:
@@ -207,6 +211,8 @@ class _Actor:
         self._policy = load_policy(self._file)
         info = self._policy.info
         self.spec: EnvSpec = found.locate(info.derive_spec(request.task, request.changes))
+        if request.sim is not None:
+            self.spec = dataclasses.replace(self.spec, sim=request.sim)
         self.name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
         self._described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
         self._chosen: dict[int, float] = {}

@@ -1,7 +1,8 @@
 """The world of a task in MuJoCo instead of PyBullet, with the same methods: does a policy depend on the engine?
 
 Models are the same URDF files, and motors are what PyBullet's are: a row of the solver that asks for a velocity with a
-bounded force. Contacts differ: they are soft, and `solref` [s] says how soft. What neither `MujocoSim` nor `MujocoBody`
+bounded force. Two things differ: contacts are soft, `solref` [s] says how soft, at least two physics
+steps; and a joint's damping acts after its motor, so that a light joint with much of it lags. What neither `MujocoSim` nor `MujocoBody`
 defines has no equal in MuJoCo, and using it raises `UsageError`.
 """
 

@@ -250,3 +250,28 @@ def test_events_set_in_a_standing_world_act_as_in_a_new_one():
     finally:
         standing.close()
         fresh.close()
+
+
+def test_the_same_episodes_in_mujoco(rlctl):
+    pytest.importorskip("mujoco")
+    done = rlctl("eval", "reach", "--pretrained", "--sim", "mujoco", "--episodes", "2", "--json", "-")
+    assert done.returncode == 0, done.stderr
+    (engine,) = json.loads(done.stdout)["maps"]
+    assert engine["axes"][0]["values"] == [0.02, 0.01, 0.005]
+    assert [cell["success_rate"] for cell in engine["cells"]] == [1.0, 1.0, 1.0]
+
+
+def test_the_worst_contacts_are_gated(rlctl):
+    pytest.importorskip("mujoco")
+    options = ("--episodes", "2", "--sim", "mujoco:0.02", "--min-success", "0.9")
+    done = rlctl("eval", "biped", "--pretrained", *options)
+    assert done.returncode == 1
+    assert "gate missed in the worst cell, mujoco solref 0.02" in done.stderr
+    assert "--sim mujoco:0.02 --set randomize=false" in done.stdout
+
+
+def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl):
+    pytest.importorskip("mujoco")
+    done = rlctl("eval", "gear-arm", "--pretrained", "--sim", "mujoco")
+    assert done.returncode == 2
+    assert done.stderr.endswith("error: connect_gear: not in MuJoCo; this task runs in PyBullet only\n")

@@ -126,3 +126,15 @@ def test_a_trunk_that_moves_is_followed():
     robot = rollout.scene.bodies[1]
     moved = float(np.ptp(robot.positions[:, 1, 0]))
     assert robot.trunk == (1 if moved >= 0.3 else None)
+
+
+def test_a_task_of_rlctl_in_mujoco():
+    spec = EnvSpec("quadruped", sim="mujoco")
+    with closing(make_drawable(spec, print)) as env:
+        zero = np.zeros(env.action_space.shape)
+        rollout = play_episode(env, spec, 3, lambda o, step: zero if step < 10 else None, policy="zero", draw=print)
+    ground, robot = rollout.scene.bodies
+    assert ground.ground_height == pytest.approx(0.0, abs=1e-9)
+    assert "robot/trunk" in robot.links
+    assert robot.shapes
+    assert robot.box[1][0] - robot.box[0][0] < 3.0  # of the robot, without its ground

@@ -1,0 +1,112 @@
+"""Worlds of tasks in MuJoCo: the same models, starts and motors as in PyBullet, and bit-exact resets."""
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import UsageError
+from rlctl.task.env import TaskEnv
+from rlctl.task.mujoco_sim import MujocoSim, read_solref
+from tests.task.tasks import Cart
+
+pytest.importorskip("mujoco")
+
+TASKS = ["reach", "reach-sparse", "quadruped", "biped", "biped-3d"]
+
+
+def play(env, steps: int = 40):
+    """Play random actions; return all observations, the reset's first."""
+    observations = [env.reset(seed=3)[0]]
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        observation, _, terminated, _, _ = env.step(rng.uniform(-1, 1, env.action_space.shape))
+        observations.append(observation)
+        if terminated:
+            break
+    return [np.concatenate([*part.values()]) if isinstance(part, dict) else part for part in observations]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_episode_starts_as_in_pybullet_and_repeats_bit_for_bit(task):
+    with closing(EnvSpec(task).make()) as env:
+        bullet = play(env, steps=0)[0]
+        joints = env.unwrapped.task.describe_joints()
+    with closing(EnvSpec(task, sim="mujoco").make()) as env:
+        first = play(env)
+        again = play(env)
+        described = env.unwrapped.task.describe_joints()
+    with closing(EnvSpec(task, sim="mujoco").make()) as env:
+        fresh = play(env)
+    np.testing.assert_allclose(first[0], bullet, atol=1e-5)
+    assert described.names == joints.names
+    assert described.max_torque == pytest.approx(joints.max_torque)
+    assert np.array_equal(first, again)
+    assert np.array_equal(first, fresh)
+
+
+@pytest.fixture
+def weightless_arm():
+    sim = MujocoSim(control_dt=1 / 60, substeps=4, solref=0.02)
+    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    sim.model.opt.gravity[:] = 0.0
+    sim.velocity_cap[:] = np.inf
+    return sim, arm
+
+
+@pytest.mark.parametrize(("max_speed", "moved"), [(1e3, 0.3439), (0.6, 0.01)])
+def test_a_position_motor_takes_the_same_part_of_the_error_away(weightless_arm, max_speed, moved):
+    sim, arm = weightless_arm
+    arm.drive_to(np.ones(7), gain=0.1, max_force=1e5, max_speed=max_speed)
+    sim.step()
+    # A tenth of 1 rad in each of 4 substeps: 1 - 0.9 ** 4; at 0.6 rad/s: 0.6 / 60. Light joints of the wrist lag.
+    assert arm.joint_positions[:4] == pytest.approx(np.full(4, moved), rel=0.03)
+
+
+def test_a_velocity_motor_and_brakes(weightless_arm):
+    sim, arm = weightless_arm
+    wanted = np.array([0.5, 0, 0, 0, 0, 0, 0])
+    arm.drive_at(wanted, max_force=1e4)
+    sim.step()
+    assert arm.joint_velocities == pytest.approx(wanted, abs=1e-3)
+
+
+def test_frictions_are_multiplied_and_restored():
+    with closing(TaskEnv(Cart(), sim="mujoco")) as env:
+        cube, plane = env.task.cube, env.task.plane
+        env.reset(seed=0)
+        (geom,) = cube.geoms
+        nominal = float(env.sim.model.geom_friction[geom, 0])
+        plane.set_friction(0.5)
+        cube.set_friction(0.8)
+        assert env.sim.model.geom_friction[geom, 0] == pytest.approx(0.4)
+        env.reset(seed=0)
+        assert env.sim.model.geom_friction[geom, 0] == pytest.approx(nominal)
+
+
+def test_events_act_in_mujoco_too():
+    masses = []
+    for events in ({}, {"mass": {"factor": (1.5, 1.5)}}):
+        with closing(EnvSpec("reach", events=events, sim="mujoco").make()) as env:
+            env.reset(seed=0)
+            masses.append(float(env.unwrapped.sim.model.body_mass.sum()))
+    assert masses[1] > 1.2 * masses[0]
+
+
+@pytest.mark.parametrize(
+    ("task", "missing"), [("gear-arm", "connect_gear"), ("peg-insert", "add_force_sensor"), ("ant", "")]
+)
+def test_what_mujoco_has_not_is_named(task, missing):
+    with pytest.raises(UsageError, match=f"^{missing}.*: not in MuJoCo; this task runs in PyBullet only"):
+        EnvSpec(task, sim="mujoco").make()
+
+
+def test_engines():
+    assert [read_solref(sim) for sim in ("pybullet", "mujoco", "mujoco:0.005")] == [None, 0.02, 0.005]
+
+
+@pytest.mark.parametrize("sim", ["mujoco:stiff", "mujoco:0", "mujoco:nan", "bullet", ""])
+def test_what_is_no_engine(sim):
+    with pytest.raises(UsageError, match="it is pybullet, mujoco, or mujoco:SOLREF"):
+        read_solref(sim)
