@@ -1,9 +1,9 @@
 """The world of a task in MuJoCo instead of PyBullet, with the same methods: does a policy depend on the engine?
 
 Models are the same URDF files, and motors are what PyBullet's are: a row of the solver that asks for a velocity with a
-bounded force. Two things differ: contacts are soft, `solref` [s] says how soft, at least two physics
-steps; and a joint's damping acts after its motor, so that a light joint with much of it lags. What neither `MujocoSim` nor `MujocoBody`
-defines has no equal in MuJoCo, and using it raises `UsageError`.
+bounded force. Two things differ: contacts are soft, `solref` [s] says how soft, at least two physics steps; and a
+joint's damping acts after its motor, so that a light joint with much of it lags. Using what neither `MujocoSim` nor
+`MujocoBody` defines, because MuJoCo has no equal, raises `UsageError`.
 """
 
 from __future__ import annotations
