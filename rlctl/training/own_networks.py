@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.preprocessing import preprocess_obs
 
-from rlctl.environments.dict_spaces import SINGLE, join, split_space
+from rlctl.environments.dict_spaces import SINGLE, join, split, split_space
 from rlctl.errors import RecipeError, describe_exception, short_repr
 from rlctl.exporting.layers import OPSET
 from rlctl.policy.file import ACTOR_CRITIC, GRAPH, Tensors
@@ -103,9 +103,8 @@ def _write_graph(actor: _Actor, model: Any) -> NDArray[np.uint8]:
 
 
 def _list_normalized(model: Any) -> list[str]:
-    from rlctl.training.snapshot import observation_statistics
-
-    return list(observation_statistics(model.get_vec_normalize_env()))
+    normalizer = model.get_vec_normalize_env()
+    return list(split(normalizer.obs_rms)) if normalizer is not None and normalizer.norm_obs else []
 
 
 def _check_features(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> None:
