@@ -21,7 +21,7 @@ from rlctl.policy.numpy_policy import load_policy
 from rlctl.policy.onnx_policy import OnnxPolicy
 from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.policy.torch_policy import ALGORITHMS, TorchPolicy, policy_name
-from rlctl.recipe.recipe import Normalize, validate
+from rlctl.recipe.recipe import NormalizeSettings, validate
 from rlctl.training.algorithms import wrap_normalize
 from rlctl.training.snapshot import pack
 from tests.training import own_nets
@@ -51,7 +51,7 @@ TINY = {
 )
 def test_it_acts_and_exports_as_torch_does(algo, observation, action, own, tmp_path):
     spec = EnvSpec(SMALL, {"observation": observation, "action": action})
-    env = wrap_normalize(DummyVecEnv([spec.make]), Normalize(), 0.99)
+    env = wrap_normalize(DummyVecEnv([spec.make]), NormalizeSettings(), 0.99)
     buffer = {} if "ppo" in algo else {"buffer_size": 10}
     kwargs = {"net_arch": [8, 8], **own, **({"lstm_hidden_size": 8} if algo == "recurrent_ppo" else {})}
     name = policy_name(algo, env.observation_space)
