@@ -40,4 +40,11 @@ RunsFolder = Annotated[Path, Option("Where run folders go.", ("--output", "-o"),
 EnvTimeout = Annotated[
     float, Option("How long a step or reset may take.", ("--env-timeout",), metavar="SECONDS", min=0.1)
 ]
+On = Annotated[
+    str | None,
+    Option("Where runs train: local, slurm, ray, ray:auto, ray:HOST:PORT.", metavar="WHERE", default_text="local"),
+]
+Cluster = Annotated[
+    Path | None, Option("Settings for slurm and ray.", ("--cluster",), metavar="FILE", default_text="cluster.yaml")
+]
 Jobs = Annotated[int | None, Option("How many train at the same time.", min=1, default_text="half as many as cores")]

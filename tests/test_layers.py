@@ -16,6 +16,7 @@ LAYERS = [
     {"__init__"},  # loads `rlctl.train` and the others on their first use
     {"pytest_plugin"},
     {"api", "gym"},
+    {"cluster"},
     {"tuning"},
     {"training"},
     {"runs"},

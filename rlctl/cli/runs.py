@@ -36,7 +36,7 @@ def list_runs(
     from rlctl.runs.listing import list_runs, show
 
     commands = [command.name for command in app.registered_commands if command.name]
-    show(list_runs(task, sort=sort, commands=commands), json)
+    show(list_runs(task, sort=sort, commands=commands, waiting=True), json)
 
 
 @app.command("show")

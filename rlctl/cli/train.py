@@ -7,7 +7,7 @@ from typing import Annotated
 
 from rlctl.cli.arguments import Json, RecipeFlags, claim_stdout, command
 from rlctl.errors import UsageError
-from rlctl.options import Jobs, Option
+from rlctl.options import Cluster, Jobs, On, Option
 from rlctl.run.train_request import TrainRequest
 
 
@@ -26,6 +26,9 @@ def train(
     request: TrainRequest,
     seeds: Annotated[str | None, Option("Train these seeds, each an ordinary run, as a group.", metavar="0-4")] = None,
     jobs: Jobs = None,
+    on: On = None,
+    cluster: Cluster = None,
+    detach: Annotated[bool, Option("Submit to SLURM and do not wait.", ("--detach",))] = False,
     json: Json = None,
 ) -> None:
     """Train a policy, evaluate as it goes, and keep the best and the last."""
@@ -36,12 +39,21 @@ def train(
     resume = request.resume if group_folder is None else str(group_folder)
     request = dataclasses.replace(request, resume=resume, settings=flags.merge())
     if seeds is not None or group_folder is not None:
+        from rlctl import output
+        from rlctl.cluster.executors import choose_executor
         from rlctl.evaluation import group
         from rlctl.training.seeds import train_seeds
+        from rlctl.training.trainings import Detached
 
-        result = train_seeds(request, seeds, jobs=jobs)
+        make_trainings = choose_executor(on, cluster, detach=detach)
+        try:
+            result = train_seeds(request, seeds, jobs=jobs, make_trainings=make_trainings)
+        except Detached as submitted:
+            return output.print_notes([str(submitted)])
         group.show(result.score, json)
         return result.check()
+    if on is not None or detach:
+        raise UsageError("--on is about several seeds: give --seeds 0-4, or --resume GROUP")
     if jobs is not None:
         raise UsageError("--jobs is about several seeds: give --seeds 0-4, or --resume GROUP")
     from rlctl.training.request import run_training

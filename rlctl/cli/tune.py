@@ -6,7 +6,7 @@ import dataclasses
 from typing import Annotated
 
 from rlctl.cli.arguments import Json, RecipeFlags, claim_stdout, command
-from rlctl.options import Jobs, Option
+from rlctl.options import Cluster, Jobs, On, Option
 from rlctl.tuning.tune_request import TuneRequest
 
 
@@ -21,11 +21,14 @@ class TuneFlags(RecipeFlags):
 
 
 @command
-def tune(flags: TuneFlags, request: TuneRequest, jobs: Jobs = None, json: Json = None) -> None:
+def tune(
+    flags: TuneFlags, request: TuneRequest, jobs: Jobs = None, on: On = None, cluster: Cluster = None, json: Json = None
+) -> None:
     """Find hyperparameters: the learning rate, then rollout and minibatch, then the discount, with Optuna."""
     claim_stdout()
+    from rlctl.cluster.executors import choose_executor
     from rlctl.tuning import report
     from rlctl.tuning.tune import tune as run_tuning
 
     request = dataclasses.replace(request, settings=flags.merge())
-    return report.show(run_tuning(request, jobs=jobs), json)
+    return report.show(run_tuning(request, jobs=jobs, make_trainings=choose_executor(on, cluster, verb="tune")), json)

@@ -15,7 +15,7 @@ from rlctl.policy.players.player import Exploration
 
 
 @dataclasses.dataclass(frozen=True)
-class Job:
+class WorkerJob:
     """What a worker is for: `count` of `total` environments, from number `first` on."""
 
     memory: int

@@ -43,7 +43,7 @@ from rlctl.task.events import Event, EventSettings, push
 class Worker:
     """A few environments and what plays them; `Build` comes before all other messages."""
 
-    def __init__(self, job: messages.Job) -> None:
+    def __init__(self, job: messages.WorkerJob) -> None:
         self._job = job
         self._episodes: list[RunningEpisode] = []
         self._player: Player | None = None
@@ -269,7 +269,7 @@ def _make_player(name: str, space: spaces.Space[Any], observation_space: spaces.
     return make_player(name, space)
 
 
-def main(connection: Connection, job: messages.Job) -> None:
+def main(connection: Connection, job: messages.WorkerJob) -> None:
     """Answer messages until the connection closes."""
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # lines are forwarded at once
     worker = Worker(job)

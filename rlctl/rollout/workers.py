@@ -66,7 +66,7 @@ class Workers:
         self._steps = 1
         self._ready = False
         memories = self._memory, self._numbers_memory
-        jobs = [{"job": messages.Job(*memories, low, high - low, n_envs)} for low, high in self._ranges]
+        jobs = [{"job": messages.WorkerJob(*memories, low, high - low, n_envs)} for low, high in self._ranges]
         try:
             self._pool = ProcessPool(
                 "rlctl.rollout.worker:main", jobs, on_output or write_stderr, self._read_progress, memories
@@ -289,7 +289,7 @@ def _info_of(answers: Mapping[int, Answer]) -> EnvInfo:
 
 
 def available_cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Return how many cores this process may use; a cluster gives a run so many by the variable `RLCTL_CORES`."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    share = os.environ.get("RLCTL_CORES", "")
+    return min(cores, max(1, int(share))) if share.isdecimal() else cores

@@ -12,7 +12,7 @@ from rlctl.environments import registry
 from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.run.directory import ROOT, RunDirectory
 from rlctl.run.lookup import describe_source_change
-from rlctl.runs.summary import RunSummary, find_runs, summarize
+from rlctl.runs.summary import RunSummary, find_runs, list_waiting, summarize
 
 _SORT_KEYS = {
     "newest": lambda run: (run.started or run.path.name, run.path.name),
@@ -29,13 +29,18 @@ _STATE_SHOWN = 44  # characters; `rlctl runs show` has the whole error
 
 
 def list_runs(
-    task: str | None = None, *, sort: str = "newest", root: Path = ROOT, commands: Iterable[str] = ()
+    task: str | None = None,
+    *,
+    sort: str = "newest",
+    root: Path = ROOT,
+    commands: Iterable[str] = (),
+    waiting: bool = False,
 ) -> list[RunSummary]:
-    """Return the runs of a task, or all, best or newest first.
+    """Return the runs of a task, or all, best or newest first; with `waiting` also those a cluster has not begun.
 
     Raises `UsageError` for a task without runs, which may be one of `commands` misspelt.
     """
-    runs = [summarize(path) for path in find_runs(root)]
+    runs = [*(summarize(path) for path in find_runs(root)), *(list_waiting(root) if waiting else ())]
     if task is not None:
         every = runs
         slug = registry.make_slug(task)
@@ -78,7 +83,7 @@ def _find_source_changes(runs: list[RunSummary]) -> dict[str, list[str]]:
 def _cells(run: RunSummary) -> list[Any]:
     from rich.text import Text
 
-    styles = {"done": "green", "running": "cyan", "failed": "red", "damaged": "red"}
+    styles = {"done": "green", "queued": "cyan", "running": "cyan", "failed": "red", "damaged": "red"}
     return [
         run.name,
         run.algo,

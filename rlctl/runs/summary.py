@@ -13,6 +13,8 @@ from typing import Any
 
 from rlctl.errors import ArtifactError
 from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
+from rlctl.run.group import find_run_of_seed
+from rlctl.run.job import list_jobs, read_job
 
 Rows = list[dict[str, float | None]]
 """Of a table, oldest first; an empty field is None."""
@@ -31,9 +33,9 @@ class RunSummary:
     algo: str = ""
     seed: int | None = None
     state: str = ""
-    """`done`, `running`, `stopped`, `failed` or `damaged`."""
+    """`done`, `queued`, `running`, `stopped`, `failed` or `damaged`."""
     reason: str = ""
-    """Why it failed or is damaged."""
+    """Why it failed or is damaged; where a cluster executes it."""
     started: str = ""
     """ISO 8601, UTC."""
     steps: int | None = None
@@ -154,10 +156,29 @@ def _state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str]:
         return "done", ""
     if state == "running":
         # A killed training could not write that it stopped; its lock went with it.
-        return ("running" if is_being_written(run.path) else "stopped"), ""
+        if is_being_written(run.path):
+            return "running", ""
+        return _remote_state(run, status) or ("stopped", "")
     if state == "interrupted":
-        return "stopped", ""
+        return _remote_state(run, status) or ("stopped", "")
     return "failed", error
+
+
+def _remote_state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str] | None:
+    """Return the state of a run that a cluster executes, or will go on with; None for others."""
+    seed = _whole(_first_number(status.get("seed")))
+    job = None if seed is None else read_job(run.path.parent, seed)
+    return None if job is None or job.state == "ended" else (job.state, job.describe())
+
+
+def list_waiting(root: Path = ROOT) -> Iterator[RunSummary]:
+    """Yield the runs that a cluster has not begun: they have no folder yet, only the one of their group."""
+    for task in _folders(root):
+        for folder in _folders(task):
+            for job in list_jobs(folder):
+                if find_run_of_seed(folder, job.seed) is None:
+                    path = folder / f"(seed {job.seed})"
+                    yield RunSummary(path, task=job.task, seed=job.seed, state=job.state, reason=job.describe())
 
 
 def _first_line(text: str) -> str:

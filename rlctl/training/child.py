@@ -8,11 +8,11 @@ from multiprocessing.connection import Connection
 from types import FrameType
 from typing import Any
 
-from rlctl.processes import error_boundary
+from rlctl.processes import error_boundary, messages
 
 
 def main(connection: Connection, request: dict[str, Any], command: Sequence[str]) -> None:
-    """Train; a byte string is sent as soon as signals stop the training. `command` is that of the parent process."""
+    """Train; a message is sent as soon as signals stop the training. `command` is that of the parent process."""
     sys.argv[:] = command
     error_boundary.prepare_streams()
     code = error_boundary.run(lambda: _train(connection, request))
@@ -25,7 +25,7 @@ def _train(connection: Connection, content: dict[str, Any]) -> int:
     from rlctl.training.signals import HandledSignals
 
     with HandledSignals(_interrupt):
-        connection.send_bytes(b"ready")
+        messages.send(connection, "ready")
         from rlctl.training.request import run_training
 
         run_training(TrainRequest.from_json(content))

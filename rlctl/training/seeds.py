@@ -15,13 +15,12 @@ from rlctl.errors import RlctlError, UsageError
 from rlctl.evaluation.group import GroupScore, as_json, evaluate_group
 from rlctl.evaluation.request import EvalRequest
 from rlctl.recipe.sources import resolve
-from rlctl.rollout.workers import available_cores
 from rlctl.run.directory import RunLock
 from rlctl.run.group import Group, create_group, parse_seeds, read_group
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.start import check_arguments, preserve_process_state
-from rlctl.training.trainings import CORES_PER_TRAINING, Trainings, choose_jobs
+from rlctl.training.trainings import MakeTrainings, Trainings, make_local_trainings
 from rlctl.training.warm_start import find_source
 
 
@@ -54,13 +53,18 @@ class SeedsResult:
 
 
 def train_seeds(
-    request: TrainRequest, seeds: str | None, *, jobs: int | None = None, episodes: int = 100
+    request: TrainRequest,
+    seeds: str | None,
+    *,
+    jobs: int | None = None,
+    episodes: int = 100,
+    make_trainings: MakeTrainings = make_local_trainings,
 ) -> SeedsResult:
     """Train a request with several seeds, or go on with the group that it resumes; then evaluate each best policy.
 
-    At most `jobs` train at a time. Seeds that are done are left as they are, and one that fails stops no other. Raises
-    `UsageError` for seeds that are none, `RecipeError` for a recipe that is wrong, and `Interrupted` after a signal,
-    when all have saved their checkpoints.
+    At most `jobs` train at a time, where `make_trainings` says. Seeds that are done are left as they are, and one that
+    fails stops no other. Raises `UsageError` for seeds that are none, `RecipeError` for a recipe that is wrong, and
+    `Interrupted` after a signal, when all have saved their checkpoints.
     """
     if seeds is not None:
         group, resume = _begin(request, seeds), TrainRequest()
@@ -68,13 +72,16 @@ def train_seeds(
         check_arguments(request)
         group, resume = read_group(Path(str(request.resume))), request
     with RunLock(group.path, "group"):
-        return _train(group, resume, jobs, episodes)
+        return _train(group, resume, jobs, episodes, make_trainings)
 
 
-def _train(group: Group, resume: TrainRequest, jobs: int | None, episodes: int) -> SeedsResult:
+def _train(
+    group: Group, resume: TrainRequest, jobs: int | None, episodes: int, make_trainings: MakeTrainings
+) -> SeedsResult:
     """Train the seeds of a group that are not done; `resume` is what is different now."""
     requests = {seed: _make_request(group, seed, resume) for seed in group.seeds if _is_waiting(group, seed, resume)}
-    trainings = Trainings(_choose_jobs(group, len(requests), jobs))
+    trainings = make_trainings(group.path, len(requests), jobs)
+    _print_start(group, len(requests), trainings)
     calls = [
         functools.partial(trainings.train, request_of_seed, functools.partial(_print_line, seed))
         for seed, request_of_seed in requests.items()
@@ -102,19 +109,14 @@ def _begin(request: TrainRequest, seeds: str) -> Group:
     return create_group(request, numbers)
 
 
-def _choose_jobs(group: Group, waiting: int, jobs: int | None) -> int:
-    cores, chosen = available_cores(), choose_jobs(jobs, waiting)
+def _print_start(group: Group, waiting: int, trainings: Trainings) -> None:
     done = len(group.seeds) - waiting
     note = f"{group.path}: {output.format_count(len(group.seeds), 'seed')}"
     if waiting:
-        note += (
-            f"{f', {done} done' if done else ''}, {chosen} at a time: a training keeps {CORES_PER_TRAINING} cores "
-            f"busy, there are {cores}; --jobs changes it"
-        )
+        note += f"{f', {done} done' if done else ''}, {trainings.describe()}"
     else:
         note += ", all done: nothing to train; -n makes them longer"
     output.print_notes([note])
-    return chosen
 
 
 def _make_request(group: Group, seed: int, resume: TrainRequest) -> TrainRequest:

@@ -1,4 +1,7 @@
-"""Trainings in processes of their own, some of them at a time, each with its share of the cores."""
+"""Trainings in processes of their own, some of them at a time: on this machine, each with its share of the cores.
+
+`rlctl.cluster` has subclasses of `Trainings` that train on other machines.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,15 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import FrameType
 from typing import TypeVar
 
 from rlctl.errors import Interrupted
-from rlctl.processes.child_process import ChildProcess
+from rlctl.processes.child_process import ChildEndedError, ChildProcess
 from rlctl.processes.printed_lines import LineReader
 from rlctl.rollout.workers import available_cores
 from rlctl.run.train_request import TrainRequest
@@ -22,7 +27,8 @@ from rlctl.training.signals import HandledSignals
 
 CORES_PER_TRAINING = 2
 """One plays while the other learns, in turn or side by side."""
-_WATCH_S = 0.5
+_WATCH_S = 0.25
+_ASK_S = 0.5
 Result = TypeVar("Result")
 
 
@@ -31,25 +37,43 @@ def choose_jobs(jobs: int | None, waiting: int) -> int:
     return min(jobs or max(1, available_cores() // CORES_PER_TRAINING), max(waiting, 1))
 
 
+class Detached(Exception):
+    """The trainings were submitted, and the driver does not wait for them."""
+
+
+NextSignal = Callable[[], int]
+"""Returns the number of a signal to pass on to a training, 0 for none; asked several times a second."""
+
+
 class Trainings:
-    """Runs calls that each `train`, some of them at a time; a signal stops them all."""
+    """Runs calls that each `train`, some of them at a time, on this machine; a signal stops them all."""
+
+    resume_options = ""
+    """What a command that resumes them has besides: ` --on slurm`."""
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
         self._places = itertools.count()
-        self._running: set[int] = set()  # by process id
+        self._signals: list[int] = []
         self.stopped_by: int | None = None
         """The signal that stops all; what has not begun then does not begin."""
 
+    def describe(self) -> str:
+        """Say where, and how many at a time, they train."""
+        return (
+            f"{self._jobs} at a time: a training keeps {CORES_PER_TRAINING} cores busy, there are {available_cores()}; "
+            "--jobs changes it"
+        )
+
     def run(self, calls: Sequence[Callable[[], Result]], to_go_on: str) -> list[Result]:
         """Return what each call returns. Raises `Interrupted` after a signal, with the command to go on with."""
-        with HandledSignals(self._pass_on), ThreadPoolExecutor(self._jobs, initializer=self._take_cores) as pool:
+        with HandledSignals(self._pass_on), ThreadPoolExecutor(self._jobs, initializer=self._prepare_thread) as pool:
             results = [future.result() for future in [pool.submit(call) for call in calls]]
         if self.stopped_by is not None:
-            raise Interrupted(f"interrupted; resume with: {to_go_on}", self.stopped_by)
+            raise Interrupted(f"interrupted; resume with: {to_go_on}{self.resume_options}", self.stopped_by)
         return results
 
-    def _take_cores(self) -> None:
+    def _prepare_thread(self) -> None:
         """Let what this thread starts use its share of the cores, from which it also takes its number of workers."""
         place = next(self._places)
         if self._jobs > 1 and hasattr(os, "sched_setaffinity"):
@@ -70,38 +94,73 @@ class Trainings:
         """
         if self.stopped_by is not None:
             return 0
-        reader = LineReader(receive)
-        child = ChildProcess(
-            "rlctl.training.child:main",
-            {"request": request.to_json(), "command": sys.argv},
-            one_thread=False,
-            stdout=reader.descriptor,
-            stderr=reader.descriptor,
-        )
-        reader.close_descriptor()
-        process = child.process
-        try:
-            with contextlib.suppress(EOFError, OSError):
-                child.connection.recv_bytes()  # until then it ignores signals
-            self._running.add(process.pid)
-            if self.stopped_by is not None:  # meanwhile
-                os.kill(process.pid, self.stopped_by)
-            while is_hopeless is not None:
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(_WATCH_S)
-                    break
-                if is_hopeless():
-                    os.kill(process.pid, signal.SIGINT)
-                    break
-            code = process.wait()
-        finally:
-            self._running.discard(process.pid)
-            child.close()
-        reader.wait()
-        return code if code >= 0 else 128 - code
+        return self._execute(request, receive, self._make_next_signal(is_hopeless))
+
+    def _execute(self, request: TrainRequest, receive: Callable[[str], None], next_signal: NextSignal) -> int:
+        return train_in_child(request, receive, next_signal)
+
+    def _make_next_signal(self, is_hopeless: Callable[[], bool] | None) -> NextSignal:
+        passed_on, asked_s, hopeless = 0, 0.0, False
+
+        def next_signal() -> int:
+            nonlocal passed_on, asked_s, hopeless
+            if passed_on < len(self._signals):
+                passed_on += 1
+                return self._signals[passed_on - 1]
+            if is_hopeless is not None and not hopeless and time.monotonic() - asked_s > _ASK_S:
+                asked_s, hopeless = time.monotonic(), is_hopeless()
+                return signal.SIGINT if hopeless else 0
+            return 0
+
+        return next_signal
 
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
         self.stopped_by = self.stopped_by or number
-        for process in list(self._running):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process, number)
+        self._signals.append(number)
+
+
+MakeTrainings = Callable[[Path, int, int | None], Trainings]
+"""Takes the folder of the runs, how many are to be trained, and how many at a time if the user says it."""
+
+
+def make_local_trainings(folder: Path, waiting: int, jobs: int | None) -> Trainings:
+    """Return trainings on this machine."""
+    return Trainings(choose_jobs(jobs, waiting))
+
+
+def train_in_child(
+    request: TrainRequest,
+    receive: Callable[[str], None],
+    next_signal: NextSignal,
+    *,
+    command: Sequence[str] | None = None,
+    env: Mapping[str, str] | None = None,
+) -> int:
+    """Train in a process that ends with this one; return its exit code, which is 128 + N after signal N.
+
+    `receive` gets the lines that it prints. Any exception from `next_signal` kills it and is raised.
+    """
+    reader = LineReader(receive)
+    child = ChildProcess(
+        "rlctl.training.child:main",
+        {"request": request.to_json(), "command": list(sys.argv if command is None else command)},
+        one_thread=False,
+        stdout=reader.descriptor,
+        stderr=reader.descriptor,
+        env=env or {},
+    )
+    reader.close_descriptor()
+    try:
+        with contextlib.suppress(ChildEndedError):
+            child.receive()  # until then it ignores signals
+        while True:
+            if number := next_signal():
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(child.process.pid, number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                code = child.process.wait(_WATCH_S)
+                break
+    finally:
+        child.close()
+    reader.wait()
+    return code if code >= 0 else 128 - code

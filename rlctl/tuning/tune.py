@@ -20,7 +20,7 @@ from rlctl.recipe.recipe import Recipe
 from rlctl.recipe.sources import find_config, resolve_with_stages
 from rlctl.run.directory import RunLock, create_group_folder
 from rlctl.training.start import preserve_process_state
-from rlctl.training.trainings import Trainings, choose_jobs
+from rlctl.training.trainings import MakeTrainings, make_local_trainings
 from rlctl.tuning.space import Dimension, fill_parameters, list_usual_steps, nest, parse_search
 from rlctl.tuning.tune_request import TuneRequest
 from rlctl.tuning.tuning import Trial, Tuning, load
@@ -30,7 +30,9 @@ _EVALUATIONS = 10
 _OF_THE_RETURN = ("task", "reward_weights", "events", "randomize")
 
 
-def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
+def tune(
+    request: TuneRequest, *, jobs: int | None = None, make_trainings: MakeTrainings = make_local_trainings
+) -> Tuning:
     """Search hyperparameters, or resume a tuning, whose interrupted trials are resumed; return every trial.
 
     Raises `UsageError` without optuna, or for a search that is none; `RecipeError` for values that a recipe cannot
@@ -42,7 +44,7 @@ def tune(request: TuneRequest, *, jobs: int | None = None) -> Tuning:
     # It is read before a lock is written into a folder that is none, and again by the holder of the lock.
     tuning = _begin(request, request.task or "") if request.resume is None else load(request.resume)
     with RunLock(tuning.path, "tuning"):
-        return _search(load(tuning.path), jobs)
+        return _search(load(tuning.path), jobs, make_trainings)
 
 
 def _begin(request: TuneRequest, task: str) -> Tuning:
@@ -109,26 +111,27 @@ def _evaluate_often_enough(recipe: Recipe, settings: Mapping[str, Any]) -> dict[
     return merge(settings, {"eval": {"every_steps": max(1, recipe.total_timesteps // _EVALUATIONS)}})
 
 
-def _search(tuning: Tuning, jobs: int | None) -> Tuning:
+def _search(tuning: Tuning, jobs: int | None, make_trainings: MakeTrainings) -> Tuning:
     # It imports optuna, which may not be there.
     from rlctl.tuning.search import StepSearch, train
 
     to_go_on = f"rlctl tune --resume {shlex.quote(str(tuning.path))}"
     with preserve_process_state():
         recipe = resolve_with_stages(tuning.task, tuning.config, tuning.settings)
-    output.print_notes([_describe(tuning, recipe, jobs), *_warn_of_long_rollouts(recipe)])
+    trainings = make_trainings(tuning.path, tuning.trials_per_step, jobs)
+    output.print_notes([_describe(tuning, recipe, trainings.describe()), *_warn_of_long_rollouts(recipe)])
     if not tuning.trials:
         tuning.trials.append(Trial(0, 0, {}))
     first = tuning.trials[0]
     if first.state in ("begun", "failed"):
-        trainings = Trainings(1)
+        trainings = make_trainings(tuning.path, 1, 1)
         trainings.run([lambda: train(tuning, first, trainings)], to_go_on)
         tuning.save()
         if first.score is None:
             raise TaskError(f"{tuning.path}: the recipe as it is failed: {first.problem}\nto try again: {to_go_on}")
     content = recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
     for number in range(1, len(tuning.steps) + 1):
-        trainings = Trainings(choose_jobs(jobs, tuning.trials_per_step))
+        trainings = make_trainings(tuning.path, tuning.trials_per_step, jobs)
         step = StepSearch(tuning, number, content, trainings)
         trainings.run([step.run_next] * step.count_waiting(), to_go_on)
     return tuning
@@ -145,11 +148,10 @@ def _warn_of_long_rollouts(recipe: Recipe) -> list[str]:
     ]
 
 
-def _describe(tuning: Tuning, recipe: Recipe, jobs: int | None) -> str:
+def _describe(tuning: Tuning, recipe: Recipe, where: str) -> str:
     names = "; then ".join(" and ".join(dimension.name for dimension in step) for step in tuning.steps)
-    at_a_time = choose_jobs(jobs, tuning.trials_per_step)
     return (
         f"{tuning.path}: {names}; at most {output.format_count(tuning.trials_per_step, 'trial')} "
-        f"{'each, ' if len(tuning.steps) > 1 else ''}of {recipe.total_timesteps:,} steps, {at_a_time} at a time; "
-        "-n makes them shorter, --trials fewer, --jobs more at a time"
+        f"{'each, ' if len(tuning.steps) > 1 else ''}of {recipe.total_timesteps:,} steps, {where}; "
+        "-n makes them shorter, --trials fewer"
     )

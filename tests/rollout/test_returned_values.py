@@ -6,7 +6,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.processes.child_process import anonymous_file
 from rlctl.processes.pool import WorkerException
 from rlctl.rollout.failures import FailedInEpisode, describe_failure, format_hint
-from rlctl.rollout.messages import Attach, Build, Job, LoadPolicy, Play
+from rlctl.rollout.messages import Attach, Build, LoadPolicy, Play, WorkerJob
 from rlctl.rollout.worker import Worker
 from tests.training import faulty_envs
 
@@ -15,7 +15,7 @@ ENVS = faulty_envs.__file__
 
 def failure(env, **parameters):
     """Return what a worker reports of the episode of seed 7."""
-    worker = Worker(Job(anonymous_file(), -1, 0, 1, 1))
+    worker = Worker(WorkerJob(anonymous_file(), -1, 0, 1, 1))
     worker.answer(Build(EnvSpec(f"{ENVS}:{env}", parameters)))
     worker.answer(Attach(10))
     worker.answer(LoadPolicy(other="zero"))

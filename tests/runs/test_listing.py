@@ -10,6 +10,8 @@ import time
 import pytest
 
 from rlctl.errors import UsageError
+from rlctl.run.directory import RunDirectory
+from rlctl.run.job import JOBS, Job, write_job
 from rlctl.runs.listing import format_changes, list_runs
 from rlctl.runs.summary import summarize
 
@@ -25,6 +27,22 @@ def test_states(write_run, hold_lock):
     texts = [summarize(path).state_text for path in (done, running, killed, stopped, failed)]
     assert texts[:2] == ["done", "running"]
     assert texts[2:] == ["stopped at step 1,000", "stopped at step 1,024", "failed: task 'reach': it broke"]
+
+
+def test_runs_that_a_cluster_executes(tmp_path):
+    group = tmp_path / "runs/reach/2026-01-01_00-00-00_seeds"
+    (group / JOBS).mkdir(parents=True)
+    (group / "group.json").write_text("{}")
+    run = RunDirectory(group / "2026-01-01_00-00-01_s0")
+    run.path.mkdir()
+    run.write_status({"task": "reach", "seed": 0, "status": "running"})
+    write_job(group, Job(0, "reach", "running", "slurm 12_0", "node7", 2))
+    write_job(group, Job(1, "reach", "queued", "slurm 12_1"))
+    texts = {run.seed: run.state_text for run in list_runs(root=tmp_path / "runs", waiting=True)}
+    assert texts == {0: "running: on node7 as slurm 12_0, attempt 2", 1: "queued: as slurm 12_1"}
+    assert [run.seed for run in list_runs(root=tmp_path / "runs")] == [0]
+    write_job(group, Job(0, "reach", "ended", "slurm 12_0", "node7", 2, 0))
+    assert summarize(run.path).state == "stopped"
 
 
 def test_best_is_by_success_then_return(write_run):

@@ -1,0 +1,64 @@
+"""What SLURM starts on a node, `python -m rlctl.cluster.node WORKS INDEX`: executes one work of an array.
+
+Ends with 143 if the job is to be requeued, and with the exit code of the training otherwise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import platform
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from rlctl.cluster.slurm import STOP_FILE
+from rlctl.cluster.work import PREEMPTED, TAKEN, Work, execute, from_json
+from rlctl.run.job import Job, job_file, read_job, write_job
+from rlctl.run.train_request import TrainRequest
+from rlctl.storage import files
+from rlctl.training.signals import HandledSignals
+from rlctl.training.trainings import NextSignal, Trainings
+
+
+class _NodeTrainings(Trainings):
+    """The one training of this node; signals of SLURM are passed on to it."""
+
+    def __init__(self, work: Work) -> None:
+        super().__init__(1)
+        self._work = work
+
+    def train_work(self, receive: Callable[[str], None]) -> int:
+        """Execute the work; return its exit code."""
+        stop = self._work.folder / STOP_FILE
+        with HandledSignals(self._pass_on):
+            code = self.train(TrainRequest.from_json(self._work.request), receive, stop.exists)
+        return code if self.stopped_by is None or code else PREEMPTED  # stopped before it began
+
+    def _execute(self, request: TrainRequest, receive: Callable[[str], None], next_signal: NextSignal) -> int:
+        return execute(self._work, receive, next_signal)
+
+
+def run(works: Path, index: int) -> int:
+    """Execute the work of an index, and write down how it goes; return the exit code for SLURM."""
+    work = from_json(files.read_json(works)[index])
+    folder = work.folder
+    before = read_job(folder, work.seed)
+    place = f"slurm {os.environ.get('SLURM_ARRAY_JOB_ID', '?')}_{index}"
+    attempts = before.attempts + 1 if before is not None and before.place == place else 1
+    job = Job(work.seed, work.task, "running", place, platform.node(), attempts)
+    write_job(folder, job)
+    with job_file(folder, work.seed, "log").open("a", buffering=1, encoding="utf-8") as log:
+        code = _NodeTrainings(work).train_work(lambda line: print(line, file=log))
+        is_retried = code in (PREEMPTED, TAKEN) and not (folder / STOP_FILE).exists()
+        if is_retried and attempts > work.settings["retries"]:
+            print(f"error: given up after {attempts} attempts: raise retries in cluster.yaml", file=log)
+            is_retried = False
+    write_job(
+        folder, dataclasses.replace(job, state="queued" if is_retried else "ended", code=None if is_retried else code)
+    )
+    return PREEMPTED if is_retried else code
+
+
+if __name__ == "__main__":
+    sys.exit(run(Path(sys.argv[1]), int(sys.argv[2])))

@@ -1,0 +1,204 @@
+"""Trainings as an array of SLURM jobs: a script for `sbatch`, a small file per seed that tells the driver of it.
+
+A node starts or resumes a run (`rlctl.cluster.node`). One that is preempted, out of time or warned saves a checkpoint
+and ends with 143, which the script turns into a requeue. The array does not need the driver: it goes on without it, and
+a driver that comes back follows it again.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import TypeVar
+
+from rlctl import output
+from rlctl.cluster.settings import ClusterSettings
+from rlctl.cluster.work import TAKEN, Work, make_work, mark_shared_folder, to_json
+from rlctl.errors import TaskError, UsageError
+from rlctl.run.job import JOBS, Job, job_file, list_jobs, read_job, write_job
+from rlctl.run.train_request import TrainRequest
+from rlctl.storage import files
+from rlctl.training.trainings import Detached, NextSignal, Trainings
+
+STOP_FILE = f"{JOBS}/stop"
+"""Nodes stop their training, with a checkpoint, when it is there."""
+_POLL_S = 0.5
+_ASK_QUEUE_S = 15.0
+_SCRIPT = """\
+#!/bin/bash
+#SBATCH --job-name={name} --array={array} --requeue --open-mode=append
+#SBATCH --ntasks=1 --cpus-per-task={cpus} --output={output}
+#SBATCH --signal=USR1@60
+trap : TERM USR1 USR2  # the step gets them too, saves a checkpoint and ends with 143
+cd {cwd} || exit 5
+{setup}
+srun --ntasks=1 {python} -m rlctl.cluster.node {works} "$SLURM_ARRAY_TASK_ID"
+code=$?
+case $code in  # saved, or ended by a signal before it began
+  138|140|143) scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID" && sleep 60 ;;
+esac
+exit $code
+"""
+Result = TypeVar("Result")
+
+
+class SlurmTrainings(Trainings):
+    """Trains all at once in one array of jobs. `run` raises `Detached` with `detach`."""
+
+    resume_options = " --on slurm"
+
+    def __init__(self, folder: Path, waiting: int, settings: ClusterSettings, *, detach: bool = False) -> None:
+        super().__init__(max(waiting, 1))
+        self._folder, self._settings, self._detach = folder, settings, detach
+        self._token = mark_shared_folder(folder)
+        files.remove(folder / STOP_FILE)
+        self._works: list[Work] = []
+        self._ready = threading.Barrier(self._jobs, action=self._submit)
+        self._queue_lock = threading.Lock()
+        self._queue_s, self._queue = 0.0, ""
+        self._queue = self._ask_queue()
+
+    def describe(self) -> str:
+        """Say where they train."""
+        return f"on SLURM, {output.format_count(self._settings.cpus, 'core')} each"
+
+    def _prepare_thread(self) -> None:
+        """The driver only waits."""
+
+    def _execute(self, request: TrainRequest, receive: Callable[[str], None], next_signal: NextSignal) -> int:
+        try:
+            work = make_work(request, self._token, self._settings)
+            log = job_file(self._folder, work.seed, "log")
+            known = read_job(self._folder, work.seed)
+            if known is None or known.state == "ended" or not self._is_queued(known):
+                self._works.append(work)
+                files.remove(log)
+            self._ready.wait()
+        except threading.BrokenBarrierError:  # another one could not be submitted, or a signal stops all
+            return TAKEN if self.stopped_by is None else 128 + self.stopped_by
+        except BaseException:
+            self._ready.abort()
+            raise
+        if self._detach:
+            return 0
+        return self._follow(work.seed, log, receive, next_signal)
+
+    def run(self, calls: Sequence[Callable[[], Result]], to_go_on: str) -> list[Result]:
+        """Return what each call returns; raises `Detached` once all are submitted, if nobody waits for them."""
+        results = super().run(calls, to_go_on)
+        if self._detach and calls:
+            raise Detached(f"submitted to SLURM; to come back: {to_go_on}{self.resume_options}")
+        return results
+
+    def _pass_on(self, number: int, frame: FrameType | None) -> None:
+        super()._pass_on(number, frame)
+        self._ready.abort()
+
+    def _submit(self) -> None:
+        """Submit the works, once all of them are known."""
+        if not self._works:
+            return
+        self._works.sort(key=lambda work: work.seed)
+        folder = self._folder
+        works = folder / JOBS / f"array-{uuid.uuid4().hex[:8]}.json"
+        files.write_json(works, [to_json(work) for work in self._works])
+        script = works.with_suffix(".sbatch")
+        files.write_text(script, self._write_script(works))
+        command = ["sbatch", "--parsable", *self._settings.sbatch, str(script)]
+        number = _call(command).strip().partition(";")[0]
+        for index, work in enumerate(self._works):
+            write_job(folder, Job(work.seed, work.task, "queued", f"slurm {number}_{index}"))
+        with self._queue_lock:
+            self._queue_s, self._queue = time.monotonic(), ""  # which does not list them yet
+
+    def _write_script(self, works: Path) -> str:
+        return _SCRIPT.format(
+            name=f"rlctl-{self._folder.name}",
+            array=f"0-{len(self._works) - 1}",
+            cpus=self._settings.cpus,
+            output=shlex.quote(f"{os.path.abspath(self._folder / JOBS)}/slurm-%a.out"),
+            cwd=shlex.quote(os.getcwd()),
+            setup="\n".join(self._settings.setup),
+            python=shlex.quote(sys.executable),
+            works=shlex.quote(os.path.abspath(works)),
+        )
+
+    def _follow(self, seed: int, log: Path, receive: Callable[[str], None], next_signal: NextSignal) -> int:
+        """Pass on what a node writes until its job has ended; return the exit code."""
+        position = 0
+        while True:
+            time.sleep(_POLL_S)
+            job = read_job(self._folder, seed)
+            position = _pass_on_lines(log, position, receive)
+            if job is not None and job.state == "ended" and job.code is not None:
+                return job.code
+            if next_signal():
+                files.write_text(self._folder / STOP_FILE, "")
+                self._cancel_waiting()
+            if job is None or not self._is_queued(job):
+                job = read_job(self._folder, seed)  # it may have ended meanwhile
+                if job is not None and job.code is not None:
+                    continue
+                if self.stopped_by is None:
+                    place = job.place if job else "its job"
+                    receive(f"error: {place} is gone from SLURM without a result; see {self._folder / JOBS}")
+                return TAKEN if self.stopped_by is None else 128 + self.stopped_by
+
+    def _cancel_waiting(self) -> None:
+        """Take out of SLURM's queue what has not begun."""
+        for job in list_jobs(self._folder):
+            if job.state == "queued":
+                subprocess.run(["scancel", "--state=PENDING", job.place.partition(" ")[2]], check=False)
+
+    def _is_queued(self, job: Job) -> bool:
+        """Say whether SLURM has a job still; asked four times a minute."""
+        with self._queue_lock:
+            if time.monotonic() - self._queue_s > _ASK_QUEUE_S or self.stopped_by is not None:
+                self._queue = self._ask_queue()
+                self._queue_s = time.monotonic()
+            elif not self._queue:
+                return True
+            return job.place.partition(" ")[2] in self._queue.split()
+
+    def _ask_queue(self) -> str:
+        command = ["squeue", "--noheader", "--array", "--format=%i", "--user", str(os.getuid())]
+        return _call(command) or "-"
+
+
+def _pass_on_lines(log: Path, position: int, receive: Callable[[str], None]) -> int:
+    """Hand the lines of a file behind a position to `receive`; return the next position."""
+    try:
+        with log.open("rb") as file:
+            file.seek(position)
+            content = file.read()
+    except OSError:
+        return position
+    whole = content[: content.rfind(b"\n") + 1]
+    for line in whole.decode(errors="replace").splitlines():
+        receive(line)
+    return position + len(whole)
+
+
+def _call(command: list[str]) -> str:
+    """Run a command of SLURM; return what it prints. Raises `UsageError` without SLURM, `TaskError` if it fails."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    except FileNotFoundError:
+        raise UsageError(
+            f"--on slurm: there is no {command[0]} on this machine: use a login node of the cluster"
+        ) from None
+    except subprocess.TimeoutExpired:
+        raise TaskError(f"--on slurm: {command[0]} did not answer within 60 s") from None
+    if done.returncode:
+        raise TaskError(
+            f"--on slurm: {command[0]} failed: {(done.stderr or done.stdout).strip().partition(chr(10))[0]}"
+        )
+    return done.stdout

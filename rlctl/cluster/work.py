@@ -1,0 +1,155 @@
+"""The unit of work of a cluster: a training that owns one run folder, as JSON, and executing it on a node.
+
+Whether it begins or resumes is decided on the node, when it starts there: a retry is a resume.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import platform
+import sys
+import uuid
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rlctl.cluster.settings import ClusterSettings
+from rlctl.environments.task_version import identify_task
+from rlctl.errors import ArtifactError, RlctlError
+from rlctl.run.directory import RunDirectory
+from rlctl.run.group import find_run_of_seed
+from rlctl.run.job import JOBS, list_jobs
+from rlctl.run.lookup import locate_task
+from rlctl.run.train_request import TrainRequest
+from rlctl.storage import files
+from rlctl.training.trainings import NextSignal, train_in_child
+from rlctl.version import collect_versions
+
+PREEMPTED, TAKEN = 143, 75
+"""The exit codes after which a training is tried again: terminated by its cluster; another process writes the run."""
+_TOKEN_FILE = f"{JOBS}/driver"
+"""Written by the driver; a node that reads another content has another folder mounted."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """What a node needs to know to execute a training."""
+
+    seed: int
+    task: str
+    request: dict[str, Any]
+    """A `TrainRequest` as JSON."""
+    root: str
+    """The folder of the group or tuning, absolute."""
+    cwd: str
+    """The driver's current folder; the task's path and the run's record are relative to it."""
+    command: list[str]
+    """The driver's command, for the run's record."""
+    token: str
+    """The content of the driver's file in the shared folder."""
+    versions: dict[str, str]
+    source_sha256: str | None
+    """Of the task's file, as the driver sees it."""
+    settings: dict[str, Any]
+    """`ClusterSettings`."""
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the group or tuning."""
+        return Path(self.root)
+
+
+def make_work(request: TrainRequest, token: str, settings: ClusterSettings) -> Work:
+    """Return the work of a request for a run in a group."""
+    run = RunDirectory(Path(request.resume)) if request.resume is not None else None
+    seed = int(run.recipe().seed if run is not None else request.settings["seed"])
+    task = locate_task(run.status()["task"], run) if run is not None else str(request.task)
+    return Work(
+        seed=seed,
+        task=task,
+        request=request.to_json(),
+        root=os.path.abspath(request.root),
+        cwd=os.getcwd(),
+        command=sys.argv,
+        token=token,
+        versions=collect_versions(),
+        source_sha256=identify_task(task)["source_sha256"],
+        settings=settings.model_dump(),
+    )
+
+
+def mark_shared_folder(folder: Path) -> str:
+    """Write a token into the folder of a group, by which nodes recognise it; return the token."""
+    file = folder / _TOKEN_FILE
+    (folder / JOBS).mkdir(exist_ok=True)
+    if file.is_file() and any(list_jobs(folder)):  # they know the token of before
+        return file.read_text(encoding="utf-8")
+    files.write_text(file, token := uuid.uuid4().hex)
+    return token
+
+
+def execute(work: Work, receive: Callable[[str], None], next_signal: NextSignal) -> int:
+    """Train on this machine, after a look at its folder and its versions; return the exit code.
+
+    `receive` gets the lines that the training prints, and an error's text. Any exception from `next_signal` kills the
+    training and is raised.
+    """
+    try:
+        _enter_folder(work)
+        for warning in _compare_versions(work):
+            receive(warning)
+        request = _bind(work)
+    except RlctlError as error:
+        receive(f"error: {error}")
+        return error.exit_code
+    env = {"RLCTL_CORES": str(work.settings["cpus"])}
+    return train_in_child(request, receive, next_signal, command=work.command, env=env)
+
+
+def _enter_folder(work: Work) -> None:
+    """Go to the driver's folder. Raises `ArtifactError` where that, or the group's, is not the driver's here."""
+    try:
+        os.chdir(work.cwd)
+        is_same = (work.folder / _TOKEN_FILE).read_text() == work.token
+    except OSError:
+        is_same = False
+    if not is_same:
+        raise ArtifactError(
+            f"{platform.node()}: {work.root}: this node has another folder there, or none; "
+            "share the folder of the runs, and the current one, at the same paths"
+        )
+
+
+def _compare_versions(work: Work) -> list[str]:
+    """Return a warning for other versions of libraries. Raises `ArtifactError` for another rlctl or task."""
+    here, node = collect_versions(), platform.node()
+    if here["rlctl"] != work.versions["rlctl"]:
+        versions = here["rlctl"], work.versions["rlctl"]
+        raise ArtifactError("{}: rlctl {}, and {} on the driver: install the same version".format(node, *versions))
+    if identify_task(work.task)["source_sha256"] != work.source_sha256:
+        raise ArtifactError(f"{node}: the file of task {work.task!r} is not the driver's: install the same version")
+    return [
+        f"warning: not bit-equal: {name} {version} on the driver, {here.get(name, 'none')} on {node}"
+        for name, version in work.versions.items()
+        if here.get(name) != version
+    ]
+
+
+def _bind(work: Work) -> TrainRequest:
+    """Return the request, or one that resumes the run that an earlier attempt began."""
+    request = TrainRequest.from_json(work.request)
+    run = find_run_of_seed(work.folder, work.seed) if request.resume is None else None
+    if run is None:
+        return request
+    return dataclasses.replace(request, task=None, config=None, initial_policy=None, resume=str(run.path), settings={})
+
+
+def to_json(work: Work) -> dict[str, Any]:
+    """Return a work as what JSON can hold."""
+    return dataclasses.asdict(work)
+
+
+def from_json(content: Mapping[str, Any]) -> Work:
+    """Return the work of `to_json`."""
+    return Work(**content)

@@ -1,0 +1,120 @@
+"""Arrays of jobs on a fake SLURM: requeue, resume, retries, a driver that comes back, and what it says of errors."""
+
+import dataclasses
+import signal
+import threading
+import time
+
+import pytest
+
+from rlctl.cluster.executors import choose_executor
+from rlctl.errors import TaskError, UsageError
+from rlctl.run.group import read_group
+from rlctl.run.job import list_jobs, read_job
+from rlctl.run.train_request import TrainRequest
+from rlctl.training.request import run_training as train_run
+from rlctl.training.seeds import train_seeds
+from rlctl.training.trainings import Detached
+from tests.cluster import fake_slurm
+from tests.training.comparing import assert_same_run
+
+LONG = {"total_timesteps": 6400}
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not (result := condition()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return result
+
+
+@pytest.fixture
+def train(request_of_line, slurm):
+    def run(seeds, settings=None, **options):
+        request = dataclasses.replace(request_of_line, settings={**request_of_line.settings, **(settings or {})})
+        return train_seeds(request, seeds, episodes=2, make_trainings=choose_executor("slurm", **options))
+
+    return run
+
+
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGUSR1])
+def test_a_preempted_job_is_requeued_and_its_run_is_equal_to_a_local_one(
+    train, request_of_line, slurm, tmp_path, capsys, number
+):
+    (tmp_path / "cluster.yaml").write_text("cpus: 1\nsbatch: [--time=1:00:00]\nsetup: [export SET_UP=1]\n")
+    done = []
+    thread = threading.Thread(target=lambda: done.append(train("3", LONG)))
+    thread.start()
+    wait_for(lambda: list(tmp_path.glob("runs/Line/*_seeds/*_s3/checkpoints/0*")))
+    fake_slurm.preempt(slurm, "1_0", number)
+    local = train_run(dataclasses.replace(request_of_line, settings={**request_of_line.settings, **LONG, "seed": 3}))
+    thread.join(120)
+    (result,) = done
+    assert result.failed == {}
+    job = read_job(result.score.group.path, 3)
+    assert (job.state, job.code, job.attempts, job.place) == ("ended", 0, 2, "slurm 1_0")
+    run = result.score.group.find_run(3)
+    assert run.status()["resumed_at_step"] > 0
+    assert_same_run(run, local.run)
+    stderr = capsys.readouterr().err
+    assert "1 seed, on SLURM, 1 core each" in stderr
+    assert "seed 3: error: interrupted at step " in stderr
+    assert "--time=1:00:00" in (slurm / "1.submitted").read_text()
+
+
+@pytest.mark.slow
+def test_a_seed_is_given_up_after_retries_and_the_others_are_kept(train, slurm, tmp_path):
+    (tmp_path / "cluster.yaml").write_text("retries: 0\n")
+    done = []
+    thread = threading.Thread(target=lambda: done.append(train("0-1", LONG)))
+    thread.start()
+    wait_for(lambda: list(tmp_path.glob("runs/Line/*_seeds/*_s0/checkpoints/0*")))
+    fake_slurm.preempt(slurm, "1_0")
+    thread.join(120)
+    (result,) = done
+    assert result.failed == {0: 143}
+    assert result.score.group.is_done(1)
+
+
+@pytest.mark.slow
+def test_a_group_goes_on_without_its_driver_which_finds_it_again(train, slurm, tmp_path):
+    with pytest.raises(Detached, match=r"submitted to SLURM; to come back: rlctl train --resume \S+ --on slurm"):
+        train("0", LONG, detach=True)
+    (folder,) = tmp_path.glob("runs/Line/*_seeds")
+    assert {job.state for job in list_jobs(folder)} <= {"queued", "running"}
+    request = TrainRequest(resume=str(folder), root=tmp_path / "runs")
+    result = train_seeds(request, None, episodes=2, make_trainings=choose_executor("slurm"))
+    assert result.failed == {}
+    assert len(list(slurm.glob("*.submitted"))) == 1
+    assert read_group(folder).is_done(0)
+
+
+def test_a_folder_that_is_not_shared_is_named_and_not_tried_again(train, slurm, tmp_path, capsys):
+    (tmp_path / "cluster.yaml").write_text(f"setup: ['rm {tmp_path}/runs/Line/*_seeds/.jobs/driver']\n")
+    result = train("0")
+    assert result.failed == {0: 5}
+    assert "this node has another folder there, or none" in capsys.readouterr().err
+    assert read_job(result.score.group.path, 0).attempts == 1
+
+
+def test_errors_of_slurm(train, slurm, tmp_path, monkeypatch):
+    (tmp_path / "cluster.yaml").write_text("sbatch: [--refuse]\n")
+    with pytest.raises(TaskError, match="--on slurm: sbatch failed: sbatch: error: Batch job submission failed"):
+        train("0-1")
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(UsageError, match="there is no squeue on this machine: use a login node"):
+        train("0-1")
+
+
+@pytest.mark.parametrize(
+    ("on", "options", "message"),
+    [
+        ("sge", {}, "--on sge: give local, slurm, ray, ray:auto or ray:HOST:PORT"),
+        ("local", {"detach": True}, "--detach is for --on slurm"),
+        ("slurm", {"verb": "tune"}, "tune --on slurm: trials follow from each other"),
+    ],
+)
+def test_executors_that_do_not_exist(on, options, message):
+    with pytest.raises(UsageError, match=message):
+        choose_executor(on, **options)
