@@ -179,3 +179,34 @@ def test_environments_come_without_learning_libraries():
         "from rlctl.deploy import SafetyFilter",
     )
     assert {line: modules & TORCH for line, modules in loaded.items() if modules & TORCH} == {}
+
+
+def is_public_definition(node: ast.AST) -> bool:
+    """A class, function or method without `_`; not an `@overload` or a setter, whose docstrings nobody shows."""
+    if not isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) or node.name.startswith("_"):
+        return False
+    return not any(ast.unparse(mark).endswith(("overload", ".setter")) for mark in node.decorator_list)
+
+
+def find_undocumented(body: list[ast.stmt]) -> list[str]:
+    names = []
+    for node in filter(is_public_definition, body):
+        assert isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        names += [] if ast.get_docstring(node) else [node.name]
+        if isinstance(node, ast.ClassDef):
+            names += [f"{node.name}.{name}" for name in find_undocumented(node.body)]
+    return names
+
+
+def test_the_check_of_docstrings_finds_what_lacks_one() -> None:
+    source = "class A:\n  @x.setter\n  def x(self): pass\n  def y(self): pass\n  def _z(self): pass\ndef f(): pass"
+    assert find_undocumented(ast.parse(source).body) == ["A", "A.y", "f"]
+
+
+def test_every_public_class_function_and_method_has_a_docstring() -> None:
+    undocumented = {
+        str(file.relative_to(ROOT)): names
+        for file in files("rlctl")
+        if (names := find_undocumented(ast.parse(file.read_text()).body))
+    }
+    assert undocumented == {}

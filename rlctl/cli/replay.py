@@ -33,6 +33,7 @@ class ReplayCommand(TyperCommand):
     """Reads `--best RUN` as `--best 1 RUN`, and so for the other options that choose episodes by outcome."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the missing counts, then parse as Typer does."""
         return super().parse_args(ctx, list(_fill_counts(args)))
 
 

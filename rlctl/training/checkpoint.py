@@ -67,6 +67,7 @@ class Checkpoint:
 
     @property
     def progress(self) -> Progress:
+        """The counters of the training at this step."""
         return self.state.progress
 
 

@@ -149,9 +149,11 @@ class LiveDisplay(Display):
         self._live.__exit__(*details)
 
     def phase(self, text: str) -> None:
+        """Show `text` and its elapsed time until the next step, metrics or evaluation."""
         self._phase = text, time.monotonic()
 
     def run_folder(self, run: RunDirectory) -> None:
+        """Show the folder; draw the earlier rows of a resumed run."""
         self._folder = str(run.path)
         with contextlib.suppress(OSError, csv.Error):  # what cannot be read is not drawn
             for row in read_table(run.metrics_file):
@@ -164,10 +166,12 @@ class LiveDisplay(Display):
                     self.evaluation(int(steps), success, mean, row is best)
 
     def steps(self, steps: int) -> None:
+        """Move the bar to `steps`, the environment steps so far."""
         super().steps(steps)
         self._phase = None
 
     def metrics(self, row: Mapping[str, Any]) -> None:
+        """Draw a row of `metrics.csv`: speed, curves and reward terms."""
         self._phase = None
         self._steps, self._fps = row["steps"], row["fps"]
         self._add_to_curves(row)
@@ -180,13 +184,16 @@ class LiveDisplay(Display):
                 curve.append(row[name])
 
     def stage(self, title: str, why: str = "") -> None:
+        """Show the stage of the curriculum."""
         self._stage = _format_stage(title, why)
 
     def evaluation(self, steps: int, success: float | None, mean_return: float, best: bool) -> None:
+        """Add an evaluation to the list, of which the last five are shown."""
         self._phase = None
         self._evaluations.append((steps, success, mean_return, best))
 
     def message(self, text: str) -> None:
+        """Print a line above the bar."""
         from rich.text import Text
 
         self._live.console.print(Text(text))

@@ -33,6 +33,7 @@ class OffPolicyRollouts(Rollouts):
         self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
 
     def start(self) -> None:
+        """Send the policy to the workers and let them play `train_freq` steps."""
         self.send_policy(self.acting_statistics())
         self.env.start(self.model.train_freq.frequency, self._exploration())
 

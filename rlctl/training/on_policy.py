@@ -44,6 +44,7 @@ class OnPolicyRollouts(Rollouts):
     _statistics: Statistics
 
     def start(self) -> None:
+        """Send the policy to the workers and let them play `n_steps` steps of each environment."""
         model = self.model
         self._statistics = self.acting_statistics()
         self.send_policy(self._statistics)
@@ -51,12 +52,14 @@ class OnPolicyRollouts(Rollouts):
         self.env.start(model.n_steps, Exploration(stochastic=True, sde_every=max(every, 0)))
 
     def finish(self, check: Check | None) -> None:
+        """Wait for the segment and write it into SB3's rollout buffer."""
         segment = self.env.finish(check)
         self.model.num_timesteps += segment.reward.size
         self._fill_buffer(segment)
         self.finish_segment(segment)
 
     def learn(self) -> None:
+        """Run the updates of this segment."""
         self._learner.train()
 
     @torch.no_grad()

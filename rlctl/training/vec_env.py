@@ -82,6 +82,7 @@ class WorkerVecEnv(VecEnv):
         return episode_seed(self.run_seed, Stream.TRAIN, env, episode)
 
     def reset(self) -> Any:
+        """Start the next episode of every environment; return the first observations, shape (n_envs, ...)."""
         try:
             self.workers.reset({env: self._seed(env, number) for env, number in enumerate(self.episodes_started)})
         except EpisodeFailed as error:
@@ -139,27 +140,34 @@ class WorkerVecEnv(VecEnv):
         return np.concatenate([self.history.of(error.env), arrays.segment.action[error.env, :rows]])
 
     def step_async(self, actions: NDArray[Any]) -> None:
+        """Raise `NotImplementedError`: workers play whole segments."""
         raise NotImplementedError("workers play segments; nothing steps them one by one")
 
     def step_wait(self) -> Any:
+        """Raise `NotImplementedError`: workers play whole segments."""
         raise NotImplementedError("workers play segments; nothing steps them one by one")
 
     def close(self) -> None:
+        """End the workers."""
         self.workers.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return `render_mode` per environment, which is None; raise `AttributeError` for any other name."""
         if attr_name == "render_mode":
             return [None for _ in self._get_indices(indices)]
         raise AttributeError(f"worker environments do not hand out attributes: {attr_name}")
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Raise `AttributeError`: attributes of environments in workers cannot be set."""
         raise AttributeError(f"worker environments take no attributes: {attr_name}")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call `compute_reward`, which SB3's hindsight replay needs; raise `AttributeError` for any other method."""
         if method_name == "compute_reward":  # of SB3's hindsight replay; its infos are empty
             rewards = self.workers.compute_rewards(*method_args[:2])
             return [rewards for _ in self._get_indices(indices)]
         raise AttributeError(f"worker environments hand out no methods: {method_name}")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Return False per environment: no wrapper is visible from outside the workers."""
         return [False for _ in self._get_indices(indices)]
