@@ -72,6 +72,9 @@ def test_a_listing_imports_no_plugin(rlctl, site):
         "version": "1.2",
         "algo": "sac",
         "problem": None,
+        "summary": "",
+        "success": None,
+        "mean_return": None,
     }
     assert tasks["absent", "some-robots"]["problem"] == "module 'some_robots.absent' is missing"
     # The bundled one wins; the other is reachable by its place.
@@ -83,10 +86,10 @@ def test_the_table(rlctl, site):
     result = rlctl("tasks", path=site)
     assert result.stderr == ""
     header, *rows = result.stdout.splitlines()
-    assert header.split() == ["task", "origin", "algorithm", "problem"]
+    assert header.split() == ["task", "success", "return", "algorithm", "origin", "what", "it", "does"]
     assert len(rows) >= 9  # long problems go over several lines
     (row,) = [row for row in rows if row.startswith("good")]
-    assert row.split() == ["good", "some-robots", "1.2", "sac"]
+    assert row.split() == ["good", "sac", "some-robots", "1.2"]
 
 
 def test_check_shows_what_raises_in_a_line_each(importable, monkeypatch):

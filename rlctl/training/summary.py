@@ -16,23 +16,23 @@ def show(result: TrainResult, json: str | None) -> None:
     findings = diagnose(result.run)
     if output.present(_to_json(result, findings), json):
         return
-    run = shlex.quote(str(result.run.path))
-    score = result.best.evaluation if result.best else None
     lines = [result.note] if result.note else []
-    lines += [*_format_result(result), *format_end(findings, run)]
+    lines += [*_format_result(result), *format_end(findings, shlex.quote(str(result.run.path)))]
     lines += [f"recording: rerun {shlex.quote(str(path))}" for path in result.recordings]
     if result.recordings:
         lines.append("  without a display, in a browser: rerun --serve-web FILE")
-    lines += [
-        f"run: {result.run.path}",
-        "next:",
-        f"  rlctl eval {run}",
-        *([] if score is not None and score.success == 0 else [f"  rlctl export {run} --onnx"]),
-        f"  rlctl replay {run}",
-        f"  tensorboard --logdir {shlex.quote(str(result.run.tensorboard))}",
-    ]
+    lines += [f"run: {result.run.path}", "next:", *(f"  {command}" for command in list_next_commands(result))]
     for line in lines:
         output.out().print(line)
+
+
+def list_next_commands(result: TrainResult) -> list[str]:
+    """Return what to type next; a policy that never succeeded is not to be exported."""
+    run = shlex.quote(str(result.run.path))
+    score = result.best.evaluation if result.best else None
+    export = [] if score is not None and score.success == 0 else [f"rlctl export {run} --onnx"]
+    tensorboard = f"tensorboard --logdir {shlex.quote(str(result.run.tensorboard))}"
+    return [f"rlctl eval {run}", *export, f"rlctl replay {run}", tensorboard]
 
 
 def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:
