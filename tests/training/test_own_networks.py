@@ -22,6 +22,7 @@ from rlctl.policy.onnx_policy import OnnxPolicy
 from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.policy.torch_policy import ALGORITHMS, TorchPolicy, policy_name
 from rlctl.recipe.recipe import NormalizeSettings, validate
+from rlctl.replaying.replay import ReplayRequest, run_replay
 from rlctl.training.algorithms import wrap_normalize
 from rlctl.training.snapshot import pack
 from tests.training import own_nets
@@ -127,6 +128,16 @@ def test_a_policy_file_alone_imports_nothing(trained, tmp_path, monkeypatch):
     nets.unlink()
     with pytest.raises(ArtifactError, match=r"nets\.py:Gated, and that file is missing; put it back"):
         TorchPolicy.load(file)
+
+
+def test_a_policy_is_replayed_without_its_module(train, tmp_path):
+    nets = tmp_path / "gone.py"
+    shutil.copy(NETS, nets)
+    run = train("Line", {**TINY, "policy_kwargs": {"features_extractor_class": f"{nets}:Gated"}}).run
+    nets.unlink()
+    (episode,) = run_replay(ReplayRequest(str(run.last_policy), output=tmp_path)).episodes
+    assert episode.recording.is_file()
+    run_replay(ReplayRequest(None, verify=episode.episode)).check()
 
 
 def test_a_module_that_changed_is_not_resumed(train, resume, tmp_path):
