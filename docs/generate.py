@@ -6,14 +6,11 @@ import itertools
 import pathlib
 from collections.abc import Iterator
 
-from pydantic import BaseModel
-
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.json_schema import render_json_schema
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
-from rlctl.recipe.recipe import Recipe, build_schema
+from rlctl.recipe.recipe import build_schema
 from rlctl.recipe.sources import list_presets
-from rlctl.recipe.stages import Stage
 from rlctl.storage import validation, yaml_text
 from rlctl.storage.validation import Schema
 
@@ -68,15 +65,15 @@ def render_recipe_page() -> str:
         _HEAD.replace("{presets}", "\n".join(_render_presets())),
         "## Keys",
         "",
-        *_render_table(build_schema(None), (), Recipe),
+        *_render_table(build_schema(None), ()),
     ]
-    lines += [_STAGES, *_render_table(build_schema(None), ("stages", 0), Stage)]
+    lines += [_STAGES, *_render_table(build_schema(None), ("stages", 0))]
     for algo in ALGORITHM_PARAMETERS:
         for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
             model = models[algo]
             heading = f"## {algo}\n\n" if key == "algo_kwargs" else ""
             lines += ["", f"{heading}`{key}`: {(model.__doc__ or '').strip()}", ""]
-            lines += _render_table(build_schema(algo), (key,), model)
+            lines += _render_table(build_schema(algo), (key,))
     return "\n".join(lines) + "\n"
 
 
@@ -87,26 +84,18 @@ def _render_presets() -> Iterator[str]:
         yield f"- `{name}`: {' '.join(line[2:] for line in comment).partition('. ')[0].rstrip('.')}."
 
 
-def _render_table(root: Schema, path: Path, model: type[BaseModel]) -> list[str]:
-    return ["| key | value | default | meaning |", "|---|---|---|---|", *_render_rows(root, path, "", model)]
+def _render_table(root: Schema, path: Path) -> list[str]:
+    return ["| key | value | default | meaning |", "|---|---|---|---|", *_render_rows(root, path, "")]
 
 
-def _render_rows(root: Schema, path: Path, prefix: str, model: type[BaseModel] | None) -> Iterator[str]:
+def _render_rows(root: Schema, path: Path, prefix: str) -> Iterator[str]:
     """Yield a row for each key of the mapping at `path`, and below it the keys of the mapping that it is, if so."""
     for key in validation.list_keys(root, validation.find_schema(root, path)):
         part = validation.find_schema(root, (*path, key))
-        meaning = part.get("description") or _find_description(model, key)
         value = validation.describe_value(root, part).replace("|", "\\|")
-        yield f"| `{prefix}{key}` | {value} | {_render_default(part)} | {meaning} |"
+        yield f"| `{prefix}{key}` | {value} | {_render_default(part)} | {part.get('description', '')} |"
         if key not in _OWN_TABLES and "examples" not in part:
-            yield from _render_rows(root, (*path, key), f"{prefix}{key}.", None)
-
-
-def _find_description(model: type[BaseModel] | None, key: str) -> str:
-    """Return the description that a class gives a field, or the class that it inherits the field from."""
-    classes = [cls for cls in model.__mro__ if issubclass(cls, BaseModel)] if model else []
-    texts = (cls.model_fields[key].description for cls in classes if key in cls.model_fields)
-    return next((text for text in texts if text), "")
+            yield from _render_rows(root, (*path, key), f"{prefix}{key}.")
 
 
 def _render_default(part: Schema) -> str:

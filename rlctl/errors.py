@@ -9,10 +9,7 @@ import shlex
 import traceback
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    import pydantic
+from typing import Any
 
 _LONGEST = 400  # characters of somebody else's message
 _MOST_LINES = 80  # of somebody else's traceback
@@ -164,16 +161,6 @@ def check_name(
     if name not in (names := list(known)):
         there = short_repr(", ".join(names) or none, 200)
         raise error(f"{no_such} {short_repr(name)!r}.{did_you_mean(str(name), names)} {listed}: {there}.")
-
-
-def explain_invalid(error: pydantic.ValidationError, label: str = "") -> str:
-    """Return the first problem that pydantic has found: `LABEL: should be a valid number, got 'abc'`.
-
-    Without a label its place is named.
-    """
-    problem = error.errors(include_url=False)[0]
-    place = label or ".".join(map(str, problem["loc"])) or "it"
-    return f"{place}: {problem['msg'].removeprefix('Input ')}, got {short_repr(repr(problem['input']))}"
 
 
 def explain_missing_package(user: str, missing: str | None, extra: str) -> str:

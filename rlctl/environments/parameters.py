@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from rlctl.environments.plugin_code import call_plugin
-from rlctl.errors import RecipeError, did_you_mean, explain_invalid, short_repr
+from rlctl.errors import RecipeError, did_you_mean, short_repr
+from rlctl.storage import validation
 
 
 def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
@@ -57,10 +58,11 @@ def check_fields(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
         if key not in fields:
             raise _unknown_parameter(task.__name__, key, list(fields))
         _check_number(key, hints[key], value)
+        adapter = pydantic.TypeAdapter(hints[key])
         try:
-            checked[key] = pydantic.TypeAdapter(hints[key]).validate_python(value)
+            checked[key] = adapter.validate_python(value)
         except pydantic.ValidationError as error:
-            raise RecipeError(explain_invalid(error, f"task.{key}")) from None
+            raise RecipeError(validation.explain_invalid(error, adapter, value, f"task.{key}")) from None
     return checked
 
 

@@ -14,6 +14,7 @@ _GROUPED_DIGITS = {"type": "string", "pattern": r"^-?[0-9][0-9_]*(\.[0-9_]+)?$"}
 """`200_000` is a number in a recipe and text in the YAML of editors."""
 _BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
 _NUMBER = r"[0-9.]+(e[+-]?[0-9]+)?"
+_LINE = 120  # [characters]
 _KWARGS = ("algo_kwargs", "policy_kwargs")
 
 
@@ -30,14 +31,28 @@ def build_json_schema() -> dict[str, Any]:
             condition["required"] = ["algo"]
         parameters = {key: schema["properties"][key] for key in _KWARGS}
         conditions.append({"if": condition, "then": {"properties": parameters}})
-    described = {**root, "title": "rlctl recipe", "allOf": conditions, "$defs": definitions}
+    described = {**root, "allOf": conditions, "$defs": definitions}
     converted: dict[str, Any] = _convert(described)
+    converted["$defs"]["GroupedDigits"] = _GROUPED_DIGITS
     return {"$schema": "http://json-schema.org/draft-07/schema#", **converted}
 
 
 def render_json_schema() -> str:
-    """Return the schema as text."""
-    return json.dumps(build_json_schema(), indent=1) + "\n"
+    """Return the schema as text: keys sorted, each property of a recipe on a line of its own."""
+    return _render(build_json_schema()) + "\n"
+
+
+def _render(node: Any, indent: str = "", *, expand: bool = False) -> str:
+    text = json.dumps(node, sort_keys=True)
+    if len(indent + text) <= _LINE or not (expand or '"properties"' in text):
+        return text
+    inner = f"{indent} "
+    if isinstance(node, list):
+        return "[\n" + ",\n".join(inner + _render(part, inner) for part in node) + f"\n{indent}]"
+    lines = (
+        f"{inner}{json.dumps(key)}: {_render(node[key], inner, expand=key == 'properties')}" for key in sorted(node)
+    )
+    return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
 
 
 def format_editor_line(schema: Path | str = FILE) -> str:
@@ -52,9 +67,11 @@ def _convert(node: Any) -> Any:
     if not isinstance(node, dict):
         return node
     known = {_BOUNDS.get(key, key): value for key, value in node.items() if key != "default_text"}
+    if isinstance(known.get("title"), str):  # the key itself in other letters
+        del known["title"]
     if isinstance(pattern := node.get("pattern"), str):  # written for people: lin_NUMBER
         known["pattern"] = f"^{pattern.replace('NUMBER', _NUMBER)}$"
     if node.get("type") in ("integer", "number"):
-        about = {key: known.pop(key) for key in ("title", "description", "default") if key in known}
-        return {**about, "anyOf": [known, _GROUPED_DIGITS]}
+        about = {key: known.pop(key) for key in ("description", "default") if key in known}
+        return {**about, "anyOf": [known, {"$ref": "#/$defs/GroupedDigits"}]}
     return {key: _convert(value) for key, value in known.items()}

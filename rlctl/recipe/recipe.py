@@ -231,12 +231,22 @@ def build_schema(algo: Any = None) -> validation.Schema:
 @functools.cache
 def _build_schema(algo: str | None) -> validation.Schema:
     schema = Recipe.model_json_schema()
+    _add_descriptions(schema, Recipe)
     for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
         if algo in models:
             own = models[algo].model_json_schema()
+            _add_descriptions(own, models[algo])
             schema["$defs"] |= own.pop("$defs", {})
             schema["properties"][key] |= own
     return schema
+
+
+def _add_descriptions(schema: validation.Schema, model: type[Section]) -> None:
+    """Add the descriptions that pydantic leaves out: those of the overridden field, or equal to the type's own."""
+    for name, part in schema["properties"].items():
+        classes = [cls for cls in model.__mro__ if issubclass(cls, Section) and name in cls.model_fields]
+        if "description" not in part:
+            part["description"] = next((text for cls in classes if (text := cls.model_fields[name].description)), "")
 
 
 def _explain(problem: Any, path: Sequence[str | int], schema: validation.Schema, values: Mapping[str, Any]) -> str:

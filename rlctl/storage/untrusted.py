@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 from rich.filesize import decimal as format_bytes
 
-from rlctl.errors import ArtifactError, explain_invalid, short_repr
+from rlctl.errors import ArtifactError, short_repr
 from rlctl.storage import memory
 from rlctl.version import __version__
 
@@ -86,22 +86,26 @@ def parse_json(text: str | bytes) -> Any:
 def parse_model(text: str | bytes, model: type[Model], path: Path, what: str) -> Model:
     """Read JSON as a model with a `format`; raises `ArtifactError` for what is damaged, or newer than this rlctl."""
     newest = model.model_fields["format"].default
+    content = None
     try:
         content = parse_json(text)
-        found = content.get("format") if isinstance(content, dict) else None
-        if isinstance(found, int) and found > newest:
+        file_format = content.get("format") if isinstance(content, dict) else None
+        if isinstance(file_format, int) and file_format > newest:
             known = f"this rlctl {__version__} can read ({newest}); upgrade rlctl"
-            raise ArtifactError(f"{path}: {what} format {found} is newer than {known}")
+            raise ArtifactError(f"{path}: {what} format {file_format} is newer than {known}")
         return model.model_validate(content)
     except ValueError as error:  # pydantic's is one
-        raise ArtifactError(f"{path}: damaged: {_explain_error(error)}") from None
+        raise ArtifactError(f"{path}: damaged: {_explain_error(error, model, content)}") from None
 
 
-def _explain_error(error: ValueError) -> str:
-    """Return in a line what is wrong with a description; of pydantic's report the first problem, with its place."""
+def _explain_error(error: ValueError, model: Any, content: Any) -> str:
     import pydantic
 
-    return short_repr(explain_invalid(error) if isinstance(error, pydantic.ValidationError) else str(error), 200)
+    from rlctl.storage import validation
+
+    if isinstance(error, pydantic.ValidationError):
+        return short_repr(validation.explain_invalid(error, model, content), 200)
+    return short_repr(str(error), 200)
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:

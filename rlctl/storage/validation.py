@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import pydantic
 
 from rlctl.errors import did_you_mean, short_repr
-from rlctl.storage import yaml_text
 
 Schema = dict[str, Any]
 Place = tuple[str | int, ...]
 """Keys and indices that lead to a value."""
 _MOST_LINES = 3
+_ANY = "any value"
 
 
 def find_schema(root: Schema, path: Sequence[str | int]) -> Schema:
@@ -73,6 +74,20 @@ def explain_all(error: pydantic.ValidationError, root: Schema, explain: Callable
     return "\n".join(lines if len(lines) <= _MOST_LINES else [*lines[:2], f"and {len(lines) - 2} more mistakes"])
 
 
+def explain_invalid(error: pydantic.ValidationError, model: Any, values: Any, label: str = "") -> str:
+    """Explain the first problem of `values`, which were checked against `model`: a class of pydantic or an adapter.
+
+    `LABEL.KEY: expected a number, got 'abc'`.
+    """
+    try:
+        root = model.json_schema() if isinstance(model, pydantic.TypeAdapter) else model.model_json_schema()
+    except pydantic.errors.PydanticInvalidForJsonSchema:  # a type that JSON does not have
+        root = {}
+    problem: Any = error.errors(include_url=False)[0]
+    place = _locate(problem, root)
+    return explain(problem, place, root, values, key=".".join(map(str, (label, *place) if label else place)))
+
+
 def _locate(problem: Any, root: Schema) -> Place:
     path: Place = problem["loc"]
     return path if problem["type"] == "extra_forbidden" else path[: _descend(root, path)[1]]
@@ -93,10 +108,14 @@ def explain(
     label = f"{key}: " if key else ""
     if problem["type"] == "value_error":  # of a check of ours that needs more than a type
         return f"{label}{problem['ctx']['error']}"
+    if problem["type"] == "missing":
+        return f"{label}is missing"
     part, given = find_schema(root, path), values
     for part_key in path:
         given = given[part_key]
     expected = describe_value(root, part)
+    if expected == _ANY:  # the schema has no words for the type
+        return f"{label}{problem['msg'].removeprefix('Input ')}, got {short_repr(given)}"
     if unit:
         expected = f"{expected.removesuffix(' or null')} [{unit}]"
     examples = f", such as {' or '.join(part['examples'])}" if "examples" in part else ""
@@ -117,7 +136,7 @@ def _list_alternatives(root: Schema, node: Schema) -> Iterator[Schema]:
 
 def _describe(root: Schema, node: Schema) -> str:
     if "const" in node:
-        return yaml_text.dump(node["const"]).partition("\n")[0]
+        return node["const"] if isinstance(node["const"], str) else json.dumps(node["const"])
     if "enum" in node:
         return " or ".join(map(str, node["enum"]))
     if "pattern" in node:
@@ -132,7 +151,7 @@ def _describe(root: Schema, node: Schema) -> str:
     if kind == "object":
         keys = list_keys(root, node)
         return f"a mapping of {', '.join(keys)}" if keys else "a mapping"
-    return {"boolean": "true or false", "null": "null", "string": "text"}.get(str(kind), "any value")
+    return {"boolean": "true or false", "null": "null", "string": "text"}.get(str(kind), _ANY)
 
 
 def _describe_range(node: Schema) -> str:

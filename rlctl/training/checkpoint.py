@@ -24,10 +24,10 @@ from safetensors.numpy import save as save_tensors
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from rlctl.errors import ArtifactError, explain_invalid
+from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile
 from rlctl.run.directory import RunDirectory
-from rlctl.storage import files
+from rlctl.storage import files, validation
 from rlctl.training import replay_segments, snapshot
 from rlctl.training.curriculum import begin_next_episodes
 from rlctl.training.progress import Progress
@@ -204,7 +204,9 @@ def _read_state(folder: Path) -> State:
     try:
         state = State.model_validate(content)
     except pydantic.ValidationError as error:
-        raise ArtifactError(f"{file}: not a checkpoint of rlctl: {explain_invalid(error)}") from None
+        raise ArtifactError(
+            f"{file}: not a checkpoint of rlctl: {validation.explain_invalid(error, State, content)}"
+        ) from None
     if state.step != int(folder.name):
         raise ArtifactError(f"{folder}: this is the checkpoint of step {state.step}, under another name")
     return state

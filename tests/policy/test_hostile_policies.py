@@ -131,8 +131,8 @@ def test_a_space_that_cannot_be(space, message, changed, described):
         ("[" * 100_000, "damaged: nested too deeply"),
         ('{"format": ' + "9" * 10_000 + "}", "damaged: Exceeds the limit"),
         ("", "damaged: Expecting value"),
-        ("null", "damaged: it: should be a valid dictionary"),
-        ('{"format": "x"}', "damaged: format: should be a valid integer"),
+        ("null", "damaged: expected a mapping of "),
+        ('{"format": "x"}', "damaged: format: expected a whole number, got 'x'"),
     ],
 )
 def test_a_description_that_is_none(text, message, changed):

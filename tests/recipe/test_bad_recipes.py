@@ -182,7 +182,7 @@ def test_what_only_building_finds(settings, message, tmp_path):
         ("task.tolerance='0.02'", "task.tolerance: expected a number, got '0.02'"),
         ("task.tolerance=true", "task.tolerance: expected a number, got True"),
         ("task.tolerance=.nan", "task.tolerance: expected a number, got nan"),
-        ("task.tolerance=[1]", "task.tolerance: should be a valid number, got [1]"),
+        ("task.tolerance=[1]", "task.tolerance: expected a number, got [1]"),
         ("task.tollerance=1", "task.tollerance: Reach has no parameter 'tollerance'. Did you mean 'tolerance'?"),
     ],
 )

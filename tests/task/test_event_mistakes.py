@@ -72,7 +72,7 @@ RANGE = "Write [low, high], a number, or {from: [low, high], to: [low, high]}."
             {"mass": {"every_s": 1}},
             "events.mass: no parameter 'every_s'. It has: body, factor, links.",
         ),
-        ({"mass": {"body": 3}}, "events.mass.body: should be a valid string, got 3"),
+        ({"mass": {"body": 3}}, "events.mass.body: expected text, got 3"),
         ({"mass": {"body": "amr"}}, "events.mass: no body 'amr'. Did you mean 'arm'? Loaded: plane, arm, cube."),
         (
             {"mass": {"body": "cube"}},

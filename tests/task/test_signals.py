@@ -221,7 +221,7 @@ def test_everything_comes_from_the_seed(make):
         (Clock, {"noisy_angle": {"std": -0.1}}, "events.noisy_angle.std: -0.1 is not at least 0."),
         (Clock, {"late_action": {"steps": 1.5}}, "events.late_action.steps: 1.5 is not a whole number."),
         (Clock, {"late_action": {"of": "time"}}, "events.late_action: no parameter 'of'. It has: steps."),
-        (Clock, {"late_time": {"of": 3}}, "events.late_time.of: should be a valid string, got 3"),
+        (Clock, {"late_time": {"of": 3}}, "events.late_time.of: expected text or a list, each element text, got 3"),
     ],
 )
 def test_what_a_recipe_gets_wrong(task, changes, message):

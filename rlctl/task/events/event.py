@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 
 from numpy.typing import NDArray
 
-from rlctl.errors import RecipeError, RlctlError, TaskError, check_name, explain_invalid
+from rlctl.errors import RecipeError, RlctlError, TaskError, check_name
 from rlctl.task.events.ranges import Limits, Range, Widening, read_range
 
 When = Literal["reset", "start", "interval", "observation", "action"]
@@ -163,9 +163,12 @@ def _check_type(where: str, hint: Any, value: Any, error: type[RlctlError]) -> N
     import pydantic
 
     try:
-        pydantic.TypeAdapter(hint).validate_python(value)
+        adapter = pydantic.TypeAdapter(hint)
+        adapter.validate_python(value)
     except pydantic.ValidationError as problem:
-        raise error(explain_invalid(problem, where)) from None
+        from rlctl.storage import validation
+
+        raise error(validation.explain_invalid(problem, adapter, value, where)) from None
     except pydantic.errors.PydanticSchemaGenerationError:
         return  # a type of the author's own
 
