@@ -1,6 +1,6 @@
-"""What SLURM starts on a node, `python -m rlctl.cluster.node WORKS INDEX`: executes one work of an array.
+"""SLURM starts `python -m rlctl.cluster.node WORKS INDEX` on a node: it executes one training of an array.
 
-Ends with 143 if the job is to be requeued, and with the exit code of the training otherwise.
+The exit code is 143 if SLURM shall requeue the job, otherwise that of the training.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rlctl.cluster.slurm import STOP_FILE
-from rlctl.cluster.work import PREEMPTED, TAKEN, Work, execute, from_json
+from rlctl.cluster.work import PREEMPTED, TAKEN, Work, execute
 from rlctl.run.job import Job, job_file, read_job, write_job
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
@@ -22,7 +22,7 @@ from rlctl.training.trainings import NextSignal, Trainings
 
 
 class _NodeTrainings(Trainings):
-    """The one training of this node; signals of SLURM are passed on to it."""
+    """The only training of this node; it receives SLURM's signals."""
 
     def __init__(self, work: Work) -> None:
         super().__init__(1)
@@ -33,15 +33,15 @@ class _NodeTrainings(Trainings):
         stop = self._work.folder / STOP_FILE
         with HandledSignals(self._pass_on):
             code = self.train(TrainRequest.from_json(self._work.request), receive, stop.exists)
-        return code if self.stopped_by is None or code else PREEMPTED  # stopped before it began
+        return code if self.stopped_by is None or code else PREEMPTED  # a signal came before the training began
 
     def _execute(self, request: TrainRequest, receive: Callable[[str], None], next_signal: NextSignal) -> int:
         return execute(self._work, receive, next_signal)
 
 
 def run(works: Path, index: int) -> int:
-    """Execute the work of an index, and write down how it goes; return the exit code for SLURM."""
-    work = from_json(files.read_json(works)[index])
+    """Execute the work at an index and record its state in the job file; return the exit code for SLURM."""
+    work = Work(**files.read_json(works)[index])
     folder = work.folder
     before = read_job(folder, work.seed)
     place = f"slurm {os.environ.get('SLURM_ARRAY_JOB_ID', '?')}_{index}"
@@ -52,7 +52,7 @@ def run(works: Path, index: int) -> int:
         code = _NodeTrainings(work).train_work(lambda line: print(line, file=log))
         is_retried = code in (PREEMPTED, TAKEN) and not (folder / STOP_FILE).exists()
         if is_retried and attempts > work.settings["retries"]:
-            print(f"error: given up after {attempts} attempts: raise retries in cluster.yaml", file=log)
+            print(f"error: gave up after {attempts} attempts; raise retries in cluster.yaml for more", file=log)
             is_retried = False
     write_job(
         folder, dataclasses.replace(job, state="queued" if is_retried else "ended", code=None if is_retried else code)

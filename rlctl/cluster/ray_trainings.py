@@ -1,8 +1,8 @@
-"""Trainings as tasks of Ray: `ray` starts one on this machine, `ray:auto` and `ray:HOST:PORT` use one that runs.
+"""Trainings as tasks of Ray: `ray` starts Ray on this machine, `ray:auto` and `ray:HOST:PORT` use a running cluster.
 
-Ray tries a task again whose machine is lost; the attempt resumes the run. Lines and signals go through an actor on the
-driver's node: each beat of an attempt brings lines and takes a signal back. An attempt that gets no answer for
-`lease_s` ends itself.
+Ray retries a task whose machine is lost; the new attempt resumes the run. An actor on the driver's node passes on lines
+and signals: an attempt regularly sends it lines and receives a signal. An attempt that gets no answer for `lease_s`
+ends itself.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rlctl.cluster import work as cluster_work
 from rlctl.cluster.settings import ClusterSettings
-from rlctl.cluster.work import PREEMPTED, TAKEN, Work, make_work, mark_shared_folder
+from rlctl.cluster.work import PREEMPTED, TAKEN, Work, execute, make_work, mark_shared_folder
 from rlctl.errors import TaskError, UsageError, explain_missing_package
 from rlctl.run.job import Job, read_job, write_job
 from rlctl.run.train_request import TrainRequest
@@ -34,9 +33,9 @@ _MOST_AT_ONCE = 256
 
 
 def connect(address: str) -> Any:
-    """Return the module `ray`, connected: to a Ray of its own on this machine for ``, else to that at an address.
+    """Connect to Ray at an address, or start it on this machine if the address is empty; return the module `ray`.
 
-    Raises `UsageError` without Ray, and `TaskError` if it cannot be reached.
+    Raises `UsageError` if Ray is not installed, and `TaskError` if it cannot be reached.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_DEDUP_LOGS", "0")
@@ -56,7 +55,7 @@ def connect(address: str) -> Any:
     options |= {"address": address} if address else {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     try:
         ray.init(**options)
-    except Exception as error:  # ConnectionError, ValueError, RuntimeError: whatever Ray has for it
+    except Exception as error:  # ConnectionError, ValueError or RuntimeError
         raise TaskError(
             f"--on ray:{address or 'local'}: cannot be reached: {str(error).partition(chr(10))[0]}"
         ) from None
@@ -64,7 +63,7 @@ def connect(address: str) -> Any:
 
 
 class Mailbox:
-    """An actor on the driver's node, which stands between the driver and the attempts."""
+    """An actor on the driver's node that passes messages between the driver and the attempts."""
 
     def __init__(self) -> None:
         self._attempts: dict[int, int] = defaultdict(int)
@@ -73,20 +72,20 @@ class Mailbox:
         self._signals: dict[int, list[int]] = defaultdict(list)
 
     def begin(self, seed: int, host: str) -> int:
-        """Note a new attempt; return its number. All attempts before it are superseded."""
+        """Register a new attempt, which supersedes all earlier ones; return its number."""
         self._attempts[seed] += 1
         self._hosts[seed] = host
         return self._attempts[seed]
 
     def beat(self, seed: int, attempt: int, lines: list[str]) -> int:
-        """Take lines; return a signal for the training, 0 for none, -1 for an attempt that is superseded."""
+        """Store an attempt's lines; return a signal for it, 0 for none, -1 if the attempt is superseded."""
         if attempt != self._attempts[seed]:
             return -1
         self._lines[seed] += lines
         return self._signals[seed].pop(0) if self._signals[seed] else 0
 
     def stop(self, seed: int, number: int) -> None:
-        """Keep a signal for the next beat."""
+        """Store a signal until the next beat."""
         self._signals[seed].append(number)
 
     def take(self, seed: int) -> tuple[list[str], str, int]:
@@ -95,14 +94,14 @@ class Mailbox:
 
 
 class _Superseded(Exception):
-    """A newer attempt has the run, or the driver is gone."""
+    """A newer attempt writes the run, or the driver has ended."""
 
 
 def train_on_node(mailbox: Any, content: dict[str, Any]) -> int:
-    """On a node: execute a work, again if it was preempted or the run is still being written; return the exit code."""
+    """On a node: train, and retry if preempted or if another process still writes the run; return the exit code."""
     import ray
 
-    work = cluster_work.from_json(content)
+    work = Work(**content)
     attempt = ray.get(mailbox.begin.remote(work.seed, platform.node()))
     lines: list[str] = []
     heard_s = beat_s = time.monotonic()
@@ -129,7 +128,7 @@ def train_on_node(mailbox: Any, content: dict[str, Any]) -> int:
     code = TAKEN
     with contextlib.suppress(_Superseded):
         for retry in range(work.settings["retries"] + 1):
-            code = cluster_work.execute(work, lines.append, next_signal)
+            code = execute(work, lines.append, next_signal)
             beat()
             if code not in (PREEMPTED, TAKEN) or stopped:
                 break
@@ -149,11 +148,12 @@ class RayTrainings(Trainings):
         self._task = self._ray.remote(num_cpus=settings.cpus, max_retries=settings.retries)(train_on_node)
 
     def describe(self) -> str:
-        """Say where, and how many at a time, they train."""
+        """Describe where the runs train, and how many at a time."""
         cores = self._ray.cluster_resources().get("CPU", 0)
         at_once = int(cores // self._settings.cpus)
         if not at_once:
-            return f"on Ray, which has {cores:g} cores: no free slot for {self._settings.cpus} (cpus in cluster.yaml)"
+            needed = self._settings.cpus
+            return f"on Ray, whose {cores:g} cores are fewer than a run needs: {needed} (cpus in cluster.yaml)"
         return f"on Ray, {min(at_once, self._jobs)} at a time: {self._settings.cpus} of its {cores:g} cores each"
 
     def _prepare_thread(self) -> None:
@@ -163,7 +163,7 @@ class RayTrainings(Trainings):
         work = make_work(request, self._token, self._settings)
         job = Job(work.seed, work.task, "queued", "ray")
         write_job(self._folder, job)
-        reference = self._task.remote(self._mailbox, cluster_work.to_json(work))
+        reference = self._task.remote(self._mailbox, dataclasses.asdict(work))
         code = TAKEN
         try:
             code = self._follow(reference, work, job, receive, next_signal)
@@ -188,7 +188,7 @@ class RayTrainings(Trainings):
                 receive(line)
             if attempts != job.attempts:
                 if job.attempts:
-                    receive(f"attempt {attempts} on {host}: the one before was lost")
+                    receive(f"attempt {attempts} on {host}: the previous attempt was lost")
                 job = dataclasses.replace(job, state="running", host=host, attempts=attempts)
                 write_job(self._folder, job)
             if done:
@@ -202,6 +202,6 @@ class RayTrainings(Trainings):
 def _make_mailbox(ray: Any) -> Any:
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    # Ray places actors without cores anywhere: on this node it is not lost with another.
+    # Ray may place actors without cores on any node; on this one the mailbox survives the loss of other nodes.
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     return ray.remote(num_cpus=0)(Mailbox).options(scheduling_strategy=here).remote()

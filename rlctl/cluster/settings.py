@@ -1,4 +1,4 @@
-"""`cluster.yaml`: what a run gets on a cluster, and how a node is prepared. Typed, every key checked."""
+"""`cluster.yaml`: the resources of a run on a cluster and the preparation of a node; every key is checked."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rlctl.errors import RecipeError
 from rlctl.storage import validation, yaml_text
 
 FILE = Path("cluster.yaml")
-"""Read where no other file is given, if it is there."""
+"""Read if it exists and no other file is given."""
 
 
 class ClusterSettings(pydantic.BaseModel, extra="forbid"):
@@ -21,17 +21,17 @@ class ClusterSettings(pydantic.BaseModel, extra="forbid"):
     cpus: int = Field(2, ge=1)
     """Cores of each run."""
     retries: int = Field(3, ge=0, le=1000)
-    """How often a run is started again after its machine was lost, or after it was preempted."""
+    """How often a run is retried after its machine was lost or it was preempted."""
     lease_s: float = Field(60.0, gt=0)
-    """A run on Ray ends itself after so long without an answer from the driver [s]."""
+    """A run on Ray ends itself if the driver has not answered for this time [s]."""
     sbatch: list[str] = []
-    """Options that are passed on to `sbatch`, such as `--time=04:00:00`."""
+    """Options for `sbatch`, such as `--time=04:00:00`."""
     setup: list[str] = []
     """Shell commands that a SLURM node runs first, such as `source .venv/bin/activate`."""
 
 
 def read_settings(path: Path | None) -> ClusterSettings:
-    """Read a file, by default `cluster.yaml` if there is one; raises `RecipeError` for what is wrong in it."""
+    """Read a file, by default `cluster.yaml` if it exists; raises `RecipeError` if it is invalid."""
     if path is None and not FILE.is_file():
         return ClusterSettings()
     path = path or FILE

@@ -1,12 +1,13 @@
-"""Trainings as an array of SLURM jobs: a script for `sbatch`, a small file per seed that tells the driver of it.
+"""Trainings as an array of SLURM jobs: a script for `sbatch`, and a small file per seed that shows the job's state.
 
-A node starts or resumes a run (`rlctl.cluster.node`). One that is preempted, out of time or warned saves a checkpoint
-and ends with 143, which the script turns into a requeue. The array does not need the driver: it goes on without it, and
-a driver that comes back follows it again.
+A node starts or resumes a run (`rlctl.cluster.node`). A run that is preempted, out of time or warned saves a checkpoint
+and ends with 143; the script then requeues the job. The array continues without the driver, and a new driver follows
+it again.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shlex
 import subprocess
@@ -21,7 +22,7 @@ from typing import TypeVar
 
 from rlctl import output
 from rlctl.cluster.settings import ClusterSettings
-from rlctl.cluster.work import TAKEN, Work, make_work, mark_shared_folder, to_json
+from rlctl.cluster.work import TAKEN, Work, make_work, mark_shared_folder
 from rlctl.errors import TaskError, UsageError
 from rlctl.run.job import JOBS, Job, job_file, list_jobs, read_job, write_job
 from rlctl.run.train_request import TrainRequest
@@ -29,7 +30,7 @@ from rlctl.storage import files
 from rlctl.training.trainings import Detached, NextSignal, Trainings
 
 STOP_FILE = f"{JOBS}/stop"
-"""Nodes stop their training, with a checkpoint, when it is there."""
+"""When this file exists, nodes save a checkpoint and stop their training."""
 _POLL_S = 0.5
 _ASK_QUEUE_S = 15.0
 _SCRIPT = """\
@@ -51,11 +52,14 @@ Result = TypeVar("Result")
 
 
 class SlurmTrainings(Trainings):
-    """Trains all at once in one array of jobs. `run` raises `Detached` with `detach`."""
+    """Trains all runs in one array of jobs; with `detach`, `run` raises `Detached` after submitting them."""
 
     resume_options = " --on slurm"
 
-    def __init__(self, folder: Path, waiting: int, settings: ClusterSettings, *, detach: bool = False) -> None:
+    def __init__(
+        self, folder: Path, waiting: int, jobs: int | None, settings: ClusterSettings, *, detach: bool = False
+    ) -> None:
+        """`waiting` runs in the folder of a group; `jobs` has no meaning here, as SLURM decides how many run."""
         super().__init__(max(waiting, 1))
         self._folder, self._settings, self._detach = folder, settings, detach
         self._token = mark_shared_folder(folder)
@@ -67,7 +71,7 @@ class SlurmTrainings(Trainings):
         self._queue = self._ask_queue()
 
     def describe(self) -> str:
-        """Say where they train."""
+        """Describe where the runs train."""
         return f"on SLURM, {output.format_count(self._settings.cpus, 'core')} each"
 
     def _prepare_thread(self) -> None:
@@ -82,7 +86,7 @@ class SlurmTrainings(Trainings):
                 self._works.append(work)
                 files.remove(log)
             self._ready.wait()
-        except threading.BrokenBarrierError:  # another one could not be submitted, or a signal stops all
+        except threading.BrokenBarrierError:  # another run could not be submitted, or a signal stops all of them
             return TAKEN if self.stopped_by is None else 128 + self.stopped_by
         except BaseException:
             self._ready.abort()
@@ -92,10 +96,10 @@ class SlurmTrainings(Trainings):
         return self._follow(work.seed, log, receive, next_signal)
 
     def run(self, calls: Sequence[Callable[[], Result]], to_go_on: str) -> list[Result]:
-        """Return what each call returns; raises `Detached` once all are submitted, if nobody waits for them."""
+        """Return the result of each call; with `detach`, raise `Detached` once all runs are submitted."""
         results = super().run(calls, to_go_on)
         if self._detach and calls:
-            raise Detached(f"submitted to SLURM; to come back: {to_go_on}{self.resume_options}")
+            raise Detached(f"submitted to SLURM; to follow the runs: {to_go_on}{self.resume_options}")
         return results
 
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
@@ -103,13 +107,13 @@ class SlurmTrainings(Trainings):
         self._ready.abort()
 
     def _submit(self) -> None:
-        """Submit the works, once all of them are known."""
+        """Submit all works as one array."""
         if not self._works:
             return
         self._works.sort(key=lambda work: work.seed)
         folder = self._folder
         works = folder / JOBS / f"array-{uuid.uuid4().hex[:8]}.json"
-        files.write_json(works, [to_json(work) for work in self._works])
+        files.write_json(works, [dataclasses.asdict(work) for work in self._works])
         script = works.with_suffix(".sbatch")
         files.write_text(script, self._write_script(works))
         command = ["sbatch", "--parsable", *self._settings.sbatch, str(script)]
@@ -117,7 +121,7 @@ class SlurmTrainings(Trainings):
         for index, work in enumerate(self._works):
             write_job(folder, Job(work.seed, work.task, "queued", f"slurm {number}_{index}"))
         with self._queue_lock:
-            self._queue_s, self._queue = time.monotonic(), ""  # which does not list them yet
+            self._queue_s, self._queue = time.monotonic(), ""  # the old answer does not list the new jobs
 
     def _write_script(self, works: Path) -> str:
         return _SCRIPT.format(
@@ -132,12 +136,12 @@ class SlurmTrainings(Trainings):
         )
 
     def _follow(self, seed: int, log: Path, receive: Callable[[str], None], next_signal: NextSignal) -> int:
-        """Pass on what a node writes until its job has ended; return the exit code."""
+        """Pass on the lines of a node's log until its job has ended; return the exit code."""
         position = 0
         while True:
             time.sleep(_POLL_S)
             job = read_job(self._folder, seed)
-            position = _pass_on_lines(log, position, receive)
+            position = _forward_lines(log, position, receive)
             if job is not None and job.state == "ended" and job.code is not None:
                 return job.code
             if next_signal():
@@ -149,17 +153,17 @@ class SlurmTrainings(Trainings):
                     continue
                 if self.stopped_by is None:
                     place = job.place if job else "its job"
-                    receive(f"error: {place} is gone from SLURM without a result; see {self._folder / JOBS}")
+                    receive(f"error: {place} left SLURM's queue without a result; see {self._folder / JOBS}")
                 return TAKEN if self.stopped_by is None else 128 + self.stopped_by
 
     def _cancel_waiting(self) -> None:
-        """Take out of SLURM's queue what has not begun."""
+        """Cancel the jobs that have not started."""
         for job in list_jobs(self._folder):
             if job.state == "queued":
                 subprocess.run(["scancel", "--state=PENDING", job.place.partition(" ")[2]], check=False)
 
     def _is_queued(self, job: Job) -> bool:
-        """Say whether SLURM has a job still; asked four times a minute."""
+        """Return whether SLURM still has a job; SLURM is asked four times a minute."""
         with self._queue_lock:
             if time.monotonic() - self._queue_s > _ASK_QUEUE_S or self.stopped_by is not None:
                 self._queue = self._ask_queue()
@@ -173,8 +177,8 @@ class SlurmTrainings(Trainings):
         return _call(command) or "-"
 
 
-def _pass_on_lines(log: Path, position: int, receive: Callable[[str], None]) -> int:
-    """Hand the lines of a file behind a position to `receive`; return the next position."""
+def _forward_lines(log: Path, position: int, receive: Callable[[str], None]) -> int:
+    """Call `receive` with each complete line of a file after a position; return the next position."""
     try:
         with log.open("rb") as file:
             file.seek(position)
@@ -188,12 +192,12 @@ def _pass_on_lines(log: Path, position: int, receive: Callable[[str], None]) -> 
 
 
 def _call(command: list[str]) -> str:
-    """Run a command of SLURM; return what it prints. Raises `UsageError` without SLURM, `TaskError` if it fails."""
+    """Run a SLURM command and return its output; raise `UsageError` without SLURM, `TaskError` if the command fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     except FileNotFoundError:
         raise UsageError(
-            f"--on slurm: there is no {command[0]} on this machine: use a login node of the cluster"
+            f"--on slurm: {command[0]} is not installed on this machine; use a login node of the cluster"
         ) from None
     except subprocess.TimeoutExpired:
         raise TaskError(f"--on slurm: {command[0]} did not answer within 60 s") from None

@@ -1,6 +1,6 @@
-"""The unit of work of a cluster: a training that owns one run folder, as JSON, and executing it on a node.
+"""`Work`, the description of one training as JSON, and how a node executes it.
 
-Whether it begins or resumes is decided on the node, when it starts there: a retry is a resume.
+The node decides whether to begin or resume the run: a retry resumes it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 import platform
 import sys
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,9 @@ from rlctl.training.trainings import NextSignal, train_in_child
 from rlctl.version import collect_versions
 
 PREEMPTED, TAKEN = 143, 75
-"""The exit codes after which a training is tried again: terminated by its cluster; another process writes the run."""
+"""Exit codes after which a training is retried: the cluster ended it; another process writes the run."""
 _TOKEN_FILE = f"{JOBS}/driver"
-"""Written by the driver; a node that reads another content has another folder mounted."""
+"""The driver writes a token into it; a node that reads a different token has a different folder mounted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,14 +43,14 @@ class Work:
     root: str
     """The folder of the group or tuning, absolute."""
     cwd: str
-    """The driver's current folder; the task's path and the run's record are relative to it."""
+    """The driver's current folder; the paths of the task and the run are relative to it."""
     command: list[str]
     """The driver's command, for the run's record."""
     token: str
     """The content of the driver's file in the shared folder."""
     versions: dict[str, str]
     source_sha256: str | None
-    """Of the task's file, as the driver sees it."""
+    """Hash of the task's file on the driver."""
     settings: dict[str, Any]
     """`ClusterSettings`."""
 
@@ -80,19 +80,19 @@ def make_work(request: TrainRequest, token: str, settings: ClusterSettings) -> W
 
 
 def mark_shared_folder(folder: Path) -> str:
-    """Write a token into the folder of a group, by which nodes recognise it; return the token."""
+    """Write a token into the folder of a group, so that nodes recognise the folder; return the token."""
     file = folder / _TOKEN_FILE
     (folder / JOBS).mkdir(exist_ok=True)
-    if file.is_file() and any(list_jobs(folder)):  # they know the token of before
+    if file.is_file() and any(list_jobs(folder)):  # these jobs have the earlier token
         return file.read_text(encoding="utf-8")
     files.write_text(file, token := uuid.uuid4().hex)
     return token
 
 
 def execute(work: Work, receive: Callable[[str], None], next_signal: NextSignal) -> int:
-    """Train on this machine, after a look at its folder and its versions; return the exit code.
+    """Check this machine's folder and versions, then train; return the exit code.
 
-    `receive` gets the lines that the training prints, and an error's text. Any exception from `next_signal` kills the
+    `receive` gets the lines that the training prints, and error messages. Any exception from `next_signal` kills the
     training and is raised.
     """
     try:
@@ -108,7 +108,7 @@ def execute(work: Work, receive: Callable[[str], None], next_signal: NextSignal)
 
 
 def _enter_folder(work: Work) -> None:
-    """Go to the driver's folder. Raises `ArtifactError` where that, or the group's, is not the driver's here."""
+    """Change to the driver's folder; raise `ArtifactError` if the group's folder is not the driver's here."""
     try:
         os.chdir(work.cwd)
         is_same = (work.folder / _TOKEN_FILE).read_text() == work.token
@@ -116,19 +116,21 @@ def _enter_folder(work: Work) -> None:
         is_same = False
     if not is_same:
         raise ArtifactError(
-            f"{platform.node()}: {work.root}: this node has another folder there, or none; "
-            "share the folder of the runs, and the current one, at the same paths"
+            f"{platform.node()}: {work.root}: this node has a different folder there, or none; "
+            "share the runs folder and the current folder at the same paths"
         )
 
 
 def _compare_versions(work: Work) -> list[str]:
-    """Return a warning for other versions of libraries. Raises `ArtifactError` for another rlctl or task."""
+    """Return warnings for different library versions; raise `ArtifactError` for a different rlctl or task."""
     here, node = collect_versions(), platform.node()
     if here["rlctl"] != work.versions["rlctl"]:
         versions = here["rlctl"], work.versions["rlctl"]
         raise ArtifactError("{}: rlctl {}, and {} on the driver: install the same version".format(node, *versions))
     if identify_task(work.task)["source_sha256"] != work.source_sha256:
-        raise ArtifactError(f"{node}: the file of task {work.task!r} is not the driver's: install the same version")
+        raise ArtifactError(
+            f"{node}: the file of task {work.task!r} differs from the driver's: install the same version"
+        )
     return [
         f"warning: not bit-equal: {name} {version} on the driver, {here.get(name, 'none')} on {node}"
         for name, version in work.versions.items()
@@ -137,19 +139,9 @@ def _compare_versions(work: Work) -> list[str]:
 
 
 def _bind(work: Work) -> TrainRequest:
-    """Return the request, or one that resumes the run that an earlier attempt began."""
+    """Return the request, or one that resumes the run of an earlier attempt."""
     request = TrainRequest.from_json(work.request)
     run = find_run_of_seed(work.folder, work.seed) if request.resume is None else None
     if run is None:
         return request
     return dataclasses.replace(request, task=None, config=None, initial_policy=None, resume=str(run.path), settings={})
-
-
-def to_json(work: Work) -> dict[str, Any]:
-    """Return a work as what JSON can hold."""
-    return dataclasses.asdict(work)
-
-
-def from_json(content: Mapping[str, Any]) -> Work:
-    """Return the work of `to_json`."""
-    return Work(**content)

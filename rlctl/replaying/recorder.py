@@ -120,13 +120,13 @@ def play_episode(
     terminated = truncated = False
     with _locate_errors(spec.task, seed, 0):
         observation, info = env.reset(seed=seed)
-        first, drawn = copy_observation(observation, space), _find_events(info, about)
+        first, drawn = _copy_observation(observation, space), _find_events(info, about)
     for look in looks:
         look(0)
     while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
         with _locate_errors(spec.task, seed, len(steps) + 1):
             observation, reward, terminated, truncated, info = env.step(_cast_action(action, env.action_space))
-            steps.append(_read_step(action, copy_observation(observation, space), float(reward), info, about))
+            steps.append(_read_step(action, _copy_observation(observation, space), float(reward), info, about))
         for look in looks:
             look(len(steps))
     ended = bool(terminated or truncated)
@@ -256,10 +256,19 @@ def _locate_errors(task: str, seed: int, step: int) -> Iterator[None]:
         raise TaskError(message, details=details) from error
 
 
-def copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
-    """Copy an observation in the dtype of its space, as recorded episodes have it; some environments reuse theirs."""
+def _copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
+    """Copy an observation in the dtype of its space, as recorded episodes have it; some environments reuse theirs.
+
+    A Dict inside a Dict becomes keys such as `achieved_goal/kettle`.
+    """
     if isinstance(space, spaces.Dict):
-        return {key: copy_observation(observation[key], part) for key, part in space.spaces.items()}
+        copied: dict[str, Any] = {}
+        for key, part in space.spaces.items():
+            value = _copy_observation(observation[key], part)
+            copied |= (
+                {f"{key}/{name}": inner for name, inner in value.items()} if isinstance(value, dict) else {key: value}
+            )
+        return copied
     value = np.array(observation, dtype=space.dtype)
     if value.shape != space.shape:
         raise ValueError(f"observation has shape {value.shape}, the space has {space.shape}")

@@ -1,4 +1,4 @@
-"""`rlctl replay`: rollouts of a policy, or a recorded episode, as recordings to look at."""
+"""`rlctl replay`: rollouts of a policy, or a recorded episode, as recordings, films, or in a window."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ import functools
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Literal
 
 from rlctl import output
 from rlctl.environments.info import describe
-from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
+from rlctl.environments.spec import UNCHANGED, EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.evaluate import LoadedPolicy, load_player
 from rlctl.policy.numpy_policy import load_policy
+from rlctl.recipe.sources import parse_changes
 from rlctl.replaying.film import check_file, film_episodes, make_filmable
 from rlctl.replaying.recorder import Choose, Rollout, make_drawable, play_episode, recorded_actions
 from rlctl.replaying.report import ReplayedEpisode, ReplayResult
 from rlctl.replaying.reproduce import print_warning, record_episode, verify_episode
+from rlctl.replaying.request import Choice, ReplayRequest
 from rlctl.replaying.scene import Env
 from rlctl.replaying.window import open_window, show_episodes
 from rlctl.rollout.collect import play_episodes
@@ -32,18 +33,10 @@ from rlctl.run.lookup import find_owner, find_policy, locate_task
 _EPISODES_TO_CHOOSE_FROM = 100
 
 
-@dataclasses.dataclass(frozen=True)
-class Choice:
-    """Episodes by outcome: by success where the task reports it, then by return."""
-
-    kind: Literal["worst", "best", "failures"]
-    count: int
-
-
 def choose_episodes(
     policy: LoadedPolicy, spec: EnvSpec, episodes: int, seed: int, choice: Choice
 ) -> tuple[list[EpisodeResult], str]:
-    """Play the episodes that `rlctl eval` plays and return those chosen, the most extreme first, and what they are.
+    """Play the episodes that `rlctl eval` plays; return the chosen ones, the most extreme first, and a description.
 
     Raises `UsageError` for failures where the task reports no success.
     """
@@ -68,65 +61,39 @@ def _describe_choice(results: Sequence[EpisodeResult], kind: str, count: int) ->
 def select(results: Sequence[EpisodeResult], choice: Choice) -> list[EpisodeResult]:
     """Return the results of the chosen episodes, the most extreme first."""
     if choice.kind == "failures" and any(result.success is None for result in results):
-        raise UsageError(f"--failures: this task reports no success; --worst {choice.count} goes by the return")
-    left = [result for result in results if choice.kind != "failures" or not result.success]
-    left.sort(key=lambda result: (bool(result.success), result.total_reward), reverse=choice.kind == "best")
-    return left[: choice.count]
-
-
-@dataclasses.dataclass(frozen=True)
-class ReplayRequest:
-    """What the command line asks for."""
-
-    source: str | None
-    episodes: int | None = None
-    """None: one, or 100 to choose from."""
-    seed: int = 0
-    checkpoint: str = "best"
-    task: str | None = None
-    changes: EnvChanges = UNCHANGED
-    verify: Path | None = None
-    gui: bool = False
-    output: Path | None = None
-    video: Path | None = None
-    """Write a film instead of recordings."""
-    choice: Choice | None = None
-    """Play `episodes` fast and replay those with certain outcomes."""
-    sim: str | None = None
-    """Another physics engine: `mujoco`, or `mujoco:SOLREF`."""
-
-    @property
-    def shown(self) -> int:
-        """How many episodes are shown, at most."""
-        return self.choice.count if self.choice else self.episodes or 1
+        raise UsageError(f"--failures: this task reports no success; use --worst {choice.count}, which goes by return")
+    candidates = [result for result in results if choice.kind != "failures" or not result.success]
+    candidates.sort(key=lambda result: (bool(result.success), result.total_reward), reverse=choice.kind == "best")
+    return candidates[: choice.count]
 
 
 def run_replay(request: ReplayRequest) -> ReplayResult:
-    """Record, show or verify what was asked for.
+    """Record, film, show or verify episodes.
 
-    The actions of a recorded episode are replayed, and its recording goes beside it. With a policy new episodes are
-    played, and each is written as an episode (`.npz`) and a recording (`.rrd`).
+    The actions of a recorded episode are replayed, and its recording is written next to it. With a policy new episodes
+    are played, and each is written as an episode (`.npz`) and a recording (`.rrd`).
     """
     _check_request(request)
     output.results()  # from here on what an environment, or PyBullet's window, prints goes to stderr
     if request.verify is not None:
         return _verify(request.verify)
-    played = _Recorded(Path(str(request.source)), request.output) if _is_episode(request.source) else _Actor(request)
-    spec, seeds, film = played.spec, played.seeds, None
-    if not seeds:
-        episodes = []
-    elif request.video is not None:
+    source = (
+        _RecordedSource(Path(str(request.source)), request.output)
+        if _is_episode(request.source)
+        else _PolicySource(request)
+    )
+    spec, seeds, film = source.spec, source.seeds, None
+    rollouts: list[Rollout] = []
+    if request.video is not None and seeds:
         with closing(make_filmable(spec)) as env:
-            begin = functools.partial(played.begin, env)
-            rollouts, film = film_episodes(request.video, env, spec, seeds, begin, policy=played.name)
-        episodes = [_summarize(rollout) for rollout in rollouts]
-    elif request.gui:
+            begin = functools.partial(source.begin, env)
+            rollouts, film = film_episodes(request.video, env, spec, seeds, begin, policy=source.name)
+    elif request.gui and seeds:
         with closing(open_window(spec)) as env:
-            rollouts = show_episodes(env, spec, seeds, functools.partial(played.begin, env))
-        episodes = [_summarize(rollout) for rollout in rollouts]
-    else:
-        episodes = played.record()
-    return dataclasses.replace(played.report(episodes), film=film)
+            rollouts = show_episodes(env, spec, seeds, functools.partial(source.begin, env))
+    elif seeds:
+        return source.report(source.record())
+    return dataclasses.replace(source.report([_summarize(rollout) for rollout in rollouts]), film=film)
 
 
 def _is_episode(source: str | None) -> bool:
@@ -134,7 +101,7 @@ def _is_episode(source: str | None) -> bool:
 
 
 def _check_request(request: ReplayRequest) -> None:
-    source, target = request.source, request.output
+    source, target, choice = request.source, request.output, request.choice
     if source is not None and Path(source).suffix == ".rrd":
         raise UsageError(f"{source} is a recording already; open it with: rerun {source}")
     if request.verify is not None and (source is not None or request.gui or target is not None):
@@ -143,13 +110,13 @@ def _check_request(request: ReplayRequest) -> None:
         raise UsageError("--gui shows a window and writes nothing: leave out --output")
     recorded = request.verify or (source if _is_episode(source) else None)
     if recorded and request.checkpoint != "best":
-        raise UsageError("a recorded episode is replayed as it was: leave out --checkpoint and --pretrained")
+        raise UsageError("a recorded episode is replayed unchanged: leave out --checkpoint and --pretrained")
     if recorded and request.sim is not None:
-        raise UsageError(f"--sim plays new episodes of a policy; {recorded} is a recorded one")
-    if recorded and (request.task is not None or request.changes or request.episodes not in (None, 1)):
-        raise UsageError("a recorded episode is replayed as it was: leave out --task, --set and --episodes")
-    if recorded and (choice := request.choice) is not None:
-        raise UsageError(f"--{choice.kind} chooses among the episodes of a policy; {recorded} is a recorded one")
+        raise UsageError(f"--sim plays new episodes of a policy; {recorded} is a recorded episode")
+    if recorded and (request.task is not None or request.settings or request.episodes not in (None, 1)):
+        raise UsageError("a recorded episode is replayed unchanged: leave out --task, --set and --episodes")
+    if recorded and choice is not None:
+        raise UsageError(f"--{choice.kind} chooses among episodes of a policy; {recorded} is a recorded episode")
     if request.video is not None:
         if request.gui or target is not None or request.verify is not None:
             raise UsageError("--video writes a film and nothing else: leave out --gui, --output and --verify")
@@ -176,7 +143,7 @@ def _load_episode(path: Path) -> RecordedEpisode:
     return dataclasses.replace(episode, info=episode.info.model_copy(update={"spec": spec}))
 
 
-class _Recorded:
+class _RecordedSource:
     """A recorded episode, whose actions are replayed."""
 
     def __init__(self, path: Path, output: Path | None) -> None:
@@ -189,7 +156,7 @@ class _Recorded:
         return recorded_actions(self._episode, env, self._path)
 
     def record(self) -> list[ReplayedEpisode]:
-        """Write the recording beside the episode, or to `--output`."""
+        """Write the recording next to the episode, or to `--output`."""
         recording = self._path.with_suffix(".rrd")
         if self._output is not None:
             recording = self._output if self._output.suffix == ".rrd" else self._output / recording.name
@@ -200,17 +167,18 @@ class _Recorded:
         return ReplayResult(self.spec.task, self.name, episodes)
 
 
-class _Actor:
+class _PolicySource:
     """A policy and the environment it acts in."""
 
     def __init__(self, request: ReplayRequest) -> None:
         self._output = request.output
-        found = find_policy(request.source, request.checkpoint)
-        output.print_notes(found.notes)
-        self._file, self._run = found.file, found.run
+        policy = find_policy(request.source, request.checkpoint)
+        output.print_notes(policy.notes)
+        self._file, self._run = policy.file, policy.run
         self._policy = load_policy(self._file)
         info = self._policy.info
-        self.spec: EnvSpec = found.locate(info.derive_spec(request.task, request.changes))
+        changes = parse_changes(request.settings) if request.settings else UNCHANGED
+        self.spec: EnvSpec = policy.locate(info.derive_spec(request.task, changes))
         if request.sim is not None:
             self.spec = dataclasses.replace(self.spec, sim=request.sim)
         self.name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
@@ -231,7 +199,7 @@ class _Actor:
         """Write each episode and its recording."""
         from rlctl.replaying.rrd import write_rrd
 
-        spec, done = self.spec, []
+        spec, episodes = self.spec, []
         with closing(make_drawable(spec, print_warning)) as env:
             for seed in self.seeds:
                 choose = self.begin(env, seed)
@@ -241,17 +209,18 @@ class _Actor:
                 save_episode(episode, rollout.episode)
                 title, several = f"{spec.task} / episode {recording.stem}", len(self.seeds) > 1
                 write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
-                done.append(_summarize(rollout, recording, episode))
-        return done
+                episodes.append(_summarize(rollout, recording, episode))
+        return episodes
 
     def report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
-        """Return the result; warns where an episode is not what it was when it was chosen."""
-        for each in episodes:
-            before = self._chosen.get(each.seed, each.total_reward)
-            if before != each.total_reward:
+        """Return the result; print a warning for an episode whose return has changed since it was chosen."""
+        for episode in episodes:
+            before = self._chosen.get(episode.seed, episode.total_reward)
+            if before != episode.total_reward:
                 print_warning(
-                    f"warning: seed {each.seed}: return {each.total_reward:.6g}, it was {before:.6g} when it was "
-                    f"chosen; does the environment repeat itself? rlctl check-env {self.spec.task}"
+                    f"warning: seed {episode.seed}: the return is {episode.total_reward:.6g}, but was {before:.6g} "
+                    "when the episode was chosen; the environment may not be deterministic: "
+                    f"rlctl check-env {self.spec.task}"
                 )
         return ReplayResult(self.spec.task, self.name, episodes, policy_file=self._described, choice=self._choice)
 
@@ -267,7 +236,7 @@ class _Actor:
             return owner.episode_file(owner.next_episode_number()).with_suffix(".rrd")
         if self._output.suffix == ".rrd":
             return self._output
-        numbers = [int(each.stem) for each in self._output.glob("*.*") if each.stem.isdecimal()]
+        numbers = [int(file.stem) for file in self._output.glob("*.*") if file.stem.isdecimal()]
         number = max(numbers, default=-1) + 1
         return self._output / RunDirectory(self._output).episode_file(number).with_suffix(".rrd").name
 

@@ -83,7 +83,7 @@ def test_a_lost_node_costs_an_attempt_and_no_bit(cluster, request_of_line, tmp_p
     for seed in (0, 1):
         local = run_training(dataclasses.replace(request, settings={**request.settings, "seed": seed}))
         assert_same_run(result.score.group.find_run(seed), local.run)
-    assert "the one before was lost" in capsys.readouterr().err
+    assert "the previous attempt was lost" in capsys.readouterr().err
 
 
 def _raylet(node):

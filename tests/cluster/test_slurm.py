@@ -79,7 +79,7 @@ def test_a_seed_is_given_up_after_retries_and_the_others_are_kept(train, slurm, 
 
 @pytest.mark.slow
 def test_a_group_goes_on_without_its_driver_which_finds_it_again(train, slurm, tmp_path):
-    with pytest.raises(Detached, match=r"submitted to SLURM; to come back: rlctl train --resume \S+ --on slurm"):
+    with pytest.raises(Detached, match=r"submitted to SLURM; to follow the runs: rlctl train --resume \S+ --on slurm"):
         train("0", LONG, detach=True)
     (folder,) = tmp_path.glob("runs/Line/*_seeds")
     assert {job.state for job in list_jobs(folder)} <= {"queued", "running"}
@@ -94,7 +94,7 @@ def test_a_folder_that_is_not_shared_is_named_and_not_tried_again(train, slurm, 
     (tmp_path / "cluster.yaml").write_text(f"setup: ['rm {tmp_path}/runs/Line/*_seeds/.jobs/driver']\n")
     result = train("0")
     assert result.failed == {0: 5}
-    assert "this node has another folder there, or none" in capsys.readouterr().err
+    assert "this node has a different folder there, or none" in capsys.readouterr().err
     assert read_job(result.score.group.path, 0).attempts == 1
 
 
@@ -103,7 +103,7 @@ def test_errors_of_slurm(train, slurm, tmp_path, monkeypatch):
     with pytest.raises(TaskError, match="--on slurm: sbatch failed: sbatch: error: Batch job submission failed"):
         train("0-1")
     monkeypatch.setenv("PATH", "/nowhere")
-    with pytest.raises(UsageError, match="there is no squeue on this machine: use a login node"):
+    with pytest.raises(UsageError, match="squeue is not installed on this machine; use a login node"):
         train("0-1")
 
 
@@ -112,7 +112,7 @@ def test_errors_of_slurm(train, slurm, tmp_path, monkeypatch):
     [
         ("sge", {}, "--on sge: give local, slurm, ray, ray:auto or ray:HOST:PORT"),
         ("local", {"detach": True}, "--detach is for --on slurm"),
-        ("slurm", {"verb": "tune"}, "tune --on slurm: trials follow from each other"),
+        ("slurm", {"verb": "tune"}, "tune --on slurm: each trial depends on the results of earlier ones"),
     ],
 )
 def test_executors_that_do_not_exist(on, options, message):

@@ -99,6 +99,24 @@ class Pixels(gymnasium.Env):
         return np.full((40, 60, 3), 20 * self.steps % 256, np.uint8)
 
 
+class Kitchen(Pixels):
+    """Observes a Dict inside a Dict, as FrankaKitchen of gymnasium-robotics does."""
+
+    def __init__(self, render_mode: str | None = None):
+        super().__init__(render_mode)
+        goals = spaces.Dict({name: spaces.Box(-2.0, 2.0, (size,), np.float64) for name, size in _GOALS.items()})
+        self.observation_space = spaces.Dict(
+            {"observation": spaces.Box(-1.0, 1.0, (2,), np.float64), "achieved_goal": goals}
+        )
+
+    def _observation(self):
+        goals = {name: np.full(size, 0.1 * self.steps) for name, size in _GOALS.items()}
+        return {"observation": self.point, "achieved_goal": goals}
+
+
+_GOALS = {"kettle": 3, "microwave": 1}
+
+
 class Blind(Pixels):
     """Cannot draw at all; its constructor knows no render_mode."""
 

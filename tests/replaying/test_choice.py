@@ -7,7 +7,8 @@ from rlctl.cli import build_app
 from rlctl.errors import UsageError
 from rlctl.evaluation.evaluate import Gates, run_evaluation
 from rlctl.evaluation.request import EvalRequest
-from rlctl.replaying.replay import Choice, ReplayRequest, run_replay, select
+from rlctl.replaying.replay import run_replay, select
+from rlctl.replaying.request import Choice, ReplayRequest
 from rlctl.rollout.messages import EpisodeResult
 
 
@@ -27,12 +28,12 @@ def test_success_counts_before_the_return(kind, count, seeds):
 def test_without_success_the_return_counts():
     played = results((None, 1.0), (None, 5.0))
     assert [result.seed for result in select(played, Choice("best", 1))] == [1]
-    with pytest.raises(UsageError, match="--failures: this task reports no success; --worst 3 goes by the return"):
+    with pytest.raises(UsageError, match="reports no success; use --worst 3, which goes by return"):
         select(played, Choice("failures", 3))
 
 
 def test_they_are_episodes_of_the_evaluation_bit_for_bit(run, tmp_path, capsys):
-    request = ReplayRequest(str(run.run.path), episodes=5, output=tmp_path, choice=Choice("worst", 2))
+    request = ReplayRequest(str(run.run.path), episodes=5, output=tmp_path, worst=2)
     result = run_replay(request)
     evaluated = run_evaluation(EvalRequest(str(run.run.path), episodes=5), Gates()).episodes
     expected = sorted((bool(row["success"]), row["return"], row["seed"]) for row in evaluated)[:2]
@@ -80,11 +81,14 @@ def test_a_number_below_1_or_not_whole_is_refused(rlctl, value, problem):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--worst", "1", "--best", "1"], "--worst and --best: give one of --worst, --best and --failures"),
-        (["x.npz", "--worst", "1"], "--worst chooses among the episodes of a policy; x.npz is a recorded one"),
+        (
+            ["--worst", "1", "--best", "1"],
+            "--worst and --best exclude each other: give one of --worst, --best and --failures",
+        ),
+        (["x.npz", "--worst", "1"], "--worst chooses among episodes of a policy; x.npz is a recorded episode"),
         (
             ["--verify", "x.npz", "--worst", "1"],
-            "--worst chooses among the episodes of a policy; x.npz is a recorded one",
+            "--worst chooses among episodes of a policy; x.npz is a recorded episode",
         ),
         (["--worst", "2", "-o", "y.rrd"], "--output y.rrd: a recording has one episode; give a folder for 2"),
         (["--video", "y.avi"], "--video y.avi: give a file that ends in .mp4 or .gif"),

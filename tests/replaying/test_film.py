@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from rlctl.errors import UsageError
-from rlctl.replaying.replay import ReplayRequest, run_replay
+from rlctl.replaying.replay import run_replay
+from rlctl.replaying.request import ReplayRequest
 from rlctl.run.episode import save_episode
 from tests.replaying.conftest import play
 

@@ -6,7 +6,9 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.replaying.recorder import make_drawable, play_episode
+from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.rrd import write_rrd
+from rlctl.run.episode import load_episode, save_episode
 from tests.replaying.conftest import ENVS, play
 from tests.replaying.reading import column, entities, jpegs
 
@@ -33,6 +35,15 @@ def test_actions_rewards_observations_and_pictures(tmp_path):
     assert sorted(pictures) == list(range(11))
     assert pictures[0][:2] == b"\xff\xd8"
     assert sorted(jpegs(path, "/observation/eye")) == list(range(11))
+
+
+def test_a_dict_inside_a_dict_has_curves_and_is_verified(tmp_path):
+    rollout, _ = play("Kitchen")
+    # 0.1 per step, from the reset on
+    assert column(write(rollout, tmp_path), "/observation/achieved_goal\\/kettle")[1][10].tolist() == [1.0, 1.0, 1.0]
+    save_episode(tmp_path / "one.npz", rollout.episode)
+    _, verification = verify_episode(load_episode(tmp_path / "one.npz"), tmp_path / "one.npz")
+    assert verification.difference is None
 
 
 def test_an_episode_without_steps_has_a_recording(tmp_path):

@@ -5,11 +5,11 @@ import shutil
 import numpy as np
 import pytest
 
-from rlctl.environments.spec import EnvChanges
 from rlctl.errors import ArtifactError
-from rlctl.replaying.replay import ReplayRequest, run_replay
+from rlctl.replaying.replay import run_replay
 from rlctl.replaying.report import as_json
 from rlctl.replaying.reproduce import record_episode
+from rlctl.replaying.request import ReplayRequest
 from rlctl.run.episode import load_episode, save_episode
 from tests.replaying.conftest import ENVS, play
 from tests.replaying.reading import column, layout, properties
@@ -61,7 +61,7 @@ def test_training_records_beside_its_episodes(run):
 
 
 def test_task_and_parameters_can_be_others(run, tmp_path):
-    request = ReplayRequest(str(run.run.path), changes=EnvChanges({"tolerance": 0.9}), output=tmp_path)
+    request = ReplayRequest(str(run.run.path), settings=["task.tolerance=0.9"], output=tmp_path)
     (episode,) = run_replay(request).episodes
     assert episode.success is True
     assert load_episode(episode.episode).info.spec.parameters == {"tolerance": 0.9}
@@ -155,7 +155,7 @@ def test_what_an_environment_prints_stays_out_of_the_result(replay, tmp_path):
         (
             ["x.npz", "--set", "task.tolerance=1"],
             2,
-            "error: a recorded episode is replayed as it was: leave out --task, --set and --episodes\n",
+            "error: a recorded episode is replayed unchanged: leave out --task, --set and --episodes\n",
         ),
         (
             ["--verify", "x.npz", "-o", "y.rrd"],

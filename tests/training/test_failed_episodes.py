@@ -3,7 +3,8 @@
 import pytest
 
 from rlctl.errors import TaskError, UsageError
-from rlctl.replaying.replay import ReplayRequest, run_replay
+from rlctl.replaying.replay import run_replay
+from rlctl.replaying.request import ReplayRequest
 from rlctl.run.episode import load_episode
 from tests.training.conftest import FAULTY, FAULTY_SEED, TINY
 

@@ -1,0 +1,75 @@
+"""What a replay is asked for: the arguments of `rlctl replay` as data. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+from rlctl.errors import UsageError
+from rlctl.options import Argument, Option
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Episodes by outcome: by success where the task reports it, then by return."""
+
+    kind: Literal["worst", "best", "failures"]
+    count: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayRequest:
+    """The arguments of `rlctl replay`."""
+
+    source: Annotated[
+        str | None,
+        Argument(
+            "A run or policy to roll out, or a recorded episode (.npz).",
+            metavar="[RUN or EPISODE]",
+            completes="run",
+            default_text="latest",
+        ),
+    ] = None
+    episodes: Annotated[
+        int | None, Option("Episodes to roll out, or to choose from.", min=1, default_text="1; 100 to choose from")
+    ] = None
+    worst: Annotated[
+        int | None, Option("Only the N worst of --episodes; N is 1 if left out.", metavar="[N]", min=1)
+    ] = None
+    best: Annotated[int | None, Option("Only the N best of --episodes.", metavar="[N]", min=1)] = None
+    failures: Annotated[
+        int | None, Option("Only N failed episodes of --episodes, the worst first.", metavar="[N]", min=1)
+    ] = None
+    seed: Annotated[int, Option("Seed of the list of episodes.", min=0)] = 0
+    checkpoint: Annotated[str, Option("Which policy of the run.", metavar="best|last|STEP")] = "best"
+    task: Annotated[str | None, Option("Roll out on this task instead of the one it was trained on.")] = None
+    settings: Annotated[
+        list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
+    ] = dataclasses.field(default_factory=list)
+    verify: Annotated[
+        Path | None, Option("Replay a recorded episode; exit 1 unless it is identical.", metavar="EPISODE")
+    ] = None
+    gui: Annotated[bool, Option("Show PyBullet's window instead of writing a recording.", ("--gui",))] = False
+    sim: Annotated[str | None, Option("Play in MuJoCo instead of PyBullet.", metavar="mujoco[:SOLREF]")] = None
+    output: Annotated[
+        Path | None,
+        Option("An .rrd file or a folder. Default: episodes/ of the run.", ("--output", "-o"), metavar="PATH"),
+    ] = None
+    video: Annotated[Path | None, Option("Write a film instead, .mp4 or .gif.", metavar="FILE")] = None
+
+    @property
+    def choice(self) -> Choice | None:
+        """Which episodes to choose by their outcome; raises `UsageError` for two kinds at once."""
+        counts: dict[Literal["worst", "best", "failures"], int | None]
+        counts = {"worst": self.worst, "best": self.best, "failures": self.failures}
+        choices = [Choice(kind, count) for kind, count in counts.items() if count is not None]
+        if len(choices) > 1:
+            kinds = f"--{choices[0].kind} and --{choices[1].kind}"
+            raise UsageError(f"{kinds} exclude each other: give one of --worst, --best and --failures")
+        return choices[0] if choices else None
+
+    @property
+    def shown(self) -> int:
+        """How many episodes are shown, at most."""
+        return self.choice.count if self.choice else self.episodes or 1
