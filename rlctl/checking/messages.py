@@ -97,7 +97,7 @@ class Form:
 
 
 @dataclasses.dataclass(frozen=True)
-class RecordedEpisode:
+class CheckedEpisode:
     """One episode of T steps, or the part of it that was played."""
 
     role: str
@@ -221,4 +221,4 @@ class End:
     """The process has done all it was asked for."""
 
 
-ChildMessage = Built | RecordedEpisode | CallFailure | RuleFinding | Fact | Skipped | Finished | Mistake | End
+ChildMessage = Built | CheckedEpisode | CallFailure | RuleFinding | Fact | Skipped | Finished | Mistake | End

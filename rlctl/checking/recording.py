@@ -11,7 +11,7 @@ from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.instance import Budget
 from rlctl.checking.leaves import Leaf, find_numbers, name_type, pick
-from rlctl.checking.messages import MOST_INFOS, CallFailure, Form, RecordedEpisode, Series
+from rlctl.checking.messages import MOST_INFOS, CallFailure, CheckedEpisode, Form, Series
 
 
 class Recording:
@@ -34,7 +34,7 @@ class Recording:
         self._infos: dict[str, tuple[list[int], list[float]]] = {}
         self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
 
-    def run(self) -> list[RecordedEpisode | CallFailure]:
+    def run(self) -> list[CheckedEpisode | CallFailure]:
         """Play the episode to its end; return what to send."""
         while self.running:
             self.advance()
@@ -67,7 +67,7 @@ class Recording:
         """Whether the episode was left before its end, for steps or time."""
         return self._ended in ("steps", "time")
 
-    def messages(self) -> list[RecordedEpisode | CallFailure]:
+    def messages(self) -> list[CheckedEpisode | CallFailure]:
         """Return what to send: the trajectory, and the failure that ended it, if one did."""
         return [self.trajectory, *([self.failure] if self.failure else [])]
 
@@ -148,10 +148,10 @@ class Recording:
         self._previous[index] = value, copy
 
     @property
-    def trajectory(self) -> RecordedEpisode:
+    def trajectory(self) -> CheckedEpisode:
         """What was written down."""
         names = ("what", "type", "leaf", "dtype", "shape")
-        return RecordedEpisode(
+        return CheckedEpisode(
             role=self.role,
             episode=self.episode.number,
             seed=self.episode.seed,

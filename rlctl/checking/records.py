@@ -10,11 +10,11 @@ from rlctl.checking.finding import NotJudged, RuleFinding
 from rlctl.checking.messages import (
     Built,
     CallFailure,
+    CheckedEpisode,
     ChildMessage,
     Fact,
     Finished,
     Form,
-    RecordedEpisode,
     Series,
     Skipped,
 )
@@ -29,7 +29,7 @@ class Records:
 
     task: str
     built: Built | None = None
-    trajectories: list[RecordedEpisode] = dataclasses.field(default_factory=list)
+    trajectories: list[CheckedEpisode] = dataclasses.field(default_factory=list)
     failures: list[CallFailure] = dataclasses.field(default_factory=list)
     findings: list[RuleFinding] = dataclasses.field(default_factory=list)
     """Those of the experiments."""
@@ -52,7 +52,7 @@ class Records:
         match message:
             case Built():
                 self.built = message
-            case RecordedEpisode():
+            case CheckedEpisode():
                 self.trajectories.append(message)
             case CallFailure():
                 self.failures.append(message)
@@ -65,12 +65,12 @@ class Records:
             case Finished():
                 self.finished[message.experiment] = message
 
-    def role(self, role: str) -> list[RecordedEpisode]:
+    def role(self, role: str) -> list[CheckedEpisode]:
         """Return what was recorded for one purpose."""
         return [trajectory for trajectory in self.trajectories if trajectory.role == role]
 
     @property
-    def episodes(self) -> list[RecordedEpisode]:
+    def episodes(self) -> list[CheckedEpisode]:
         """Return the whole episodes of the first process."""
         return self.role("episodes")
 
@@ -81,28 +81,28 @@ class Records:
         return self.built
 
     @property
-    def alone(self) -> list[RecordedEpisode]:
+    def alone(self) -> list[CheckedEpisode]:
         """Return all episodes of instances that were alone in their process and used as a learner uses them."""
         return [trajectory for trajectory in self.trajectories if trajectory.role not in OTHERS_MATTER]
 
-    def require_alone(self) -> list[RecordedEpisode]:
+    def require_alone(self) -> list[CheckedEpisode]:
         """Return the same; raises `NotJudged` if there is none."""
         episodes = self.alone
         if not any(episode.steps or episode.observations for episode in episodes):
             raise NotJudged("no episode was recorded")
         return episodes
 
-    def forms(self, what: str) -> list[tuple[RecordedEpisode, Form]]:
+    def forms(self, what: str) -> list[tuple[CheckedEpisode, Form]]:
         """Return every type that something had in the same episodes."""
         return [(episode, form) for episode in self.require_alone() for form in episode.forms if form.what == what]
 
-    def series(self, leaf: int) -> list[tuple[RecordedEpisode, Series]]:
+    def series(self, leaf: int) -> list[tuple[CheckedEpisode, Series]]:
         """Return the values of a leaf of the observation in the same episodes, where there are any."""
         return [
             (episode, episode.observations[leaf]) for episode in self.require_alone() if leaf in episode.observations
         ]
 
-    def require_role(self, role: str) -> RecordedEpisode:
+    def require_role(self, role: str) -> CheckedEpisode:
         """Return the episode of a comparison; raises `NotJudged` if there is none."""
         episodes = self.role(role)
         if not episodes:

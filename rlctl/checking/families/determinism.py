@@ -25,9 +25,9 @@ from rlctl.checking.messages import (
     SECOND_SEED,
     SUCCESS,
     Built,
+    CheckedEpisode,
     ChildMessage,
     Fact,
-    RecordedEpisode,
     Skipped,
 )
 from rlctl.checking.recording import Recording
@@ -86,7 +86,7 @@ def _find_kept(instance: Instance) -> list[str]:
     return find_unequal(*read)
 
 
-def compare(records: Records, first: str, second: str) -> tuple[RecordedEpisode, FirstDifference | None]:
+def compare(records: Records, first: str, second: str) -> tuple[CheckedEpisode, FirstDifference | None]:
     """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
     built = records.require_built()
     if not built.accepts_seed:
@@ -114,7 +114,7 @@ def require_independent(records: Records) -> None:
 def report(
     rule: str,
     records: Records,
-    trajectory: RecordedEpisode,
+    trajectory: CheckedEpisode,
     difference: FirstDifference,
     what: str,
     cause: str = "",
@@ -210,7 +210,7 @@ class FirstDifference:
         at = "at reset" if self.step == 0 else f"at step {self.step}"
         return f"first difference {at}: {self.element} is {self.first:.9g}, then {self.second:.9g}{size}"
 
-    def evidence(self, trajectory: RecordedEpisode) -> dict[str, Any]:
+    def evidence(self, trajectory: CheckedEpisode) -> dict[str, Any]:
         """Return it with the trajectory's seed, as a finding's evidence."""
         return {
             "seed": trajectory.seed,
@@ -227,7 +227,7 @@ def _plain(value: float) -> float | str:
     return value if np.isfinite(value) else str(value)
 
 
-def find_difference(built: Built, one: RecordedEpisode, two: RecordedEpisode) -> FirstDifference | None:
+def find_difference(built: Built, one: CheckedEpisode, two: CheckedEpisode) -> FirstDifference | None:
     """Compare two trajectories bit for bit as far as both go; NaN equals NaN."""
     differences: list[FirstDifference] = []
     for index in sorted(one.observations.keys() & two.observations.keys()):

@@ -10,7 +10,7 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments import check, experiment
 from rlctl.checking.finding import NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Budget, Context, Instance
-from rlctl.checking.messages import ENDS, FIRST_SEED, ChildMessage, RecordedEpisode
+from rlctl.checking.messages import ENDS, FIRST_SEED, CheckedEpisode, ChildMessage
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Records
 
@@ -81,7 +81,7 @@ def find_unseeded(context: Context) -> Iterator[ChildMessage]:
         yield RuleFinding("RL311", message, {"element": name, "seed": FIRST_SEED}, where=where)
 
 
-def _require_episodes(records: Records) -> list[RecordedEpisode]:
+def _require_episodes(records: Records) -> list[CheckedEpisode]:
     """Return the whole episodes that can be judged: those that did not raise."""
     episodes = [episode for episode in records.episodes if episode.ended != "raised"]
     if not episodes:
@@ -126,7 +126,7 @@ def _find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
         yield from () if has_obstacle else (RuleFinding("RL501", message, evidence),)
 
 
-def _ends_with_odd_reward(episode: RecordedEpisode) -> bool:
+def _ends_with_odd_reward(episode: CheckedEpisode) -> bool:
     """Say whether the last reward is outside of what all others are: an obstacle that was hit, not a clock."""
     before, last = episode.rewards[:-1], episode.rewards[-1]
     return bool(before.size and (last < before.min() or last > before.max()))

@@ -27,7 +27,7 @@ from rlctl.checking.families.rewards import (
 )
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, SUCCESS, ChildMessage, RecordedEpisode, Skipped
+from rlctl.checking.messages import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage, Skipped
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Records
 
@@ -93,7 +93,7 @@ def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
 
 
 def _severity_of_end(
-    episodes: Sequence[RecordedEpisode], early: Sequence[RecordedEpisode], inner: NDArray[np.float64]
+    episodes: Sequence[CheckedEpisode], early: Sequence[CheckedEpisode], inner: NDArray[np.float64]
 ) -> Severity | None:
     if reports_success(episodes):
         return Severity.WARNING
@@ -133,7 +133,7 @@ def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
     )
 
 
-def _bonus(idle: Sequence[RecordedEpisode]) -> tuple[str | None, float]:
+def _bonus(idle: Sequence[CheckedEpisode]) -> tuple[str | None, float]:
     """Return the constant positive term that is most of the reward, if there is one, and its share."""
     total = sum(float(np.nansum(np.abs(values))) for episode in idle for values in find_terms(episode).values())
     if total <= 0 or not all(has_terms(episode) for episode in idle):

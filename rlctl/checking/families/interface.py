@@ -19,7 +19,7 @@ from rlctl.checking.failures import (
 )
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, CallFailure, ChildMessage, Form, RecordedEpisode
+from rlctl.checking.messages import FIRST_SEED, CallFailure, CheckedEpisode, ChildMessage, Form
 from rlctl.checking.records import Records
 from rlctl.errors import RecipeError
 
@@ -76,7 +76,7 @@ def _find_wrong_types(records: Records) -> Iterator[RuleFinding]:
         yield _of_form("RL204", f"info is {_a(form.type)} at step {form.step}", trajectory, form, "dict")
 
 
-def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[RecordedEpisode, Form]]:
+def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[CheckedEpisode, Form]]:
     """Yield the first place of each type of something, without those that are fine."""
     types = set(fine)
     for trajectory, form in records.forms(what):
@@ -86,7 +86,7 @@ def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[Reco
 
 
 def _of_form(
-    rule: str, message: str, trajectory: RecordedEpisode, form: Form, expected: str, severity: Severity | None = None
+    rule: str, message: str, trajectory: CheckedEpisode, form: Form, expected: str, severity: Severity | None = None
 ) -> RuleFinding:
     return RuleFinding(rule, message, trajectory.at(form.step, type=form.type, expected=expected), severity)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rlctl.checking.experiments import RECORDING, check
 from rlctl.checking.finding import RuleFinding, Severity, list_names
 from rlctl.checking.leaves import Leaf, name_leaf
-from rlctl.checking.messages import Form, RecordedEpisode, Series
+from rlctl.checking.messages import CheckedEpisode, Form, Series
 from rlctl.checking.records import Records
 
 ROUNDING = 1e-6
@@ -26,7 +26,7 @@ SMALLEST_SIDE = 36
 """An image with a shorter side does not fit through the default network's filters [pixels]."""
 
 
-def _forms(records: Records) -> Iterator[tuple[Leaf, list[tuple[RecordedEpisode, Form]]]]:
+def _forms(records: Records) -> Iterator[tuple[Leaf, list[tuple[CheckedEpisode, Form]]]]:
     """Yield what each leaf that can be judged looked like, in all episodes."""
     forms = records.forms("observation")
     for index, leaf in enumerate(records.require_built().leaves):
@@ -126,7 +126,7 @@ def find_out_of_range(records: Records) -> Iterator[RuleFinding]:
 
 
 def _severity_of_outside(
-    recorded: list[tuple[RecordedEpisode, Series, NDArray[np.float64]]], outside: NDArray[np.bool_]
+    recorded: list[tuple[CheckedEpisode, Series, NDArray[np.float64]]], outside: NDArray[np.bool_]
 ) -> Severity:
     """Return how bad it is that some observations are outside. Shape of `outside`: all that were recorded."""
     is_first = np.concatenate([series.steps == 0 for _, series, _ in recorded])

@@ -13,7 +13,7 @@ from rlctl.checking.experiments import check, experiment
 from rlctl.checking.failures import EnvironmentRaised, describe
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, SUCCESS, ChildMessage, RecordedEpisode
+from rlctl.checking.messages import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage
 from rlctl.checking.records import Records
 
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")
@@ -45,7 +45,7 @@ TOLERANCE = 1e-4
 GOALS = ("achieved_goal", "desired_goal")
 
 
-def require_readable(records: Records) -> list[RecordedEpisode]:
+def require_readable(records: Records) -> list[CheckedEpisode]:
     """Return the episodes of a step at least, if flags and infos can be read; raises `NotJudged` otherwise."""
     records.require_built()
     if records.forms("step"):
@@ -57,7 +57,7 @@ def require_readable(records: Records) -> list[RecordedEpisode]:
     return episodes
 
 
-def require_rewarded(records: Records) -> list[RecordedEpisode]:
+def require_rewarded(records: Records) -> list[CheckedEpisode]:
     """Return the same, if every reward is a finite number."""
     episodes = require_readable(records)
     if not all(episode.reward_is_number.all() for episode in episodes):
@@ -67,17 +67,17 @@ def require_rewarded(records: Records) -> list[RecordedEpisode]:
     return episodes
 
 
-def _require_enough(episodes: list[RecordedEpisode]) -> None:
+def _require_enough(episodes: list[CheckedEpisode]) -> None:
     if sum(episode.steps for episode in episodes) < ENOUGH_STEPS:
         raise NotJudged(f"fewer than {ENOUGH_STEPS} steps were recorded")
 
 
-def has_terms(episode: RecordedEpisode) -> bool:
+def has_terms(episode: CheckedEpisode) -> bool:
     """Say whether there are reward terms in info."""
     return any(name.startswith(TERMS) for name in episode.infos)
 
 
-def find_terms(episode: RecordedEpisode) -> dict[str, NDArray[np.float64]]:
+def find_terms(episode: CheckedEpisode) -> dict[str, NDArray[np.float64]]:
     """Return the reward terms of an episode by name; NaN where one is not in info. Shape (T,) each."""
     terms = {}
     for name, series in episode.infos.items():
@@ -89,7 +89,7 @@ def find_terms(episode: RecordedEpisode) -> dict[str, NDArray[np.float64]]:
     return terms
 
 
-def find_constant_terms(episodes: Sequence[RecordedEpisode]) -> dict[str, float]:
+def find_constant_terms(episodes: Sequence[CheckedEpisode]) -> dict[str, float]:
     """Return the terms that have one value at all steps of all episodes."""
     by_name: dict[str, list[NDArray[np.float64]]] = {}
     for episode in episodes:
@@ -102,17 +102,17 @@ def find_constant_terms(episodes: Sequence[RecordedEpisode]) -> dict[str, float]
     }
 
 
-def reports_success(episodes: Sequence[RecordedEpisode]) -> bool:
+def reports_success(episodes: Sequence[CheckedEpisode]) -> bool:
     """Say whether `is_success` is in info, at least sometimes."""
     return any(SUCCESS in episode.infos for episode in episodes)
 
 
-def has_succeeded(episode: RecordedEpisode) -> bool:
+def has_succeeded(episode: CheckedEpisode) -> bool:
     """Say whether `is_success` was true at any step."""
     return SUCCESS in episode.infos and bool((episode.infos[SUCCESS].values > 0).any())
 
 
-def ends_in_success(episode: RecordedEpisode) -> bool:
+def ends_in_success(episode: CheckedEpisode) -> bool:
     """Say whether `is_success` was true at the last step."""
     series = episode.infos.get(SUCCESS)
     return series is not None and int(series.steps[-1]) == episode.steps and bool(series.values[-1] > 0)
@@ -128,12 +128,12 @@ def discounted_steps(reward: float, steps: int) -> float:
     return float(reward * (1 - DISCOUNT**steps) / (1 - DISCOUNT))
 
 
-def longest_episode(records: Records, episodes: Sequence[RecordedEpisode]) -> int:
+def longest_episode(records: Records, episodes: Sequence[CheckedEpisode]) -> int:
     """Return how long an episode may last: the declared limit, or the longest that was recorded [steps]."""
     return records.require_built().max_steps or max(episode.steps for episode in episodes)
 
 
-def summarize(episodes: Sequence[RecordedEpisode]) -> str:
+def summarize(episodes: Sequence[CheckedEpisode]) -> str:
     """Return how much was recorded: `80 episodes with random, zero and searched actions (6,100 steps)`."""
     kinds = list(dict.fromkeys(episode.actions for episode in episodes))
     kinds_text = " and ".join([", ".join(kinds[:-1]), kinds[-1]]) if len(kinds) > 1 else kinds[0]

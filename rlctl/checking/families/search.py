@@ -29,7 +29,7 @@ from rlctl.checking.families.rewards import (
 from rlctl.checking.families.state import play_after_ends
 from rlctl.checking.finding import NotJudged, RuleFinding
 from rlctl.checking.instance import Context, find_longest_episode
-from rlctl.checking.messages import FIRST_SEED, ChildMessage, RecordedEpisode, Skipped
+from rlctl.checking.messages import FIRST_SEED, CheckedEpisode, ChildMessage, Skipped
 from rlctl.checking.recording import Recording
 
 MOST_STEPS = 6_000
@@ -67,7 +67,7 @@ class _Attempt:
     """One episode of the search."""
 
     sequence: list[Any]
-    played: RecordedEpisode
+    played: CheckedEpisode
 
     @property
     def score(self) -> float:
@@ -188,7 +188,7 @@ class _Search:
         return is_left and not self.budget.why_spent
 
 
-def _finishes(episode: RecordedEpisode, success_is_reported: bool) -> bool:
+def _finishes(episode: CheckedEpisode, success_is_reported: bool) -> bool:
     """Whether an episode ended at the goal: as it reports, or else with a reward far above what it began with."""
     if episode.ended not in ("terminated", "both"):
         return False
@@ -213,7 +213,7 @@ class Stop:
     """Its mean reward from that step on."""
 
 
-def compare_returns(one: RecordedEpisode, two: RecordedEpisode, at: int, longest: int) -> Stop:
+def compare_returns(one: CheckedEpisode, two: CheckedEpisode, at: int, longest: int) -> Stop:
     """Compare an episode that finished with one that is the same for `at` steps. `longest`: the time limit [steps]."""
     rest = two.rewards[at:]
     to_come = 0 if two.has_ended else longest - two.steps
@@ -221,7 +221,7 @@ def compare_returns(one: RecordedEpisode, two: RecordedEpisode, at: int, longest
     return Stop(at + 1, discounted_sum(one.rewards[at:]), stopping, float(rest.mean()))
 
 
-def _judge_stops(finished: RecordedEpisode, stops: Sequence[Stop]) -> Iterator[ChildMessage]:
+def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[ChildMessage]:
     if not stops:
         yield Skipped("RL605", "no episode that stops just before the goal could be played")
         return

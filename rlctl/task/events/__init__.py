@@ -13,17 +13,17 @@ from rlctl.task.events.changes import (
     shift_gravity,
 )
 from rlctl.task.events.event import Event, EventSettings, acts_at
-from rlctl.task.events.ranges import Fraction, Limits, NotNegative, Positive, Range, Steps
+from rlctl.task.events.ranges import Fraction, NotNegative, Positive, Range, RangeLimits, Steps
 from rlctl.task.events.signals import delay, noise
 
 __all__ = [
     "Event",
     "EventSettings",
     "Fraction",
-    "Limits",
     "NotNegative",
     "Positive",
     "Range",
+    "RangeLimits",
     "Steps",
     "acts_at",
     "delay",

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, RlctlError, TaskError, check_name
-from rlctl.task.events.ranges import Limits, Range, Widening, read_range
+from rlctl.task.events.ranges import RangeLimits, Range, Widening, read_range
 
 When = Literal["reset", "start", "interval", "observation", "action"]
 Drawn = dict[str, float]
@@ -88,7 +88,7 @@ class Event:
         return {p.name: p for p in found if p.kind is not p.VAR_KEYWORD}
 
     @property
-    def ranges(self) -> dict[str, Limits]:
+    def ranges(self) -> dict[str, RangeLimits]:
         """The parameters that are drawn from, those first that the task sets, with what they may hold."""
         names = sorted(self._signature, key=lambda name: name not in self.parameters)
         found = {name: _find_limits(self._hints.get(name)) for name in names}
@@ -131,7 +131,7 @@ class Event:
         elif self.of:
             raise error(f"{where}.of: names observations, so it is for events at 'observation', not {self.when!r}.")
         if self.when == "interval":
-            read_range(f"{where}.every_s", self.every_s, Limits(0.0, above=True), error)
+            read_range(f"{where}.every_s", self.every_s, RangeLimits(0.0, above=True), error)
         return BoundEvent(name, self, values, error)
 
     @cached_property
@@ -146,17 +146,17 @@ class Event:
         limits = _find_limits(hint)
         widens = hint is None and isinstance(value, Mapping) and value.keys() == {"from", "to"}
         if widens or limits is not None:
-            return read_range(where, value, limits or Limits(), error)
+            return read_range(where, value, limits or RangeLimits(), error)
         if hint is not None:
             _check_type(where, hint, value, error)
         return value
 
 
-def _find_limits(hint: Any) -> Limits | None:
+def _find_limits(hint: Any) -> RangeLimits | None:
     """Return what a range of this type may hold; None for a type that is not a range."""
     if hint != Range and getattr(hint, "__origin__", None) != Range:
         return None
-    return next((m for m in getattr(hint, "__metadata__", ()) if isinstance(m, Limits)), Limits())
+    return next((m for m in getattr(hint, "__metadata__", ()) if isinstance(m, RangeLimits)), RangeLimits())
 
 
 def _check_type(where: str, hint: Any, value: Any, error: type[RlctlError]) -> None:

@@ -20,8 +20,8 @@ goes from the first to the second as the environment's level goes from 0 to 1.
 
 
 @dataclasses.dataclass(frozen=True)
-class Limits:
-    """What the values of a range may be, in its annotation: `Annotated[Range, Limits(low=0.0)]`."""
+class RangeLimits:
+    """What the values of a range may be, in its annotation: `Annotated[Range, RangeLimits(low=0.0)]`."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -39,10 +39,10 @@ class Limits:
         return f"{value:g} is not at most {self.high:g}" if value > self.high else ""
 
 
-Positive = Annotated[Range, Limits(0.0, above=True)]
-NotNegative = Annotated[Range, Limits(0.0)]
-Fraction = Annotated[Range, Limits(0.0, 1.0)]
-Steps = Annotated[Range, Limits(0.0, whole=True)]
+Positive = Annotated[Range, RangeLimits(0.0, above=True)]
+NotNegative = Annotated[Range, RangeLimits(0.0)]
+Fraction = Annotated[Range, RangeLimits(0.0, 1.0)]
+Steps = Annotated[Range, RangeLimits(0.0, whole=True)]
 
 
 class Widening(NamedTuple):
@@ -58,7 +58,7 @@ class Widening(NamedTuple):
         return (round(low), round(high)) if self.whole else (low, high)
 
 
-def read_range(where: str, value: Any, limits: Limits, error: type[Exception] = TaskError) -> Widening:
+def read_range(where: str, value: Any, limits: RangeLimits, error: type[Exception] = TaskError) -> Widening:
     """Read what a task or a recipe has written for a range; raises `error` that begins with `where`."""
     if not isinstance(value, Mapping):
         pair = _pair(where, value, limits, error)
@@ -76,7 +76,7 @@ def read_range(where: str, value: Any, limits: Limits, error: type[Exception] = 
 _EXPECTED = "Write [low, high], a number, or {from: [low, high], to: [low, high]}."
 
 
-def _pair(where: str, value: Any, limits: Limits, error: type[Exception]) -> Range:
+def _pair(where: str, value: Any, limits: RangeLimits, error: type[Exception]) -> Range:
     numbers = list(value) if isinstance(value, list | tuple | np.ndarray) else [value, value]
     if len(numbers) != 2 or not all(_is_number(number) for number in numbers):
         raise error(f"{where}: {value!r} is not a range of finite numbers. {_EXPECTED}")
