@@ -15,7 +15,7 @@ from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.run.robustness import Axis
-from rlctl.task.events import Event, Limits, set_color
+from rlctl.task.events import Event, RangeLimits, set_color
 from rlctl.task.events.ranges import read_range
 from rlctl.task.task import Task
 
@@ -102,7 +102,7 @@ def _vary_event(
         raise UsageError(f"--vary {name}: event {key!r} draws {', '.join(ranges) or 'nothing'}.{close}")
     parameter = parameter or next(iter(ranges))
     limits = ranges[parameter]
-    read_range(f"--vary {name}", list(span[:2]), Limits(limits.low, limits.high, limits.above), UsageError)
+    read_range(f"--vary {name}", list(span[:2]), RangeLimits(limits.low, limits.high, limits.above), UsageError)
     acts = spec.randomize or event.enabled or key in spec.events
     return Axis(
         name=name,
