@@ -121,16 +121,20 @@ def evaluate(
 def load_policy(path: str | os.PathLike[str], /) -> Policy:
     """Load a `.safetensors` file, an exported `.onnx` file, or the best policy of a run's folder; without torch.
 
-    `load_policy(path).predict(observation)` returns the action. The name of an installed task, `load_policy("ant")`,
-    is the policy that ships with it, never that of a run. Raises `ArtifactError` for a file that is not one.
+    `load_policy(path).predict(observation)` returns the action. `path` may be an address, `hf://ORG/NAME`. The name
+    of an installed task, `load_policy("ant")`, loads the policy that ships with it, never that of a run. Raises
+    `ArtifactError` for a file that is not a policy.
     """
     from rlctl.environments import installed
+    from rlctl.hub import store
     from rlctl.policy import numpy_policy
     from rlctl.policy.shipped import find_shipped_policy
     from rlctl.run.directory import RunDirectory
 
     name, file = os.fspath(path), Path(path)
-    if not file.suffix and installed.find(name) is not None:
+    if store.is_address(name):
+        file = store.fetch(name)
+    elif not file.suffix and installed.find(name) is not None:
         file = find_shipped_policy(name)
     if RunDirectory(file).status_file.is_file():
         file = RunDirectory(file).policy_file()

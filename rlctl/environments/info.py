@@ -125,13 +125,26 @@ def _encode_bounds(values: Any) -> Any:
     # One number where all are equal: images have many thousand bounds. Text, because JSON has no infinity.
     flat = values.ravel()
     same = flat.size > 0 and bool((flat == flat[0]).all())  # np.unique would import numpy.ma, in every worker
-    return repr(float(flat[0])) if same else [repr(float(v)) for v in flat]
+    return _write_number(flat[0]) if same else [_write_number(number) for number in flat]
+
+
+def _write_number(number: Any) -> str:
+    # float64 holds no more than 53 bits: it reads the largest int64 as 2**63.
+    is_exact = np.issubdtype(number.dtype, np.floating) or int(float(number)) == int(number)
+    return repr(float(number)) if is_exact else str(int(number))
 
 
 def _decode_bounds(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
     if isinstance(value, str):
-        return np.full(shape, np.float64(value).astype(dtype))
-    return np.array([float(v) for v in value]).reshape(shape).astype(dtype)
+        return np.full(shape, _read_number(value, dtype), dtype)
+    return np.array([_read_number(text, dtype) for text in value], dtype).reshape(shape)
+
+
+def _read_number(text: str, dtype: np.dtype[Any]) -> float:
+    if dtype.kind in "bf":
+        return float(text)
+    # Earlier files have 2**63 for the largest int64.
+    return int(text) if text.lstrip("-").isdecimal() else min(int(float(text)), int(np.iinfo(dtype).max))
 
 
 def space_from_json(data: dict[str, Any]) -> spaces.Space[Any]:

@@ -51,6 +51,11 @@ def is_address(text: str | None) -> bool:
     return text is not None and _ADDRESS.match(text) is not None
 
 
+def is_cached(path: Path) -> bool:
+    """Return whether a file or folder was downloaded by `fetch`: others wrote what is in it."""
+    return path.resolve().is_relative_to(_cache().resolve())
+
+
 def fetch(address: str) -> Path:
     """Return the folder or file in the cache that has what is at an address; download what is not there yet.
 
@@ -171,13 +176,12 @@ def _download(store: Any, path: str, address: str, target: Path, entry: StoredFi
 
 def _cache() -> Path:
     base = os.environ.get("XDG_CACHE_HOME")
-    folder = (Path(base) if base else Path.home() / ".cache") / "rlctl" / "hub"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    return (Path(base) if base else Path.home() / ".cache") / "rlctl" / "hub"
 
 
 @contextlib.contextmanager
 def _temporary_folder() -> Iterator[Path]:
+    _cache().mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="new-", dir=_cache()))
     try:
         yield folder

@@ -172,10 +172,10 @@ def locate_task(task: str, run: RunDirectory | None) -> str:
     """Return a task with the whole path of its file, if it was named by a path from the folder of the training.
 
     A run that has been moved to another folder finds the file there, by the path that was typed. A module that is found
-    nowhere else is imported from the folder of the training.
+    nowhere else is imported from the folder of the training. A downloaded run names no folder of this machine.
     """
     place, _, name = task.rpartition(":")
-    if run is None or not place or Path(place).expanduser().is_absolute():
+    if run is None or not place or Path(place).expanduser().is_absolute() or store.is_cached(run.path):
         return task
     folder = run.status().get("folder")
     if not isinstance(folder, str):

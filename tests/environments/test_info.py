@@ -19,6 +19,9 @@ from rlctl.errors import ArtifactError, UsageError
         spaces.Box(np.array([-1.0, -2.5], np.float32), np.array([0.1, 7.0], np.float32)),
         spaces.Box(0, 255, (8, 6, 3), np.uint8),
         spaces.Box(-5, 5, (2, 2), np.int64),
+        spaces.Box(-(2**63), 2**63 - 1, (2,), np.int64),
+        spaces.Box(np.array([0, 2**53]), np.array([2**53 + 1, 2**62 + 1]), dtype=np.int64),
+        spaces.Box(0, 2**64 - 1, (2,), np.uint64),
         spaces.Box(-1.0, 1.0, (), np.float32),
         spaces.Discrete(5),
         spaces.Discrete(5, start=-2),
@@ -43,6 +46,12 @@ def test_bounds_keep_every_bit():
     low = np.array([0.1, 1 / 3, 1e-45], np.float32)
     back = space_from_json(space_to_json(spaces.Box(low, low + 1)))
     assert back.low.tobytes() == low.tobytes()
+
+
+def test_whole_numbers_that_were_written_as_floats():
+    data = space_to_json(spaces.Box(-(2**63), 2**63 - 1, (2,), np.int64))
+    assert space_from_json(data | {"high": "9.223372036854776e+18"}).high.tolist() == [2**63 - 1] * 2
+    assert space_to_json(spaces.Box(0, 255, (2,), np.uint8))["high"] == "255.0"
 
 
 def test_images_take_no_room():

@@ -2,14 +2,16 @@
 
 import hashlib
 import json
+import sys
 
 import fsspec
 import pytest
 
+import rlctl
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.hub import store
 from rlctl.policy.file import PolicyFile
-from rlctl.run.lookup import find_policy, find_run
+from rlctl.run.lookup import find_policy, find_run, locate_task
 from rlctl.runs.push import push_run
 from rlctl.storage import files
 from tests.deploy.server.serving import write_policy
@@ -50,6 +52,30 @@ def test_push_and_use(run, pushed):
     card = pushed.cat("/lab/reach/README.md").decode()
     assert "| seed | 3 |" in card
     assert "| evaluation during training | not evaluated |" in card
+
+
+def test_a_downloaded_run_names_no_folder_of_this_machine(run, tmp_path):
+    """A stranger's run.json must not decide which code is imported."""
+    (tmp_path / "swing.py").write_text("")
+    (tmp_path / "swinging_legs.py").write_text("")
+    status = json.dumps(STATUS | {"folder": str(tmp_path)}).encode()
+    store.push({"policies/best.safetensors": run / "policies/best.safetensors", "run.json": status}, ADDRESS)
+    fetched = find_run(ADDRESS)
+    assert fetched.status()["folder"] == str(tmp_path)
+    before = list(sys.path)
+    for task in ("swing.py:Swing", "swinging_legs:Swing"):
+        assert locate_task(task, fetched) == task
+    assert sys.path == before
+
+
+def test_from_python(run, pushed):
+    policy = rlctl.load_policy(str(run))
+    observation = policy.info.env.spaces()[0].sample()
+    action = policy.predict(observation)
+    for address in (ADDRESS, f"{ADDRESS}/policies/best.safetensors"):
+        assert (rlctl.load_policy(address).predict(observation) == action).all()
+    with pytest.raises(UsageError, match="no task 'test'"):  # what this policy was written for
+        rlctl.evaluate(ADDRESS, episodes=1)
 
 
 def test_a_folder_is_downloaded_once(pushed):
