@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, RlctlError, TaskError, check_name
-from rlctl.task.events.ranges import RangeLimits, Range, Widening, read_range
+from rlctl.task.events.ranges import Range, RangeLimits, Widening, read_range
 
 When = Literal["reset", "start", "interval", "observation", "action"]
 Drawn = dict[str, float]
