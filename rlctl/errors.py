@@ -1,4 +1,4 @@
-"""What can go wrong, and the exit code each kind ends the tool with."""
+"""The exceptions of rlctl, with their exit codes, and helpers for their messages."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-_LONGEST = 400  # characters of somebody else's message
-_MOST_LINES = 80  # of somebody else's traceback
+_LONGEST = 400  # [characters] of another library's message
+_MOST_LINES = 80  # of a plugin's traceback
 _OURS = Path(__file__).parent
 _IMPORTLIB = Path(importlib.__file__).parent
 
@@ -31,25 +31,25 @@ class RlctlError(Exception):
 
 
 class AnswerIsNo(RlctlError):
-    """Everything worked, and the answer is no: a check failed, a gate was missed, a replay differed."""
+    """The command worked and its result is negative: a check failed, a gate was missed, a replay differed."""
 
     exit_code = 1
 
 
 class UsageError(RlctlError):
-    """The command line asks for something that does not exist or that this task cannot do."""
+    """The request names something that does not exist, or that this task does not support."""
 
     exit_code = 2
 
 
 class RunTaken(UsageError):
-    """Another process writes this run; the exit code is that of `EX_TEMPFAIL`: what runs trainings tries again."""
+    """Another process writes this run; the exit code is `EX_TEMPFAIL`, so that schedulers try again later."""
 
     exit_code = 75
 
 
 class NoSuchClassError(UsageError):
-    """A module was imported and does not define the class that was asked for."""
+    """A module was imported and does not define the requested class."""
 
 
 class OldGymError(UsageError):
@@ -61,17 +61,17 @@ class RecipeError(UsageError):
 
 
 class TaskError(RlctlError):
-    """The task or its plugin failed: import, exception, crash, hang, or values that are not finite."""
+    """The task or its plugin failed: import error, exception, crash, hang, or values that are not finite."""
 
     exit_code = 3
 
 
 class PolicyError(TaskError):
-    """A policy that is a function raised, or returned what is not an action."""
+    """A policy that is a user's function raised an exception, or returned something that is not an action."""
 
 
 class EpisodeFailed(TaskError):
-    """An environment failed in an episode that can be reproduced, as `hint` says."""
+    """An environment failed in an episode; `hint` says how to reproduce it."""
 
     def __init__(self, what: str, env: int, seed: int, step: int, *, hint: str, details: str | None = None) -> None:
         super().__init__(f"{what}\nin environment {env}, episode seed {seed}, step {step}; {hint}", details=details)
@@ -79,9 +79,9 @@ class EpisodeFailed(TaskError):
         self.env = env
         self.seed = seed
         self.step = step
-        """Number of the step that failed, from 1; 0 for the reset."""
+        """Number of the failed step, from 1; 0 for the reset."""
         self.actions: Any = None
-        """The actions of the episode, that of the failed step last, shape (step, ...); None where they are unknown."""
+        """The actions of the episode up to the failed step, shape (step, ...); None if they are unknown."""
 
     def with_hint(self, hint: str) -> EpisodeFailed:
         """Return the same error with another hint."""
@@ -95,13 +95,13 @@ class DivergedError(RlctlError):
 
 
 class ArtifactError(RlctlError):
-    """A file is missing, damaged, not ours, or made for other spaces."""
+    """A file is missing, damaged, not from rlctl, or for other spaces."""
 
     exit_code = 5
 
 
 class Interrupted(RlctlError):
-    """A signal ended the run in good order; the exit code is 128 + the signal's number."""
+    """A signal ended the run, which was saved; the exit code is 128 + the signal's number."""
 
     def __init__(self, message: str, signal_number: int) -> None:
         super().__init__(message)
@@ -109,7 +109,7 @@ class Interrupted(RlctlError):
 
 
 def describe_exception(error: BaseException) -> str:
-    """Return `RuntimeError: the gripper fell off`: a line, not too long, of whatever somebody else's code raised."""
+    """Describe any exception in one line of limited length: `RuntimeError: the gripper fell off`."""
     name = type(error).__name__
     try:
         text = " ".join(str(error).split())
@@ -117,21 +117,21 @@ def describe_exception(error: BaseException) -> str:
         text = f"(message unavailable: {type(another).__name__})"
     if len(text) > _LONGEST:
         text = f"{text[:_LONGEST]}..."
-    # Of a file name that is not UTF-8 Python makes characters that no file of ours can hold.
+    # Python decodes file names that are not UTF-8 to surrogates, which cannot be written as UTF-8.
     text = text.encode(errors="backslashreplace").decode()
     return f"{name}: {text}" if text else name
 
 
 def format_plugin_traceback(error: BaseException) -> str:
-    """Return a traceback that begins where rlctl calls somebody else's code; empty if it never does."""
+    """Return a traceback that begins at the first frame outside rlctl; empty if there is none."""
     frames = error.__traceback__
     while frames is not None and not _is_plugin_file(frames.tb_frame.f_code.co_filename):
         frames = frames.tb_next
-    if frames is None and not isinstance(error, SyntaxError):  # which names its line itself
+    if frames is None and not isinstance(error, SyntaxError):  # its message names the line
         return ""
     lines = "".join(traceback.format_exception(type(error), error, frames)).splitlines(keepends=True)
     left_out = len(lines) - _MOST_LINES
-    if left_out > 0:  # functions that call each other until the stack is full
+    if left_out > 0:  # an endless recursion
         lines[_MOST_LINES // 2 : -_MOST_LINES // 2] = [f"  ... {left_out} lines left out ...\n"]
     return "".join(lines)
 
@@ -143,7 +143,7 @@ def _is_plugin_file(file: str) -> bool:
 
 
 def did_you_mean(word: str, options: Iterable[str]) -> str:
-    """Return " Did you mean 'reach'?" for the option closest to `word`, or an empty string."""
+    """Return " Did you mean 'reach'?" for the option closest to `word`, else an empty string."""
     close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.5)
     return f" Did you mean {close[0]!r}?" if close else ""
 
@@ -157,14 +157,14 @@ def check_name(
     listed: str = "It has",
     none: str = "none",
 ) -> None:
-    """Raise `error` for a name that is not known; it begins with `no_such`, then comes the closest one, then all."""
+    """Raise `error` if a name is unknown: `no_such`, the name, the closest known name, all known names."""
     if name not in (names := list(known)):
         there = short_repr(", ".join(names) or none, 200)
         raise error(f"{no_such} {short_repr(name)!r}.{did_you_mean(str(name), names)} {listed}: {there}.")
 
 
 def explain_missing_package(user: str, missing: str | None, extra: str) -> str:
-    """Return `USER needs MISSING: pip install ...` with the packages of an extra of rlctl, which is on no index."""
+    """Return `USER needs MISSING: pip install ...` with the packages of the extra; rlctl itself is not on PyPI."""
     from importlib import metadata
 
     try:
@@ -177,10 +177,10 @@ def explain_missing_package(user: str, missing: str | None, extra: str) -> str:
 
 
 def short_repr(value: object, length: int = 80) -> str:
-    """Return a value as Python writes it, text as it is, in one line of at most `length` characters."""
+    """Return a text, or the `repr` of any other value, as one line of at most `length` characters."""
     try:
         text = value if isinstance(value, str) else repr(value)
-    except (ValueError, RecursionError):  # a number of thousands of digits; what holds itself
-        text = f"a {type(value).__name__} that cannot be written down"
+    except (ValueError, RecursionError):  # a number with thousands of digits; an object that contains itself
+        text = f"a {type(value).__name__} without a repr"
     text = " ".join(text.split())
     return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -28,8 +28,8 @@ _PIPED_WIDTH = 1000  # nothing folds: a line stays a line for grep
 def results() -> TextIO:
     """Return the stream of results: the stdout this process was started with.
 
-    From then on file descriptor 1 points to stderr, so that what PyBullet, a plugin or a worker prints cannot
-    mix with a result.
+    Afterwards file descriptor 1 points to stderr, so that output of PyBullet, a plugin or a worker never mixes
+    with a result.
     """
     try:
         sys.stdout.flush()
@@ -43,12 +43,12 @@ def results() -> TextIO:
 
 
 def leave_closed_terminal() -> None:
-    """Point what leads to a terminal that was closed to nowhere: to write there would be an error from now on."""
+    """Redirect the streams of a terminal that was closed to /dev/null; writing to them would fail."""
     nowhere = os.open(os.devnull, os.O_RDWR)
     own = [results().fileno()] if results.cache_info().currsize else []
     for descriptor in (0, 1, 2, *own):
-        with contextlib.suppress(OSError):  # not open at all
-            # A closed terminal is a device still, but no terminal.
+        with contextlib.suppress(OSError):  # not open
+            # After the terminal is closed, the descriptor is still a character device, but isatty() is False.
             if stat.S_ISCHR(os.fstat(descriptor).st_mode) and not os.isatty(descriptor):
                 os.dup2(nowhere, descriptor)
     os.close(nowhere)
@@ -67,17 +67,17 @@ def err() -> Console:
 
 
 def escape_controls(text: str) -> str:
-    """Return text with control characters written as `\\x1b`: a terminal obeys them, and names can contain any."""
+    """Return text with control characters escaped as `\\x1b`: names may contain some, and terminals execute them."""
     return _CONTROLS.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
 
 
 def _make_console(stream: TextIO | None) -> Console:
-    """Return a console for a stream, or for what stderr is whenever it writes: a notebook may replace it."""
+    """Return a console for a stream; for None it writes to the current stderr, which a notebook may replace."""
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
 
     class SafeConsole(Console):
-        """Writes no control character of a text itself, whatever is printed."""
+        """Escapes the control characters of any text that is printed."""
 
         def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
             for segment in super().render(renderable, options):
@@ -85,18 +85,18 @@ def _make_console(stream: TextIO | None) -> Console:
 
     terminal = (stream or sys.stderr).isatty()
     width = None if terminal else _PIPED_WIDTH
-    # Neither markup nor emoji: "car.py:Car: no findings" would have one in it, and "joint[left]" would lose its end.
+    # No markup and no emoji: "car.py:Car:" contains an emoji name, and "joint[left]" a markup tag.
     options: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False, "soft_wrap": not terminal}
     return SafeConsole(file=stream, stderr=stream is None, width=width, **options)
 
 
 def is_utf8() -> bool:
-    """Say whether stderr, which shows progress, can show more than ASCII."""
+    """Return whether stderr, which shows progress, can show more than ASCII."""
     return (getattr(sys.stderr, "encoding", None) or "").lower().startswith("utf")
 
 
 def confirm(question: str, refusal: str) -> bool:
-    """Ask on the terminal; raises `UsageError`, with `refusal`, where nobody can be asked."""
+    """Ask on the terminal; raises `UsageError(refusal)` without a terminal."""
     if sys.stdin is None or not sys.stdin.isatty():
         raise UsageError(refusal)
     import typer
@@ -106,7 +106,7 @@ def confirm(question: str, refusal: str) -> bool:
 
 @contextlib.contextmanager
 def show_progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show on a terminal how much of `total` is done, and when it will be; the function given takes how much."""
+    """Show a progress bar on a terminal; yields a function that takes how much of `total` is done."""
     if not err().is_terminal:
         yield lambda done: None
         return
@@ -118,7 +118,7 @@ def show_progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 def format_duration(seconds: float) -> str:
-    """Return a time for people: `50 s`, `12 min`, `3.4 h`, `2.5 days`."""
+    """Format a time [s]: `50 s`, `12 min`, `3.4 h`, `2.5 days`."""
     for size, unit in ((86_400, "days"), (3600, "h")):
         if seconds >= size:
             return f"{round(seconds / size, 1):g} {unit}"
@@ -126,12 +126,12 @@ def format_duration(seconds: float) -> str:
 
 
 def format_count(count: int, noun: str) -> str:
-    """Return a number of things: `1 episode`, `2,000 episodes`."""
+    """Format a number with a noun: `1 episode`, `2,000 episodes`."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Print lines for people to stderr."""
+    """Print lines to stderr."""
     for note in notes:
         err().print(note, style="dim")
 
@@ -147,11 +147,10 @@ def print_table(
     drop: Sequence[str] = (),
     gap: str = "  ",
 ) -> None:
-    """Print a table of results, its columns aligned right but for those in `left`. A cell is plain text, not markup.
+    """Print a table of results, with columns aligned right except those in `left`. Cells are plain text, not markup.
 
-    A table without column names has no header. Where the terminal is too narrow for one line per row, the columns in
-    `drop` are left out one by one, in this order; if the table is still too wide, cells are folded: those of texts
-    after the first column, and all others only where that does not suffice.
+    A table without column names has no header. If the terminal is too narrow, the columns in `drop` are left out one by
+    one, in this order. If the table is still too wide, texts after the first column are folded, then all other cells.
     """
     from rich.text import Text
 
@@ -217,10 +216,9 @@ def _print_lines(table: list[list[Text]], names: list[str], left: Collection[str
 
 
 def present(content: Any, json_target: str | None) -> bool:
-    """Write a result as JSON where `--json` asks for it: to a file, or to stdout for `-`.
+    """Write a result as JSON to the target of `--json`: a file, or stdout for `-`; None writes nothing.
 
-    `content` is plain data, dataclasses and paths. Return whether stdout has it; then nothing else belongs there.
-    Without a target nothing is written.
+    `content` is plain data, dataclasses and paths. Return whether it went to stdout; then print nothing else there.
     """
     if json_target is None:
         return False

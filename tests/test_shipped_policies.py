@@ -174,7 +174,7 @@ def test_a_plugin_ships_a_policy_and_its_task_changes(rlctl, install):
     write_push_policy(file, 2)
     good = rlctl("eval", "push", "--pretrained", "--episodes", 2, path=site)
     assert good.returncode == 0, good.stderr
-    assert f"warning: {site}/pushing.py is not what it was when this policy was exported; its score" in good.stderr
+    assert f"warning: {site}/pushing.py has changed since this policy was exported; its score" in good.stderr
     write_push_policy(file, 3)
     changed = rlctl("eval", "push", "--pretrained", "--episodes", 2, path=site)
     assert changed.returncode == 5

@@ -1,4 +1,4 @@
-"""Spaces and observations as parts by key: those of a Dict space; any other space has one part."""
+"""Split spaces and observations into parts by key. A Dict space has a part per key, any other space one part."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 Observations = NDArray[Any] | dict[str, NDArray[Any]]
-"""Observations of several rows: environments, or steps."""
+"""A batch of observations; a row per environment or per step."""
 
 LARGEST_SPACE = 10_000_000
-"""Elements that the observations or the actions of an environment may have: a full-HD picture has 6 million."""
+"""Maximum number of elements of an observation or action space; a full-HD picture has 6 million."""
 
 SINGLE = ""
 """The key of the only part of a space that is not a Dict."""
@@ -30,7 +30,7 @@ def split(observation: Any) -> dict[str, Any]:
 
 
 def join(parts: Mapping[str, Any]) -> Any:
-    """Return the observation that `split` has taken apart."""
+    """Return the observation whose parts these are; the inverse of `split`."""
     return parts[SINGLE] if SINGLE in parts else dict(parts)
 
 
@@ -40,7 +40,7 @@ def map_parts(function: Callable[[Any], Any], observation: Any) -> Any:
 
 
 def take_row(observations: Any, row: int) -> Any:
-    """Return one observation of several."""
+    """Return one observation of a batch."""
     return map_parts(lambda part: part[row], observations)
 
 
@@ -52,9 +52,10 @@ def stack(observations: Sequence[Any]) -> Observations:
 
 
 def split_names(observations: Any, sizes: Mapping[str, int]) -> dict[str, NDArray[Any]]:
-    """Return observations of several rows by name, each of shape (rows, ...): by key, or by the sizes of what is flat.
+    """Split a batch of observations by name; each part has shape (rows, ...).
 
-    Of stacked observations it is the newest. Where nothing has a name there is one part.
+    A Dict is split by key, a flat observation by `sizes`; of stacked frames only the newest is returned. Without names
+    the result is one part.
     """
     parts = split(observations)
     if SINGLE not in parts or not sizes or parts[SINGLE].ndim != 2:
@@ -64,6 +65,6 @@ def split_names(observations: Any, sizes: Mapping[str, int]) -> dict[str, NDArra
 
 
 def format_space(space: Any, longest: int = 100) -> str:
-    """Return a space as text of one line; of one that would be longer only its kind and shape."""
+    """Return a space as one line of text; if that is longer than `longest`, only its kind and shape."""
     text = " ".join(str(space).split())
     return text if len(text) <= longest else f"{type(space).__name__}{getattr(space, 'shape', None) or ''}"

@@ -1,4 +1,4 @@
-"""What a policy file says of its environment, as plain data: spaces, names, units, timing."""
+"""The description of an environment that policy files contain, as plain data: spaces, names, units, timing."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.task.joints import Joints
 
 _ONE_HOT = 10
-"""How many elements of a Box an alternative of a discrete space counts for."""
+"""Each value of a discrete space counts as this many elements of a Box."""
 
 
 class EnvInfo(pydantic.BaseModel):
-    """Describes an environment; kept in every policy file, ONNX file and run."""
+    """Describes an environment; part of every policy file, ONNX file and run."""
 
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     observation_sizes: dict[str, int] = {}
-    """Size per observation name, in the order of the flat observation; empty where names are not known."""
+    """Size per observation name, in the order of the flat observation; empty if the names are unknown."""
     observation_units: dict[str, str] = {}
     action_meaning: str = ""
     control_dt: float | None = None
     """Time between two actions [s]."""
     reward_weights: dict[str, float] = {}
     events: dict[str, bool] = {}
-    """Random changes that the task offers, and whether each acts."""
+    """The task's events (random changes), and whether each acts."""
     has_success: bool = False
     has_compute_reward: bool = False
-    """Whether it can compute the reward of a step for another goal than the wanted one."""
+    """Whether it has `compute_reward`, which hindsight replay needs."""
     max_steps: int | None = None
     robot: str = ""
     joints: Joints | None = None
-    """What the action moves, where the task says so."""
+    """The joints that the action moves, if the task describes them."""
 
     def spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         """Return the observation and the action space."""
         return space_from_json(self.observation_space), space_from_json(self.action_space)
 
     def find_difference(self, other: EnvInfo, whose: str = "the environment's") -> str | None:
-        """Say how the spaces of `other` differ from these, in a few words; None if they do not."""
+        """Describe how the spaces of `other` differ from these; None if they are equal."""
         for name in ("observation", "action"):
             ours, theirs = getattr(self, f"{name}_space"), getattr(other, f"{name}_space")
             if ours != theirs:
@@ -56,7 +56,7 @@ class EnvInfo(pydantic.BaseModel):
 
 
 def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
-    """Describe an environment; for a task with its names, units and timing."""
+    """Describe an environment; a `Task` also gives names, units and timing."""
     from rlctl.environments.mujoco_model import describe_model
     from rlctl.environments.wrappers import find_time_feature, find_time_limit
     from rlctl.task.env import TaskEnv
@@ -87,14 +87,14 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
 
 
 def describe_randomization(events: Mapping[str, bool]) -> str:
-    """Return whether and by what an environment was randomised; empty for one that offers no events."""
+    """Return `randomised by NAMES` or `not randomised`; empty for an environment without events."""
     if acting := [name for name, acts in events.items() if acts]:
         return f"randomised by {', '.join(acting)}"
     return "not randomised" if events else ""
 
 
 def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
-    """Return a space as plain data; raises `UsageError` for a kind or a size that no policy here can handle."""
+    """Return a space as plain data; raises `UsageError` for a kind or size of space that policies do not support."""
     if isinstance(space, spaces.Box | spaces.MultiBinary) and math.prod(space.shape or ()) > LARGEST_SPACE:
         raise UsageError(
             f"a space of {math.prod(space.shape or ()):,} elements; at most {LARGEST_SPACE:,} are supported"
@@ -122,7 +122,7 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
 
 
 def _encode_bounds(values: Any) -> Any:
-    # One number where all are equal: images have many thousand bounds. Text, because JSON has no infinity.
+    # One number if all bounds are equal: images have many thousands. As text, because JSON has no infinity.
     flat = values.ravel()
     same = flat.size > 0 and bool((flat == flat[0]).all())  # np.unique would import numpy.ma, in every worker
     return _write_number(flat[0]) if same else [_write_number(number) for number in flat]
@@ -148,7 +148,7 @@ def _read_number(text: str, dtype: np.dtype[Any]) -> float:
 
 
 def space_from_json(data: dict[str, Any]) -> spaces.Space[Any]:
-    """Return the space that `space_to_json` wrote; raises `ArtifactError` if it is not one, before it takes memory."""
+    """Return the space that `space_to_json` encoded; raises `ArtifactError` for invalid or too large data."""
     try:
         if (count := _count_elements(data)) > LARGEST_SPACE:
             raise ValueError(f"{count:,} elements, at most {LARGEST_SPACE:,} are supported")
@@ -164,7 +164,7 @@ def _count_elements(data: dict[str, Any]) -> int:
         return math.prod(_check_shape(data["shape"]))
     if data["type"] == "MultiBinary":
         return math.prod(_check_shape(data["n"]))
-    # Networks want them one-hot, as numbers of eight bytes, for a whole batch.
+    # Networks get them one-hot encoded, 8 bytes per number, for a whole batch.
     alternatives = [data["n"]] if data["type"] == "Discrete" else data["nvec"]
     return _ONE_HOT * sum(_check_whole(count) for count in alternatives)
 
@@ -185,7 +185,7 @@ def _build(data: dict[str, Any]) -> spaces.Space[Any]:
             shape = _check_shape(data["n"])
             return spaces.MultiBinary(list(shape) if isinstance(data["n"], list) else shape[0])
         case "Dict":
-            # Pairs: a mapping would be sorted by key, and the order is part of the space.
+            # Pairs, because Gymnasium sorts a mapping by key, and the order is part of the space.
             return spaces.Dict([(key, _build(value)) for key, value in data["spaces"].items()])
     raise ValueError(f"no type {short_repr(data['type'])}")
 

@@ -1,4 +1,4 @@
-"""Installed tasks: what each distribution declares under the entry-point group `rlctl.tasks`. Imports no plugin."""
+"""Installed tasks: the entry points of the group `rlctl.tasks` in all distributions. Imports no plugin."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TARGET = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 @dataclasses.dataclass(frozen=True)
 class TaskEntry:
-    """An installed task, as its distribution declares it; nothing of it is imported."""
+    """An installed task, as its distribution declares it; its code is not imported."""
 
     name: str
     target: str
@@ -32,7 +32,7 @@ class TaskEntry:
     distribution: str
     version: str
     problem: str | None = None
-    """Why it cannot be used under its name, if so."""
+    """Why the task cannot be used by its name; None if it can."""
 
     @property
     def module_file(self) -> Path | None:
@@ -41,7 +41,7 @@ class TaskEntry:
 
     @property
     def recipe_file(self) -> Path | None:
-        """The packaged recipe: `<name>.yaml` beside the module, or the module's own, `<module>.yaml`."""
+        """The packaged recipe: `<name>.yaml` next to the module, or the module's own, `<module>.yaml`."""
         file = self.module_file
         if file is None or self.problem:
             return None
@@ -50,7 +50,7 @@ class TaskEntry:
 
     @property
     def policy_file(self) -> Path | None:
-        """The shipped policy: `policies/<name>.safetensors` beside the module."""
+        """The shipped policy: `policies/<name>.safetensors` next to the module."""
         file = self.module_file
         if file is None or self.problem:
             return None
@@ -59,22 +59,22 @@ class TaskEntry:
 
 
 def list_installed() -> list[TaskEntry]:
-    """Return every installed task, by name; of two with one name the bundled one, or the first, can be used.
+    """Return every installed task, sorted by name. Of two with the same name, rlctl's own or the first can be used.
 
-    The list is made again when `sys.path`, or a folder on it, has changed.
+    The result is cached until `sys.path` or a folder on it changes.
     """
     return list(_list_installed(tuple((folder, _find_state(folder or os.curdir)) for folder in sys.path)))
 
 
 def find(name: str) -> TaskEntry | None:
-    """Return the installed task of a name."""
+    """Return the installed task with this name, or None."""
     if ":" in name:  # names a module, a file or a package
         return None
     return next((entry for entry in list_installed() if entry.name == name), None)
 
 
 def _find_state(folder: str) -> tuple[int, ...]:
-    """Return which folder it is, and when something was added or removed; empty if it is none."""
+    """Return the identity and the modification time of a folder; empty if it does not exist."""
     try:
         state = os.stat(folder)
     except OSError:
@@ -103,7 +103,7 @@ def _rank(entry: TaskEntry) -> tuple[Any, ...]:
 
 
 def _read_distribution(distribution: importlib.metadata.Distribution) -> Iterator[TaskEntry]:
-    """Yield the tasks of a distribution; whatever is broken about it becomes the `problem` of its tasks."""
+    """Yield the tasks of a distribution; what is broken in it becomes the `problem` of its tasks."""
     problem = None
     try:
         text = distribution.read_text("entry_points.txt") or ""
@@ -112,7 +112,7 @@ def _read_distribution(distribution: importlib.metadata.Distribution) -> Iterato
         problem = "its entry_points.txt is not UTF-8"
     except OSError:
         return
-    if GROUP not in text:  # most distributions: their metadata, which is slow to parse, is not needed
+    if GROUP not in text:  # most distributions; their metadata is slow to parse and not needed
         return
     try:
         metadata: Any = distribution.metadata
@@ -154,7 +154,7 @@ def _find_problem(entry: TaskEntry, owner: TaskEntry) -> str | None:
 
 
 def check_import(entry: TaskEntry, timeout_s: float = 60.0) -> str | None:
-    """Import a task in a child process; return what it raised, in a line, or None."""
+    """Import a task in a child process; return its exception as one line, or None."""
     import subprocess
 
     code = (
@@ -174,7 +174,7 @@ def check_import(entry: TaskEntry, timeout_s: float = 60.0) -> str | None:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return f"import did not end within {timeout_s:.0f} s"
+        return f"import did not finish within {timeout_s:.0f} s"
     lines = [line[1:] for line in child.stdout.splitlines() if line.startswith("@")]
     if not lines:
         return f"import ended the process with exit code {child.returncode}"

@@ -1,6 +1,6 @@
-"""What is known of any environment that MuJoCo simulates, such as Gymnasium's: its model has names, limits and masses.
+"""Read names, limits and masses from the model of any environment that MuJoCo simulates, such as Gymnasium's.
 
-MuJoCo itself is not imported here: an environment that uses it has done so.
+Nothing here imports MuJoCo; an environment that uses it has imported it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-    """Return `model` and `data` of an environment that has them, None of any other."""
+    """Return the MuJoCo `model` and `data` of an environment, or None."""
     library, inner = sys.modules.get("mujoco"), env.unwrapped
     if library is None:
         return None
@@ -34,14 +34,14 @@ def describe_model(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     found = find_mujoco(env)
     if found is None:
         return {}
-    dt = getattr(env.unwrapped, "dt", None)  # frames per second are rounded: 67 for a step of 0.015 s
+    dt = getattr(env.unwrapped, "dt", None)  # not from the frame rate, which is rounded: 67 for a step of 0.015 s
     step = {"control_dt": float(dt)} if isinstance(dt, float | int) and dt > 0 else {}
     size = int(np.prod(env.action_space.shape or ()))
     return {**step, "joints": _describe_joints(found[0]) if size == found[0].nu else None}
 
 
 def _describe_joints(model: mujoco.MjModel) -> Joints | None:
-    """Describe the joints that the actuators move, in their order; None where one moves something else."""
+    """Describe the joints that the actuators move, in their order; None if one moves something else."""
     import mujoco
 
     joint_kind, no_bias = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtBias.mjBIAS_NONE)
@@ -62,7 +62,7 @@ def _describe_joints(model: mujoco.MjModel) -> Joints | None:
 
 
 def joint_name(model: mujoco.MjModel, joint: int) -> str:
-    """Return the name of a joint, or its number where it has none."""
+    """Return a joint's name, or its number if it has no name."""
     return model.joint(int(joint)).name or f"joint {joint}"
 
 

@@ -1,7 +1,8 @@
-"""Tasks that a file names. A file may name environments, and nothing else: no function, no script, no class of others.
+"""Check tasks that a file names, before they are imported: a file may name environments and nothing else.
 
-A policy, a recorded episode or a run says which task it is for, with parameters; what they name is code on this
-machine, and files are sent by others. A person who names a task on the command line may name anything.
+Policies, recorded episodes and runs contain the name of their task, and loading it runs code on this machine. The
+file may come from somebody else, so other functions, scripts and classes are refused. A user on the command line may
+name anything.
 """
 
 from __future__ import annotations
@@ -28,36 +29,36 @@ _LARGEST = 10 * 2**20  # [bytes] of a source file that is looked into
 
 
 def load(task: str, named_by: str) -> Callable[..., Any]:
-    """Import a task that `named_by` names, as `registry.load` does; raises `ArtifactError` unless it is one."""
+    """Import a task that a file of kind `named_by` names; raises `ArtifactError` if it is not an environment."""
     if not task.isprintable():
-        raise _make_error(task, named_by, "that is not a name")
+        raise _make_error(task, named_by, "it contains unprintable characters")
     if installed.find(task) is None and ":" in task:
         _look_before_import(task, named_by)
     constructor = registry.load(task)
     if not _may_be_called(task, constructor):
-        raise _make_error(task, named_by, "that is not an environment class")
+        raise _make_error(task, named_by, "it is not an environment class")
     return constructor
 
 
 def _make_error(task: str, named_by: str, why: str) -> ArtifactError:
     shown = task if len(task) <= 80 else f"{task[:80]}..."
-    hint = "; if you know what it is, name it yourself with --task" if named_by == POLICY else ""
+    hint = "; if you trust it, name it with --task" if named_by == POLICY else ""
     return ArtifactError(
-        f"{named_by} names {shown!r} as its task, and {why}: not run, because a file may name environments only{hint}"
+        f"{named_by} names {shown!r} as its task, but {why}; not run, because a file may name environments only{hint}"
     )
 
 
 def _look_before_import(task: str, named_by: str) -> None:
-    """Raise `ArtifactError` for what cannot be an environment, judged by its source: importing it would run it."""
+    """Raise `ArtifactError` if the source shows that it cannot be an environment; an import would already run it."""
     by_id = _MODULE_ID.match(task)
     place, _, name = task.rpartition(":")
     file = registry.find_source_file(f"{place}:_")  # of a Gymnasium id, the module that registers it
     if file is None or not file.is_file():
         if place.partition(".")[0] in sys.stdlib_module_names:
-            raise _make_error(task, named_by, "that is a part of Python")
-        return  # nothing to import: the registry says so
+            raise _make_error(task, named_by, "it is part of Python")
+        return  # nothing to import; `registry.load` raises the error
     if file.suffix != ".py" or _is_of_python(file):
-        raise _make_error(task, named_by, "that is a part of Python or of rlctl")
+        raise _make_error(task, named_by, "it is part of Python or rlctl")
     source = _read_source(file)
     if by_id is not None:
         if "gymnasium" not in source:
@@ -67,7 +68,7 @@ def _look_before_import(task: str, named_by: str) -> None:
 
 
 def _is_of_python(file: Path) -> bool:
-    """Say whether a file is of the standard library, under which packages are installed as well, or of rlctl."""
+    """Return whether a file belongs to rlctl or the standard library; installed packages do not count."""
     library, file = Path(sysconfig.get_paths()["stdlib"]).resolve(), file.resolve()
     if file.is_relative_to(PACKAGE_FOLDER.resolve()):
         return True
@@ -84,7 +85,7 @@ def _read_source(file: Path) -> str:
 
 
 def _defines(source: str, name: str) -> bool:
-    """Say whether a module binds a name: by a class, a function, an assignment, or an import."""
+    """Return whether a module defines a name: as a class or function, by an assignment or an import."""
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
@@ -100,14 +101,14 @@ def _defines(source: str, name: str) -> bool:
 
 
 def _may_be_called(task: str, constructor: Any) -> bool:
-    """Say whether calling it makes an environment: a class of one, or what a user's own module says makes one."""
+    """Return whether it may be called: an environment class, or anything that the user's own module defines."""
     import gymnasium
 
     if installed.find(task) is not None or hasattr(constructor, "gymnasium_id") or registry.is_task(constructor):
         return True
     if inspect.isclass(constructor) and issubclass(constructor, gymnasium.Env):
         return True
-    # A function, or a class that only looks like an environment: of the user's own code, and about environments.
+    # A function or another class: only from the user's own file, and only if that mentions Gymnasium or rlctl.
     try:
         file = Path(inspect.getfile(constructor))
     except (TypeError, OSError):

@@ -1,4 +1,4 @@
-"""Parameters of a task's or an environment's constructor: which there are, and whether values fit."""
+"""The parameters of a task's or an environment's constructor, and checks of their values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rlctl.storage import validation
 
 
 def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
-    """Raise `RecipeError` for a parameter that a plain environment does not have."""
+    """Raise `RecipeError` if a plain environment's constructor has no parameter of that name."""
     known = read_parameters(constructor) if parameters else None
     if known is None or any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
         return
@@ -24,9 +24,9 @@ def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -
 
 
 def read_parameters(constructor: Any) -> Mapping[str, inspect.Parameter] | None:
-    """Return the parameters of a plain environment by name, of a Gymnasium id those of what it stands for.
+    """Return the parameters of a plain environment's constructor by name; None if they are unknown.
 
-    None where they are not known.
+    For a Gymnasium id these are the parameters of its entry point.
     """
     if hasattr(constructor, "gymnasium_id"):
         import gymnasium
@@ -46,7 +46,7 @@ def _unknown_parameter(task: str, key: str, known: list[str]) -> RecipeError:
 
 
 def check_fields(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a `Task` in the types of its fields; raises `RecipeError` for what does not fit."""
+    """Return a `Task`'s parameters, converted to the types of its fields; raises `RecipeError` for a wrong value."""
     import typing
 
     import pydantic
@@ -67,7 +67,7 @@ def check_fields(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check_number(key: str, hint: Any, value: Any) -> None:
-    """Raise `RecipeError` for what pydantic would make a number of: text and bools; and for what is none."""
+    """Raise `RecipeError` for text, bools and nan, which pydantic would accept as numbers."""
     if hint in (int, float) and isinstance(value, bool | str):
         raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
     if isinstance(value, float) and math.isnan(value):

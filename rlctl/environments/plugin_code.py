@@ -1,4 +1,4 @@
-"""Code of plugins: importing it and calling it, so that whatever it does becomes an error of one line."""
+"""Imports and calls the code of plugins. Any exception from it becomes an error of one line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rlctl.errors import TaskError, UsageError
 
 
 def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
-    """Run a plugin's code; whatever it raises, `SystemExit` included, becomes a `TaskError`."""
+    """Call a plugin's code; any exception from it, `SystemExit` included, becomes a `TaskError`."""
     try:
         return call()
     except (errors.RlctlError, KeyboardInterrupt):
@@ -61,7 +61,7 @@ def find_module_file(module: str, *, in_current_folder: bool = False) -> Path | 
 
 
 def import_module(task: str, name: str) -> Any:
-    """Import an installed module, or one below the current folder; raises `TaskError` for any exception in it."""
+    """Import a module that is installed or in the current folder; raises `TaskError` for any exception in it."""
     is_installed = name in sys.modules or find_module_file(name) is not None
     if not is_installed and find_module_file(name, in_current_folder=True) is None:
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
@@ -70,7 +70,7 @@ def import_module(task: str, name: str) -> Any:
 
 
 def import_file(task: str, file: Path) -> Any:
-    """Import a file as a module, once; its folder can be imported from, after all others."""
+    """Import a file as a module, once. Its folder becomes the last entry of `sys.path`."""
     file = _find_loaded(file.expanduser())
     if not file.is_file():
         raise UsageError(f"task {task!r}: no file {file}")
@@ -98,21 +98,21 @@ def import_file(task: str, file: Path) -> Any:
 
 
 def append_to_path(folder: str) -> None:
-    """Let modules of a folder be imported, after all others: a torch.py in it must not be taken for torch."""
+    """Append a folder to `sys.path`; it comes last so that a `torch.py` in it does not hide torch."""
     if folder not in sys.path:
         sys.path.append(folder)
 
 
 @contextlib.contextmanager
 def _survive_import(task: str) -> Iterator[None]:
-    """Make `os._exit` an exception while a module is imported, and cancel an alarm that it leaves behind.
+    """Turn `os._exit` into an exception during an import, and cancel an alarm that the module has set.
 
-    Either would end the process without a word.
+    Both would end the process without a message.
     """
     leave, process = os._exit, os.getpid()
 
     def refuse(status: int) -> NoReturn:
-        if os.getpid() != process:  # a process that the module forked may end so
+        if os.getpid() != process:  # a child process that the module forked may do this
             leave(status)
         raise SystemExit(f"os._exit({status})")
 
@@ -126,16 +126,18 @@ def _survive_import(task: str) -> Iterator[None]:
         os._exit = leave
         if in_main and signal.getsignal(signal.SIGALRM) == _raise_alarm:
             if signal.setitimer(signal.ITIMER_REAL, 0.0)[0]:
-                print(f"warning: task {task!r}: its module sets an alarm; cancelled", file=sys.stderr)
+                print(
+                    f"warning: task {task!r}: importing it set an alarm (SIGALRM); rlctl cancelled it", file=sys.stderr
+                )
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
 
 
 def _raise_alarm(number: int, frame: FrameType | None) -> NoReturn:
-    raise TimeoutError("an alarm that the module sets goes off while it is imported")
+    raise TimeoutError("the module set an alarm (SIGALRM), which fired during the import")
 
 
 def _find_loaded(file: Path) -> Path:
-    """Return a file's whole path, even if the working directory is not the one any more in which it was loaded."""
+    """Return a file's absolute path, also if the working directory has changed since the file was loaded."""
     loaded = (getattr(module, "__file__", None) or "" for module in list(sys.modules.values()))
     before = None if file.exists() else next((path for path in loaded if Path(path).match(str(file))), None)
     return Path(before or file).resolve()

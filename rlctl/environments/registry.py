@@ -1,4 +1,4 @@
-"""From what the user typed to what makes an environment, and to the files beside it.
+"""Resolve a task's name to the constructor of its environment, and to the task's files.
 
 A task is written as an installed name (`reach`), `package.module:Class`, `path/to/file.py:Class`, or a Gymnasium id
 (`Pendulum-v1`, `package:Env-v0`).
@@ -35,7 +35,7 @@ def load(task: str) -> Callable[..., Any]:
         package = task.rpartition(":")[0]
         if package and find_module_file(package, in_current_folder=True) is not None:
             append_to_path(os.getcwd())
-            import_module(task, package)  # here, so that what it raises is known as an import's
+            import_module(task, package)  # separately, so that an exception is reported as one of the import
         return _load_gymnasium(task)
     if ":" in task:
         append_to_path(os.getcwd())
@@ -43,7 +43,7 @@ def load(task: str) -> Callable[..., Any]:
     if task.endswith(".py") and (file := Path(task).expanduser()).is_file():
         classes = _list_classes(file)
         forms = " or ".join(f"{task}:{name}" for name in classes) or f"{task}:CLASS; it defines no class"
-        raise UsageError(f"{task}: name the class in it: {forms}")
+        raise UsageError(f"{task}: give the class too: {forms}")
     if task and Path(task).is_dir():
         raise UsageError(
             f"{task} is a folder, not a task: pip install -e {task} installs a plugin; or name a class: "
@@ -57,7 +57,7 @@ def load(task: str) -> Callable[..., Any]:
 
 
 def _list_classes(file: Path) -> list[str]:
-    """Return the public classes that a file defines, without importing it: those that look like tasks, or all."""
+    """Return the public classes in a file, without importing it: those that look like tasks, else all."""
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError, RecursionError):
@@ -68,13 +68,13 @@ def _list_classes(file: Path) -> list[str]:
 
 
 def is_task(constructor: Any) -> bool:
-    """Say whether what was loaded is a `rlctl.task.Task` class."""
+    """Return whether a constructor is a `rlctl.task.Task` class."""
     task_module = sys.modules.get("rlctl.task.task")
     return task_module is not None and inspect.isclass(constructor) and issubclass(constructor, task_module.Task)
 
 
 def find_recipe_file(task: str) -> Path | None:
-    """Return the recipe that comes with a task: `<name>.yaml` beside its module, or `<file>.yaml` beside its file."""
+    """Return the recipe that comes with a task: `<name>.yaml` next to its module, or `<file>.yaml` next to its file."""
     if entry := installed.find(task):
         return entry.recipe_file
     file = find_source_file(task)
@@ -93,7 +93,7 @@ def find_source_file(task: str) -> Path | None:
 
 
 def find_origin(task: str) -> dict[str, str]:
-    """Return what to write down about where a task comes from: `distribution` and `version`, where known."""
+    """Return the `distribution` and `version` of an installed task; empty for any other."""
     if entry := installed.find(task):
         return {"distribution": entry.distribution, "version": entry.version}
     return {}
@@ -111,7 +111,7 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
     for part in attribute.split("."):
         if not hasattr(constructor, part):
             if attribute in getattr(sys.modules.get("gymnasium"), "registry", ()):
-                return _load_gymnasium(attribute)  # an id without a version, which the module has registered
+                return _load_gymnasium(attribute)  # the module has registered an id without a version
             classes = [name for name, value in vars(module).items() if inspect.isclass(value)]
             own = [name for name in classes if getattr(module, name).__module__ == module.__name__]
             raise NoSuchClassError(
@@ -131,7 +131,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
     if spec is not None and isinstance(spec.entry_point, str):
         module = spec.entry_point.partition(":")[0]
         if find_module_file(module) is not None:
-            import_module(task, module)  # as in `load`: an import that fails is no constructor that fails
+            import_module(task, module)  # as in `load`: report exceptions of the import separately
 
     def constructor(**parameters: Any) -> Any:
         try:
@@ -139,7 +139,9 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
         except gymnasium.error.UnregisteredEnv:
             name = task.rpartition(":")[2]
             if _is_in_old_gym(name):
-                raise OldGymError(f"{name} is registered with the old gym, where Gymnasium does not find it") from None
+                raise OldGymError(
+                    f"{name} is registered with the old gym package; Gymnasium cannot find it there"
+                ) from None
             close = did_you_mean(name, gymnasium.registry)
             raise UsageError(f"Gymnasium has no environment {task!r}.{close}") from None
         except gymnasium.error.DeprecatedEnv as error:
@@ -147,7 +149,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
         except ModuleNotFoundError as error:
             missing = getattr(error.__cause__, "name", None) or error.name
             if missing and missing != task.partition(":")[0]:
-                raise  # the module is there, and something that it imports is not
+                raise  # the module exists, but one of its own imports does not
             raise UsageError(f"Gymnasium: {task}: {error}") from None
 
     constructor.gymnasium_id = task  # type: ignore[attr-defined]
@@ -155,7 +157,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
 
 
 def _is_in_old_gym(name: str) -> bool:
-    """Say whether the old gym, if something has imported it, knows an id."""
+    """Return whether an id is registered with the old gym package, if that is imported."""
     old = getattr(sys.modules.get("gym"), "envs", None)
     known = getattr(old, "registry", {})
     return name in getattr(known, "env_specs", known)

@@ -1,4 +1,4 @@
-"""What an environment is made from, and making it."""
+"""`EnvSpec`: everything that defines an environment, as plain data; it also builds the environment."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class EnvSpec:
-    """Everything an environment is made from; plain data.
+    """Everything that defines an environment, as plain data.
 
-    Embedded wherever a file or a message names an environment: policies, episodes, messages to workers.
+    Policy files, recorded episodes and messages to workers contain one.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}  # in the models that embed it
@@ -40,24 +40,24 @@ class EnvSpec:
     events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     """Events that act, with the parameters that differ from the task's."""
     frame_stack: Annotated[int, Ge(1)] = 1
-    """How many of the last observations make one."""
+    """Number of latest observations that are stacked into one."""
     time_feature: bool = False
-    """Whether the part of the episode that is left is observed."""
+    """Whether the fraction of the episode that is left is observed."""
     stage: Annotated[int, Ge(0)] = 0
-    """Stage of the curriculum, from 1; 0 where there is none."""
+    """Stage of the curriculum, from 1; 0 without a curriculum."""
     level: Annotated[float, Ge(0), Le(1)] = 1.0
-    """How far the ranges of events that widen have done so, in [0, 1]."""
+    """How far ranges written `{from: ..., to: ...}` have widened, from 0 (`from`) to 1 (`to`)."""
     sim: str = "pybullet"
     """The physics engine of a task: `pybullet`, `mujoco`, or `mujoco:0.01` with the time constant of contacts [s]."""
     named_by: str = dataclasses.field(default="", compare=False)
-    """The kind of file that names the task; empty where a person did. A file may name environments only."""
+    """The kind of file that names the task; empty if a user named it. A file may name environments only."""
 
     def constructor(self) -> Callable[..., Any]:
-        """Import what makes the environment; raises `ArtifactError` if a file names it and it is not an environment."""
+        """Import the environment's constructor; raises `ArtifactError` if a file names anything else."""
         return named_task.load(self.task, self.named_by) if self.named_by else load(self.task)
 
     def make(self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None) -> gymnasium.Env[Any, Any]:
-        """Build the environment; raises `UsageError` for what the user typed, `TaskError` for what it does."""
+        """Build the environment; raises `UsageError` for wrong names or parameters, `TaskError` if it fails."""
         constructor = self.constructor()
         if is_task(constructor):
             env = self._make_task_env(constructor, render_mode)
@@ -107,7 +107,7 @@ class EnvSpec:
         check_keywords(self.task, constructor, parameters)
         if render_mode is not None:
             if render_mode == "rgb_array" and not os.environ.get("DISPLAY"):
-                os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's choice needs a display
+                os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's default needs a display
             parameters["render_mode"] = render_mode
             try:
                 check_keywords(self.task, constructor, parameters)
@@ -117,7 +117,7 @@ class EnvSpec:
         if hasattr(env, "num_envs") and not isinstance(env, gymnasium.Env):
             raise TaskError(
                 f"{self.task}: {type(env).__name__} is a vectorised environment\n"
-                "Give a single one: rlctl steps n_envs of them side by side"
+                "give a single environment; rlctl itself runs n_envs of them in parallel"
             )
         if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
             raise TaskError(
@@ -129,16 +129,16 @@ class EnvSpec:
 
 @dataclasses.dataclass(frozen=True)
 class EnvChanges:
-    """What a user changes in an environment that a policy or a recipe names: `--set` of the verbs."""
+    """Changes that `--set` makes to the environment of a policy or a recipe."""
 
     parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
     randomize: bool | None = None
-    """True: all events act. False: only those in `events`, and those that are part of the task. None: as it is."""
+    """True: all events act. False: only those in `events`, and those the task enables itself. None: unchanged."""
     events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
     def apply(self, spec: EnvSpec) -> EnvSpec:
-        """Return `spec` with the changes put over it."""
+        """Return `spec` with the changes applied."""
         return dataclasses.replace(
             spec,
             parameters=merge(spec.parameters, self.parameters),
@@ -155,7 +155,7 @@ UNCHANGED = EnvChanges()
 
 
 def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `below` with the values of `above` put over it, mapping by mapping."""
+    """Return `below` updated with `above`; nested mappings are merged too."""
     result = dict(below)
     for key, value in above.items():
         known = result.get(key)
@@ -174,7 +174,7 @@ def make(
 ) -> gymnasium.Env[Any, Any]:
     """Return the Gymnasium environment of a task; keywords are the task's parameters.
 
-    `randomize` lets all events of the task act, `events` those that it names, with the parameters it gives:
+    `randomize` enables all events of the task; `events` enables the named ones and sets their parameters:
     `events={"mass": {"factor": (0.9, 1.1)}}`.
     """
     env = EnvSpec(task, parameters, randomize=randomize, events=events or {}).make(render_mode)
@@ -184,7 +184,7 @@ def make(
 
 
 def _make_gymnasium_spec(task: str, render_mode: str | None, randomize: bool, events: Any, parameters: Any) -> Any:
-    """Return what Gymnasium and other libraries read an environment's id and time limit off."""
+    """Return the spec from which Gymnasium and other libraries read an environment's id and time limit."""
     from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
     kwargs = {"task": task, "render_mode": render_mode, "randomize": randomize, "events": events, **parameters}
@@ -194,7 +194,7 @@ def _make_gymnasium_spec(task: str, render_mode: str | None, randomize: bool, ev
 
 
 def make_several(spec: EnvSpec, count: int) -> list[gymnasium.Env[Any, Any]]:
-    """Build environments; a constructor that changes the working directory does not change it for the next."""
+    """Build environments, each from the same working directory even if a constructor changes it."""
     load(spec.task)
     folder = os.getcwd()
     envs = []
@@ -215,6 +215,6 @@ def _dump(spec: EnvSpec) -> dict[str, Any]:
 
 
 PolicySpec = Annotated[EnvSpec, AfterValidator(_name_by(named_task.POLICY)), PlainSerializer(_dump)]
-"""The `EnvSpec` in a policy file that somebody may have sent: its task is named by that file."""
+"""The `EnvSpec` in a policy file; the file may come from somebody else, so its task is checked before the import."""
 EpisodeSpec = Annotated[EnvSpec, AfterValidator(_name_by(named_task.EPISODE)), PlainSerializer(_dump)]
 """The `EnvSpec` in a recorded episode."""

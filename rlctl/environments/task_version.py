@@ -1,4 +1,4 @@
-"""Which version of a task something was made with: its distribution's, and its source."""
+"""The version of a task: that of its distribution, and the sha256 of its source."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def identify_task(task: str) -> dict[str, Any]:
 
 
 def describe_task_changes(before: Mapping[str, Any], task: str, since: str = "the run began") -> list[str]:
-    """Describe how a task differs from what `identify_task` returned before; empty if it does not."""
+    """Describe how a task differs from an earlier result of `identify_task`; empty if it does not."""
     now = identify_task(task)
     earlier, later = (origin if isinstance(origin, dict) else {} for origin in (before.get("origin"), now["origin"]))
     if earlier != later:
@@ -27,7 +27,7 @@ def describe_task_changes(before: Mapping[str, Any], task: str, since: str = "th
     if before.get("source_sha256") != now["source_sha256"]:
         file = registry.find_source_file(task)
         gone = file is not None and not file.is_file()
-        return [f"{file or task} {'is not there any more' if gone else f'is not what it was when {since}'}"]
+        return [f"{file or task} {'no longer exists' if gone else f'has changed since {since}'}"]
     return []
 
 

@@ -15,15 +15,15 @@ from rlctl.errors import RecipeError
 from rlctl.task.env import TaskEnv
 
 NAME = "time_left"
-"""Its name among the observations of a task."""
-_KEY = "observation"  # of a Dict space: the entry that has it
+"""Name of the added observation."""
+_KEY = "observation"  # the entry of a Dict space to which it is appended
 
 
 class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Appends the fraction of the time limit that is left to a flat observation: 1 at the reset, 0 at the limit.
+    """Appends the remaining fraction of the time limit to a flat observation: 1 at the reset, 0 at the limit.
 
-    A policy observes it, as the locomotion agents of rl-zoo3 do. Of a Dict space it is appended to the entry
-    `observation`. Equal to sb3-contrib's `TimeFeatureWrapper`, which imports torch.
+    In a Dict space it is appended to the entry `observation`. Equal to sb3-contrib's `TimeFeatureWrapper`, which
+    rl-zoo3's locomotion agents use; that one imports torch.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -31,7 +31,9 @@ class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
         inner = env.unwrapped
         limit = inner.max_steps if isinstance(inner, TaskEnv) else find_time_limit(env)
         if not limit:
-            raise RecipeError(f"time_feature: {type(inner).__name__} has no time limit, so no time is left")
+            raise RecipeError(
+                f"time_feature: {type(inner).__name__} has no time limit, so there is no remaining time to observe"
+            )
         self._limit = limit
         self._steps = 0
         space = env.observation_space
@@ -42,7 +44,7 @@ class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
             self.observation_space = _append_bounds(space)
 
     def extend_sizes(self, sizes: dict[str, int]) -> dict[str, int]:
-        """Return the sizes of the observations of a task, by name, with the time."""
+        """Return a task's observation sizes by name, with the time added."""
         if isinstance(self.observation_space, spaces.Dict):
             return {**sizes, _KEY: sizes[_KEY] + 1}
         return {**sizes, NAME: 1}
@@ -76,7 +78,7 @@ def _append_bounds(space: spaces.Space[Any]) -> spaces.Box:
 
 
 def find_time_feature(env: gymnasium.Env[Any, Any]) -> TimeFeature | None:
-    """Return the wrapper of an environment that adds the time; None without."""
+    """Return the environment's `TimeFeature` wrapper, or None."""
     while isinstance(env, gymnasium.Wrapper):
         if isinstance(env, TimeFeature):
             return env
@@ -85,9 +87,9 @@ def find_time_feature(env: gymnasium.Env[Any, Any]) -> TimeFeature | None:
 
 
 def find_time_limit(env: Any) -> int | None:
-    """Return after how many steps an environment's episodes are truncated, by a `TimeLimit` or its registration.
+    """Return the number of steps after which a `TimeLimit` or the registration truncates an episode, or None.
 
-    None where neither says so; what an environment does by itself is not known.
+    A limit inside the environment's own code is not known.
     """
     spec = getattr(env, "spec", None)
     limits = [spec.max_episode_steps] if spec and spec.max_episode_steps else []

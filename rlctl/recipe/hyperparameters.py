@@ -1,6 +1,6 @@
 """The parameters of every algorithm, `algo_kwargs`: SB3's names, with the type and range of each.
 
-Names and defaults are compared with SB3's signatures by a test; `docs/recipe.md` is made from these models.
+Names and defaults are compared with SB3's signatures by a test; `docs/recipe.md` is generated from these models.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _EntropyCoefficient = _NotNegative | Literal["auto"] | Annotated[str, NumberAfte
 
 
 def decide_by(rule: str) -> dict[str, Any]:
-    """Return the `json_schema_extra` of a parameter that rlctl chooses where a recipe does not: by which rule."""
+    """Return the `json_schema_extra` of a parameter whose default rlctl chooses by `rule`."""
     return {"default_text": f"{rule} *rlctl*"}
 
 
@@ -38,7 +38,7 @@ _MINIBATCH = decide_by("128, or the whole rollout where that is smaller")
 
 
 class Parameters(Section):
-    """Parameters by SB3's names; those that a recipe leaves out are not passed on."""
+    """Parameters by SB3's names; only those that a recipe sets are passed to SB3."""
 
 
 class _Learning(Parameters):
@@ -52,13 +52,13 @@ class _OnPolicy(_Learning):
     n_steps: _Count = Field(2048, json_schema_extra=_ROLLOUT)
     """Steps per environment and rollout."""
     gae_lambda: _Fraction = 0.95
-    """Bias against variance of the advantage estimate (GAE); 1 is the Monte Carlo return."""
+    """Trade-off between bias and variance of the advantage estimate (GAE); 1 is the Monte Carlo return."""
     ent_coef: _NotNegative = 0.0
-    """Weight of the entropy in the loss."""
+    """Weight of the entropy bonus in the loss."""
     vf_coef: _NotNegative = 0.5
     """Weight of the value function in the loss."""
     max_grad_norm: _Positive = 0.5
-    """Gradients are clipped to this norm."""
+    """Maximum norm of the gradient; larger ones are scaled down."""
     normalize_advantage: Switch = True
     """Whether to normalise the advantages of a minibatch."""
     use_sde: Switch = False
@@ -75,11 +75,11 @@ class Ppo(_OnPolicy):
     n_epochs: _Count = 10
     """Passes over each rollout."""
     clip_range: _ClipSchedule = 0.2
-    """How far the ratio of new to old probability may leave 1."""
+    """Clip range of the probability ratio: how far it may differ from 1."""
     clip_range_vf: _PositiveSchedule | None = None
-    """The same for the value function; null: not clipped."""
+    """Clip range of the value function; null: not clipped."""
     target_kl: _Positive | None = None
-    """Ends an update when the policy has moved this far; null: never."""
+    """KL divergence at which an update stops early; null: never."""
 
 
 class RecurrentPpo(Ppo):
@@ -126,9 +126,9 @@ class _Continuous(_OffPolicy):
 
 class _MaximumEntropy(_Continuous):
     ent_coef: _EntropyCoefficient = "auto"
-    """Weight of the entropy; `auto` learns it, `auto_0.1` from 0.1 on."""
+    """Entropy coefficient; `auto` learns it, `auto_0.1` learns it starting at 0.1."""
     target_entropy: Number | Literal["auto"] = "auto"
-    """Entropy that `ent_coef: auto` aims at; `auto`: minus the number of action elements."""
+    """Target entropy of `ent_coef: auto`; `auto`: minus the number of action elements."""
     use_sde: Switch = False
     """State-dependent exploration (gSDE)."""
     sde_sample_freq: _Count | Literal[-1] = -1
@@ -141,18 +141,18 @@ class Sac(_MaximumEntropy):
     """Soft actor-critic."""
 
     tau: _PositiveFraction = 0.005
-    """Share of the online network in each update of the target network."""
+    """Soft update coefficient of the target network."""
     target_update_interval: _Count = 1
     """Gradient steps between updates of the target network."""
     policy_delay: _Count = 1
-    """Critic updates per update of the actor and the entropy coefficient; not of Stable-Baselines3."""
+    """Critic updates per update of the actor and the entropy coefficient; Stable-Baselines3's SAC does not have it."""
 
 
 class Tqc(Sac):
     """Truncated quantile critics."""
 
     top_quantiles_to_drop_per_net: _CountFrom0 = 2
-    """Highest quantiles of each critic that are left out; fewer than `policy_kwargs.n_quantiles`."""
+    """Number of highest quantiles dropped per critic; less than `policy_kwargs.n_quantiles`."""
 
 
 class CrossQ(_MaximumEntropy):
@@ -168,7 +168,7 @@ class Ddpg(_Continuous):
 
     learning_rate: _Schedule = 1e-3
     tau: _PositiveFraction = 0.005
-    """Share of the online network in each update of the target network."""
+    """Soft update coefficient of the target network."""
     action_noise: _NotNegative | None = Field(None, json_schema_extra=decide_by("0.1"))
 
 
@@ -180,7 +180,7 @@ class Td3(Ddpg):
     target_policy_noise: _NotNegative = 0.2
     """Standard deviation of the noise that smooths the target policy."""
     target_noise_clip: _NotNegative = 0.5
-    """That noise is clipped to this."""
+    """Clip bound of that noise."""
 
 
 class Dqn(_OffPolicy):
@@ -189,18 +189,18 @@ class Dqn(_OffPolicy):
     learning_rate: _Schedule = 1e-4
     batch_size: _Minibatch = 32
     tau: _PositiveFraction = 1.0
-    """Share of the online network in each update of the target network."""
+    """Soft update coefficient of the target network."""
     train_freq: _Count = Field(4, json_schema_extra=decide_by("1"))
     target_update_interval: _Count = 10_000
     """Steps between updates of the target network."""
     exploration_fraction: _Fraction = 0.1
-    """Part of the training over which the random actions become fewer."""
+    """Fraction of the training during which epsilon falls."""
     exploration_initial_eps: _Fraction = 1.0
-    """Share of random actions at the beginning."""
+    """Initial epsilon: fraction of random actions."""
     exploration_final_eps: _Fraction = 0.05
-    """Share of random actions at the end."""
+    """Final epsilon: fraction of random actions."""
     max_grad_norm: _Positive = 10.0
-    """Gradients are clipped to this norm."""
+    """Maximum norm of the gradient; larger ones are scaled down."""
 
 
 ALGORITHM_PARAMETERS: dict[str, type[Parameters]] = {

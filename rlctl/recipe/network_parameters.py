@@ -16,15 +16,15 @@ _PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
 
 
 def _widths(default: str, *examples: str) -> Any:
-    """Return the field of `net_arch`, whose default SB3 chooses."""
+    """Return the field `net_arch`; SB3 chooses its default."""
     return Field(None, examples=list(examples) or None, json_schema_extra={"default_text": default})
 
 
 class _FeaturesExtractor(Parameters):
     features_dim: _Width = 512
-    """Features of an image (NatureCNN)."""
+    """Number of features of an image (NatureCNN)."""
     cnn_output_dim: _Width = 256
-    """Features per image of a dict observation."""
+    """Number of features per image of a dict observation."""
     normalized_image: Switch = False
     """Whether images are in [0, 1] already."""
 
@@ -64,9 +64,9 @@ Activation = Annotated[
 
 class _Network(Parameters):
     activation_fn: Activation = "relu"
-    """Activation function of the hidden layers, or one of yours: `FILE.py:CLASS`, `MODULE:CLASS`."""
+    """Activation function of the hidden layers, or a class of your own: `FILE.py:CLASS`, `MODULE:CLASS`."""
     features_extractor_class: _OwnClass | None = None
-    """Your own network before the layers of `net_arch`: `FILE.py:CLASS`, of SB3's BaseFeaturesExtractor."""
+    """Your own features extractor before the layers of `net_arch`: a subclass of SB3's BaseFeaturesExtractor."""
     features_extractor_kwargs: Annotated[
         _FeaturesExtractor | None, WrapValidator(_accept_arguments), PlainSerializer(_to_plain)
     ] = None
@@ -91,13 +91,13 @@ class ActorCritic(_Network):
     ortho_init: Switch = True
     """Orthogonal initialisation."""
     log_std_init: Annotated[Number, Field(ge=-20, le=10)] = 0.0
-    """Logarithm of the actions' first standard deviation."""
+    """Logarithm of the initial standard deviation of the actions."""
     full_std: Switch = True
-    """With gSDE: a standard deviation per feature and action, not per feature."""
+    """With gSDE: a standard deviation per feature and action, instead of one per feature."""
     use_expln: Switch = False
     """With gSDE: expln() instead of exp() for the standard deviation."""
     squash_output: Switch = False
-    """With gSDE: tanh after the action."""
+    """With gSDE: apply tanh to the action."""
     share_features_extractor: Switch = True
     """Whether actor and value function share their features extractor."""
 
@@ -125,7 +125,7 @@ class TwinCritics(_Network):
     )
     """Widths of the hidden layers, of the actor (`pi`) and the critics (`qf`)."""
     n_critics: _Few = 2
-    """Critics, of which the lowest value is taken."""
+    """Number of critics; their minimum is used."""
     share_features_extractor: Switch = False
     """Whether actor and critics share their features extractor."""
 
@@ -141,7 +141,7 @@ class SquashedActor(TwinCritics):
 
     net_arch: _Layers | _ActorAndCritic | None = _widths("[256, 256]", "[256, 256]", "{pi: [256, 256], qf: [256, 256]}")
     log_std_init: Annotated[Number, Field(ge=-20, le=10)] = -3.0
-    """With gSDE: logarithm of the actions' first standard deviation."""
+    """With gSDE: logarithm of the initial standard deviation of the actions."""
     use_expln: Switch = False
     """With gSDE: expln() instead of exp() for the standard deviation."""
     clip_mean: Annotated[Number, Field(ge=0)] = 2.0
@@ -162,11 +162,11 @@ class BatchNormCritics(SquashedActor):
         "{pi: [256, 256], qf: [1024, 1024]}", "[256, 256]", "{pi: [256, 256], qf: [1024, 1024]}"
     )
     batch_norm: Switch = True
-    """Whether to normalise batches at all."""
+    """Whether to use batch normalisation."""
     batch_norm_momentum: _PositiveFraction = 0.01
-    """Share of a batch in the running statistics."""
+    """Weight of a new batch in the running statistics."""
     batch_norm_eps: _PositiveFraction = 0.001
-    """What is added to the variance."""
+    """Small number added to the variance."""
     renorm_warmup_steps: Annotated[Whole, Field(ge=0, le=10**9)] = 100_000
     """Gradient steps before batch renormalisation begins."""
 

@@ -1,4 +1,4 @@
-"""Types of a recipe's values: a number is not a text and not a bool, and a switch is not a number."""
+"""Strict types of a recipe's values: text and bools are not numbers, and numbers are not switches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydantic_core import PydanticCustomError
 
 
 class Section(pydantic.BaseModel, extra="forbid", frozen=True, use_attribute_docstrings=True):
-    """A mapping in a file that people write: no other keys than these, each described by the text below it."""
+    """A mapping in a file that users write. Unknown keys are errors; the text below a field describes it."""
 
 
 Number = Annotated[float, pydantic.Strict(), pydantic.AllowInfNan(False)]
@@ -34,7 +34,7 @@ Whole = Annotated[int, pydantic.Strict(), pydantic.BeforeValidator(_make_whole)]
 
 @dataclasses.dataclass(frozen=True)
 class NumberAfter(GroupedMetadata):
-    """Marks texts such as `lin_3e-4`: a prefix and a number of the type `kind`."""
+    """Type of texts such as `lin_3e-4`: `prefix`, then a number of type `kind`."""
 
     prefix: str
     kind: Any
@@ -49,6 +49,6 @@ class NumberAfter(GroupedMetadata):
         except ValueError:
             text = ""
         if not text.startswith(self.prefix):
-            # The type's description says what would be right; see `rlctl.storage.validation`.
+            # `rlctl.storage.validation` writes the message, from the type's JSON schema.
             raise PydanticCustomError("wrong_type", "wrong type")
         return text

@@ -1,4 +1,4 @@
-"""Recipes: how to train a task. YAML, typed, every key checked; `rlctl.recipe.sources` puts them together."""
+"""Recipes: how to train a task. Typed YAML, every key is checked; `rlctl.recipe.sources` merges their sources."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from rlctl.storage import validation, yaml_text
 Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
-"""What can learn in hindsight: what has a replay buffer, except crossq, which has no network for Dict spaces."""
+"""Algorithms with hindsight replay: those with a replay buffer, except crossq, which has no network for Dict spaces."""
 
 NOT_SET = "(not set)"
-"""What `find_difference` has for a key that a recipe does not have."""
-_QUANTILES = 25  # per critic, where a recipe does not say
+"""Stands for a missing key in the result of `find_difference`."""
+_QUANTILES = 25  # default per critic
 _MOST_STEPS = 10**12
 _MOST_ENVS = 10_000
 
@@ -49,7 +49,9 @@ class NormalizeSettings(Section):
         for name, normalized in (("observation", self.observation), ("reward", self.reward)):
             bound = f"clip_{name}"
             if not normalized and getattr(self, bound) != type(self).model_fields[bound].default:
-                raise ValueError(f"{bound} has no effect with {name}: false; what is normalised is clipped")
+                raise ValueError(
+                    f"{bound} has no effect with {name}: false, because only normalised values are clipped"
+                )
         return self
 
 
@@ -70,29 +72,29 @@ class Hindsight(Section):
     """Hindsight experience replay, by the names of SB3's `HerReplayBuffer`; see `rlctl.training.hindsight`."""
 
     n_sampled_goal: Whole = Field(4, ge=1, le=1000)
-    """Goals in hindsight per real one."""
+    """Relabelled transitions per real transition."""
     goal_selection_strategy: Literal["future", "final", "episode"] = "future"
-    """Which of the goals that an episode reached are taken."""
+    """Which of the goals that the episode reached later replace the desired goal."""
 
 
 class CheckpointSettings(Section):
     """Which checkpoints are kept."""
 
     keep: Whole = Field(3, ge=1, le=1_000_000)
-    """How many of the newest are kept."""
+    """Number of newest checkpoints that are kept."""
 
 
 class Recipe(Section):
     """How to train a task. `algo_kwargs` and `policy_kwargs` are SB3's own names."""
 
     task: dict[str, Any] = {}
-    """Parameters of the task: what its constructor takes."""
+    """Parameters of the task: the arguments of its constructor."""
     reward_weights: dict[str, Number] = {}
-    """Weights of reward terms, where they differ from the task's."""
+    """Weights of reward terms that differ from the task's defaults."""
     randomize: Switch = False
-    """Whether all random changes (`events`) that the task offers act."""
+    """Whether all of the task's events (random changes) act."""
     events: dict[str, dict[str, Any]] = {}
-    """Random changes that act, by name, with the parameters that differ from the task's."""
+    """Events (random changes) that act, by name, with the parameters that differ from the task's defaults."""
     algo: Algorithm = "ppo"
     """The algorithm."""
     algo_kwargs: dict[str, Any] = {}
@@ -100,23 +102,23 @@ class Recipe(Section):
     policy_kwargs: dict[str, Any] = {}
     """Parameters of the networks; see the algorithm's own table."""
     her: Hindsight | None = None
-    """Hindsight experience replay, for tasks with goals; null: none."""
+    """Hindsight experience replay, for tasks with goals; null: off."""
     normalize: NormalizeSettings | None = Field(
         None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; else neither")
     )
     """Running normalisation of observations and rewards."""
     frame_stack: Whole = Field(1, ge=1, le=1000)
-    """How many of the last observations the policy gets."""
+    """Number of latest observations that the policy gets, stacked."""
     time_feature: Switch = False
-    """Whether the policy also observes the part of the episode that is left, from 1 to 0, as rl-zoo3's agents do."""
+    """Whether the policy also observes the remaining fraction of the episode, from 1 to 0, as rl-zoo3's agents do."""
     overlap: Switch = True
-    """Whether off-policy algorithms learn while environments play, with a policy one chunk of `train_freq` older."""
+    """Off-policy: whether the learner updates while environments play, with a policy one chunk (`train_freq`) older."""
     n_envs: Whole = Field(8, ge=1, le=_MOST_ENVS)
-    """Environments stepped side by side."""
+    """Number of parallel environments."""
     total_timesteps: Whole = Field(300_000, ge=1, le=_MOST_STEPS)
     """Environment steps, all environments together."""
     seed: Whole = Field(0, ge=0, lt=2**32)
-    """Seed of everything random."""
+    """Seed of all random numbers."""
     eval: EvalSettings = EvalSettings()
     """Evaluation while training."""
     stop_success: Number | None = Field(None, gt=0, le=1)
@@ -141,7 +143,7 @@ class Recipe(Section):
         dropped = self.algo_kwargs.get("top_quantiles_to_drop_per_net", 0)
         if dropped >= (quantiles := self.policy_kwargs.get("n_quantiles", _QUANTILES)):
             raise ValueError(
-                f"algo_kwargs.top_quantiles_to_drop_per_net: {dropped} of {quantiles} leaves nothing; "
+                f"algo_kwargs.top_quantiles_to_drop_per_net: drops {dropped} of {quantiles}, so none is left; "
                 "it must be below policy_kwargs.n_quantiles"
             )
         return self
@@ -151,13 +153,13 @@ class Recipe(Section):
     def _check_replay(cls, value: Hindsight | None, others: pydantic.ValidationInfo) -> Hindsight | None:
         algo = others.data.get("algo")
         if value is not None and algo is not None and algo not in IN_HINDSIGHT:
-            raise ValueError(f"{algo} cannot learn in hindsight; {', '.join(IN_HINDSIGHT)} can")
+            raise ValueError(f"{algo} does not support hindsight replay; {', '.join(IN_HINDSIGHT)} do")
         return value
 
     def env_specs(self, task: str, named_by: str = "") -> list[EnvSpec]:
-        """Return what environments are made from, stage by stage; of a recipe without stages a list of one.
+        """Return the `EnvSpec` of each stage; a list of one for a recipe without stages.
 
-        `named_by` is the kind of file that names the task, if no person does.
+        `named_by` is the kind of file that names the task; empty if the user named it.
         """
         base = EnvSpec(
             task,
@@ -188,15 +190,15 @@ class Recipe(Section):
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """Values of a recipe, and where they are from."""
+    """Values of a recipe, and their source."""
 
     name: str
-    """Empty for what was typed, or given to a function: errors need not say where that is."""
+    """Empty for the command line and for function arguments: errors need not name their place."""
     values: Mapping[str, Any]
     file: Path | None = None
 
     def find(self, path: Sequence[str | int]) -> str | None:
-        """Return where the value at `path` is from, with the line of a file; None if it is not from here."""
+        """Return the source of the value at `path`, with the line of a file; None if it is not in this source."""
         value: Any = self.values
         for part in path:
             if not (isinstance(value, Mapping) and part in value) and not (isinstance(part, int) and value):
@@ -208,7 +210,7 @@ class Source:
 def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
     """Check plain data; raises `RecipeError` that names each wrong key, what was expected, and the closest name.
 
-    `sources` are where values are from, topmost first: of the first that has the key the error names the place.
+    `sources` are in order of precedence; the error names the first one that has the key.
     """
     try:
         return Recipe.model_validate(values)
@@ -224,7 +226,7 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
 
 
 def build_schema(algo: Any = None) -> validation.Schema:
-    """Return the JSON schema of a recipe, with the parameters of an algorithm and its networks; do not change it."""
+    """Return the JSON schema of a recipe, with the parameters of `algo` and its networks; do not modify it."""
     return _build_schema(algo if isinstance(algo, str) and algo in ALGORITHMS else None)
 
 
@@ -259,7 +261,7 @@ def _explain(problem: Any, path: Sequence[str | int], schema: validation.Schema,
 
 
 def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:
-    """Return per dotted key that differs the value in `recipe` and the one in `base`; the seed is not compared."""
+    """Return the dotted keys that differ, each with its value in `recipe` and in `base`; the seed is not compared."""
     ours, theirs = (dict(_flatten(one.model_dump(mode="json", by_alias=True))) for one in (recipe, base))
     keys = dict.fromkeys([*theirs, *ours])
     pairs = {key: (ours.get(key, NOT_SET), theirs.get(key, NOT_SET)) for key in keys if key != "seed"}
@@ -267,7 +269,7 @@ def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:
 
 
 def find_mixed(recipes: Sequence[Recipe]) -> list[str]:
-    """Return the dotted keys in which several recipes are not the same."""
+    """Return the dotted keys in which the recipes differ."""
     return sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})
 
 

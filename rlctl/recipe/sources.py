@@ -1,4 +1,4 @@
-"""Where a recipe comes from: a task's packaged YAML, then `--config`, then `--set` and the other flags."""
+"""Merges the sources of a recipe: a task's packaged YAML, then `--config`, then `--set` and the other flags."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rlctl.recipe.recipe import NormalizeSettings, Recipe, Source, validate
 from rlctl.storage import yaml_text
 
 _PRESETS = Path(__file__).with_name("presets")
-"""Recipes that `--config` finds by name."""
+"""Preset recipes: `--config presets/NAME`."""
 _DEEPEST_KEY = 20
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
 _OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events")
@@ -27,7 +27,7 @@ def resolve(
 ) -> Recipe:
     """Merge the packaged recipe, `--config` and the command line's settings, and check every key.
 
-    `stages` are those that the task's class declares; a recipe that has the key replaces them.
+    `stages` are those of the task's class; the key `stages` of a recipe replaces them.
     """
     packaged_file = registry.find_recipe_file(task)
     packaged = read(packaged_file) if packaged_file else {}
@@ -41,7 +41,7 @@ def resolve(
     ]
     algo = given.get("algo", packaged.get("algo", "ppo"))
     if packaged.get("algo", "ppo") != algo:
-        # Hyperparameters of another algorithm would be wrong here, and so would its number of environments.
+        # The packaged hyperparameters and number of environments are for another algorithm.
         packaged = {k: v for k, v in packaged.items() if k not in _OF_THE_ALGORITHM}
     merged = merge(packaged, given)
     if stages and "stages" not in merged:
@@ -50,18 +50,18 @@ def resolve(
 
 
 def resolve_with_stages(task: str, config: Path | None, settings: Mapping[str, Any]) -> Recipe:
-    """Return what `resolve` does, with the stages that the task's class declares; the task is imported."""
+    """Resolve a recipe, including the stages that the task's class declares; the task is imported."""
     constructor: Any = registry.load(task)
     return resolve(task, config, settings, constructor.stages if registry.is_task(constructor) else ())
 
 
 def resolve_packaged(task: str, settings: Mapping[str, Any] | None = None) -> Recipe:
-    """Return the recipe that a task comes with, with the stages that its class declares; the task is imported."""
+    """Return the packaged recipe of a task, with the stages that its class declares; the task is imported."""
     return resolve_with_stages(task, None, settings or {})
 
 
 def fill_defaults(recipe: Recipe) -> Recipe:
-    """Fill in what the algorithm decides: rollout length, normalisation, how often to evaluate."""
+    """Fill in defaults that depend on other keys: rollout length, normalisation, evaluation interval."""
     changes: dict[str, Any] = {}
     kwargs = dict(recipe.algo_kwargs)
     on_policy = recipe.algo in ON_POLICY
@@ -83,7 +83,7 @@ def fill_defaults(recipe: Recipe) -> Recipe:
 
 
 def describe_rounding(recipe: Recipe) -> str | None:
-    """Describe how many steps are trained where whole rollouts make clearly more of them than `total_timesteps`."""
+    """Return a note if whole rollouts make the training more than 10 % longer than `total_timesteps`, else None."""
     if recipe.algo not in ON_POLICY:
         return None
     rollout = int(recipe.algo_kwargs.get("n_steps", 5)) * recipe.n_envs
@@ -91,8 +91,8 @@ def describe_rounding(recipe: Recipe) -> str | None:
     if steps <= 1.1 * recipe.total_timesteps:
         return None
     return (
-        f"{steps:,} steps will be trained, not {recipe.total_timesteps:,}: {recipe.algo} trains whole rollouts, of "
-        f"{rollout:,} steps here (n_steps x n_envs)"
+        f"training takes {steps:,} steps, not {recipe.total_timesteps:,}: {recipe.algo} needs whole rollouts of "
+        f"{rollout:,} steps (n_steps x n_envs)"
     )
 
 
@@ -102,17 +102,17 @@ def read(path: Path) -> dict[str, Any]:
         raise ArtifactError(f"no recipe file {path}; presets: {', '.join(list_presets())}")
     content = yaml_text.load(yaml_text.read_text(path), str(path))
     if content is not None and not isinstance(content, dict):
-        raise RecipeError(f"{path}: a recipe is a mapping of keys to values, this is a {type(content).__name__}")
+        raise RecipeError(f"{path}: expected a mapping of keys to values, got a {type(content).__name__}")
     return content or {}
 
 
 def list_presets() -> dict[str, Path]:
-    """Return the names that `--config` knows, `presets/ppo` and so on, and their files."""
+    """Return the presets of `--config`: name (`presets/ppo`) and file."""
     return {f"{_PRESETS.name}/{file.stem}": file for file in sorted(_PRESETS.glob("*.yaml"))}
 
 
 def find_config(config: Path) -> Path:
-    """Return the file of a `--config`: a preset's where no file has that name, else the path itself.
+    """Return the file of a `--config`: the path itself, or a preset's file if no file has that name.
 
     Raises `ArtifactError` for a preset that does not exist.
     """
@@ -122,13 +122,13 @@ def find_config(config: Path) -> Path:
     if not file.exists():
         presets = list_presets()
         raise ArtifactError(
-            f"no preset {str(config)!r}.{did_you_mean(str(config), presets)} There are: {', '.join(presets)}."
+            f"no preset {str(config)!r}.{did_you_mean(str(config), presets)} Presets: {', '.join(presets)}."
         )
     return file
 
 
 def parse_settings(settings: list[str]) -> dict[str, Any]:
-    """Turn `--set` texts such as `algo_kwargs.gamma=0.97` into a nested mapping."""
+    """Parse `--set` texts such as `algo_kwargs.gamma=0.97` into a nested mapping."""
     result: dict[str, Any] = {}
     for text in settings:
         key, equals, value = text.partition("=")
@@ -136,23 +136,27 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
             raise RecipeError(f"--set {short_repr(text)!r}: write key=value, for example --set task.tolerance=0.02")
         *path, last = key.strip().split(".")
         if len(path) >= _DEEPEST_KEY or not all((*path, last)):
-            raise RecipeError(f"--set {short_repr(text)!r}: a key is names joined by dots, such as task.tolerance")
+            raise RecipeError(
+                f"--set {short_repr(text)!r}: write a key as names joined by dots, such as task.tolerance"
+            )
         place = result
         for part in path:
             place = place.setdefault(part, {})
             if not isinstance(place, dict):
-                raise RecipeError(f"--set {short_repr(text)!r}: {part!r} has been given a value already")
+                raise RecipeError(
+                    f"--set {short_repr(text)!r}: an earlier --set gives {part!r} a value, so it cannot have keys"
+                )
         place[last] = yaml_text.load(value, f"--set {key}")
     return result
 
 
 def parse_changes(settings: list[str]) -> EnvChanges:
-    """Return what `--set` changes in an environment; raises `RecipeError` for a key that is not of one."""
+    """Parse the `--set` texts that change an environment; raises `RecipeError` for any other key."""
     return check_changes(parse_settings(settings), "--set")
 
 
 def check_changes(values: Mapping[str, Any], source: str) -> EnvChanges:
-    """Check the keys of a recipe that are about the environment; raises `RecipeError` for another key."""
+    """Check changes of an environment, given as keys of a recipe; raises `RecipeError` for any other key."""
     for key in values:
         if key not in _OF_THE_ENVIRONMENT:
             can = "task.NAME, reward_weights.NAME, randomize and events.NAME can be set here"
@@ -163,7 +167,7 @@ def check_changes(values: Mapping[str, Any], source: str) -> EnvChanges:
 
 
 def merge_flags(settings: list[str], **flags: Any) -> dict[str, Any]:
-    """Return the settings of `--set` with those of the flags that were given put over them."""
+    """Return the settings of `--set`, overridden by the flags that are not None."""
     values = parse_settings(settings)
     for name, value in flags.items():
         if value is not None:

@@ -1,4 +1,4 @@
-"""Curricula: the stages of a recipe, from easy to what is wanted."""
+"""Curricula: the stages of a recipe, from an easy task to the full task."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from rlctl.recipe.quantities import Number, Section, Whole
 
 
 class Promotion(Section):
-    """When training goes on to the next stage: by the success rate or the mean return of its last episodes."""
+    """When training moves to the next stage: at a success rate or a mean return of the last training episodes."""
 
     success: Number | None = Field(None, gt=0, le=1)
     """Success rate to reach."""
     mean_return: Number | None = Field(None, alias="return")
     """Mean return to reach."""
     window: Whole = Field(100, ge=1, le=1_000_000)
-    """How many finished training episodes of the stage are looked at; the rule holds no earlier than that."""
+    """Number of finished training episodes of the stage that are averaged; promotion needs at least that many."""
     min_steps: Whole = Field(0, ge=0)
-    """Environment steps that a stage lasts at least, all environments together."""
+    """Minimum length of the stage in environment steps, all environments together."""
 
     @pydantic.model_validator(mode="after")
     def _check_measure(self) -> Promotion:
         if (self.success is None) == (self.mean_return is None):
-            raise ValueError("give success or return, one of the two: promote: {success: 0.8, window: 100}")
+            raise ValueError("give one of success and return: promote: {success: 0.8, window: 100}")
         return self
 
     @property
@@ -48,7 +48,7 @@ class Stage(Section):
     events: dict[str, dict[str, Any]] = {}
     """Changes of the recipe's `events`."""
     level: Number = Field(1.0, ge=0, le=1)
-    """How far ranges of events written `{from: ..., to: ...}` have widened."""
+    """How far event ranges written `{from: ..., to: ...}` have widened: 0 is `from`, 1 is `to`."""
     promote: Promotion | None = None
     """When the stage ends; the last stage has none."""
 
@@ -62,28 +62,28 @@ class Stage(Section):
 
 
 def check_promotions(stages: list[Stage]) -> list[Stage]:
-    """Return stages; raises `ValueError` unless every stage but the last says when it ends, and the last does not."""
+    """Return the stages; raises `ValueError` unless all but the last have a promotion rule, and the last has none."""
     for number, stage in enumerate(stages, start=1):
         last = number == len(stages)
         if stage.promote is None and not last:
             raise ValueError(
-                f"stage {number} of {len(stages)} ({stage}) has no promotion rule, so training would never leave it; "
+                f"stage {number} of {len(stages)} ({stage}) has no promotion rule, so it would never end; "
                 "add promote: {success: 0.8, window: 100} or promote: {return: 50.0, window: 100}"
             )
         if stage.promote is not None and last:
-            raise ValueError(f"stage {number} of {len(stages)} ({stage}) is the last: leave out its promote")
+            raise ValueError(f"stage {number} of {len(stages)} ({stage}) is the last: remove its promote")
     return stages
 
 
 def format_value(key: str, value: Any) -> str:
-    """Return the value of a recipe's key for people: of stages, as plain data, only what they change."""
+    """Return the value of a recipe's key as text; of `stages` (plain data) only what they change."""
     try:
         stages = [Stage.model_validate(stage) for stage in value] if key == "stages" else []
-    except (TypeError, ValueError):  # not set, or what a file by hand holds
+    except (TypeError, ValueError):  # not set, or invalid in a file that was edited
         stages = []
     return f"{len(stages)} stages: " + "; ".join(map(str, stages)) if stages else str(value)
 
 
 def format_title(number: int, stages: Sequence[Stage]) -> str:
-    """Return a stage for people: `stage 2 of 3: tolerance 0.1`."""
+    """Return the title of a stage: `stage 2 of 3: tolerance 0.1`."""
     return f"stage {number} of {len(stages)}: {stages[number - 1]}"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def name_in_errors(path: Path) -> Iterator[None]:
-    """Make an `OSError` name `path`: Python names nothing where a write or a sync fails, or a temporary file."""
+    """Make an `OSError` name `path`; Python names no file, or a temporary one, if a write or a sync fails."""
     try:
         yield
     except OSError as error:
@@ -32,16 +32,16 @@ def name_in_errors(path: Path) -> Iterator[None]:
 
 
 def write_with(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` make a file next to its place, flush it to the disk, and rename it into place."""
+    """Let `write` create a temporary file next to `path`, sync it to disk, and rename it to `path`."""
     os.makedirs(path.parent, exist_ok=True)
-    beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # keeps the suffix: some writers look at it
+    beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # the suffix stays: some writers depend on it
     try:
         with name_in_errors(path):
             write(beside)
             sync(beside)
             os.replace(beside, path)
     except BaseException:
-        with contextlib.suppress(OSError):  # the error that led here is the one to report
+        with contextlib.suppress(OSError):  # the first error is the one to report
             os.unlink(beside)
         raise
     _sync_folder(path.parent)
@@ -53,7 +53,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_new(path: Path, content: bytes) -> None:
-    """Write a file and flush it to the disk: for a folder that is not in its place yet."""
+    """Write a file and sync it to disk, not atomically: for files in a folder of `whole_folder`."""
     append(path, content, 0)
     sync(path)
 
@@ -91,7 +91,7 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         return untrusted.read_arrays(path)
     except ArtifactError:
         raise
-    except Exception as error:  # numpy raises whatever zipfile, zlib and its own parser raise
+    except Exception as error:  # of numpy, zipfile or zlib
         raise ArtifactError(f"{path}: damaged, or not an .npz file: {error}") from None
 
 
@@ -100,7 +100,7 @@ _OLD = ".old.part"
 
 @contextlib.contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Give a folder to fill by `write_new`; it takes its place when the block ends well, and is removed if not."""
+    """Yield a temporary folder to fill with `write_new`; it is renamed to `path` if the block succeeds, else removed."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     remove_tree(beside)
     try:
@@ -116,7 +116,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def _take_place(new: Path, path: Path) -> None:
-    # No system call that Python has swaps two folders. Whoever finds the old one aside puts it back: `recover`.
+    # Python has no system call that swaps folders; `recover` restores the old one after a crash.
     aside = path.with_name(f".{path.name}{_OLD}")
     if path.exists():
         os.rename(path, aside)
@@ -130,7 +130,7 @@ def _take_place(new: Path, path: Path) -> None:
 
 
 def recover(folder: Path) -> None:
-    """Put back what `whole_folder` had set aside, and remove what was half-written, when its process was killed."""
+    """Restore folders that a killed `whole_folder` had renamed, and remove incomplete files and folders."""
     for place in folder.glob(".*.part*"):
         original = place.with_name(place.name[1:].removesuffix(_OLD))
         if place.name.endswith(_OLD) and not original.exists():
@@ -142,8 +142,8 @@ def recover(folder: Path) -> None:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder and all in it, if it is there."""
-    # It is moved aside first: what is removed half must not be taken for whole.
+    """Remove a folder and its content, if it exists."""
+    # Renamed first, so that a partly removed folder is never read.
     if not path.name.startswith("."):
         hidden = path.with_name(f".{path.name}.{os.getpid()}.part")
         shutil.rmtree(hidden, ignore_errors=True)
@@ -154,14 +154,14 @@ def remove_tree(path: Path) -> None:
 
 
 def append(path: Path, content: bytes, size: int) -> None:
-    """Append to the first `size` bytes of a file, and cut it back to them if the disk does not take it all."""
+    """Truncate a file to `size` bytes and append `content`; truncate it again if the write fails."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     try:
         with name_in_errors(path):
             os.ftruncate(descriptor, size)
             _write_all(descriptor, content)
     except OSError:
-        with contextlib.suppress(OSError):  # the next one to append cuts it back again
+        with contextlib.suppress(OSError):  # the next append truncates it again
             os.ftruncate(descriptor, size)
         raise
     finally:
@@ -169,7 +169,7 @@ def append(path: Path, content: bytes, size: int) -> None:
 
 
 def truncate(path: Path, size: int) -> None:
-    """Cut a file back to its first `size` bytes."""
+    """Truncate a file to `size` bytes."""
     descriptor = os.open(path, os.O_WRONLY)
     try:
         with name_in_errors(path):
@@ -189,12 +189,12 @@ def _write_all(descriptor: int, content: bytes) -> None:
 
 
 def digest(content: bytes) -> str:
-    """Return the sha256 of some content, as hexadecimal digits."""
+    """Return the sha256 of `content` in hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()
 
 
 def check_digest(path: Path, expected: str) -> None:
-    """Raise `ArtifactError` if a file is not there, or not what it was when `expected` was its digest."""
+    """Raise `ArtifactError` if a file is missing or its sha256 is not `expected`."""
     if digest(untrusted.read_bytes(path)) != expected:
         raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
 
@@ -209,13 +209,13 @@ def write_sealed(path: Path, content: str) -> None:
 
 
 def is_as_sealed(path: Path) -> bool:
-    """Whether a file that can be read is as `write_sealed` wrote it."""
+    """Return whether a file is unchanged since `write_sealed` wrote it."""
     content, _, seal = path.read_bytes().rpartition(_SEAL.encode())
     return seal.decode(errors="replace") == digest(content) + "\n"
 
 
 def set_aside(path: Path) -> None:
-    """Rename what is damaged out of the way, in the place of what was set aside before under this name."""
+    """Rename a damaged file or folder to `NAME.damaged`, replacing an earlier one."""
     aside = path.with_name(f"{path.name}.damaged")
     if aside.is_dir():
         remove_tree(aside)
@@ -223,7 +223,7 @@ def set_aside(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, if it is there."""
+    """Remove a file, if it exists."""
     with contextlib.suppress(FileNotFoundError):
         os.unlink(path)
 

@@ -1,6 +1,7 @@
-"""How much memory there is: what does not fit is refused before it is allocated.
+"""Measures available memory, so that data that is too large is refused before it is allocated.
 
-numpy and torch reserve memory without touching it, so what is too big seems to work until the system kills the process.
+numpy and torch reserve memory without touching it: an allocation that is too large succeeds, and the system kills the
+process later.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ _CGROUPS = Path("/sys/fs/cgroup")
 
 
 def available() -> int | None:
-    """Return how many bytes this process may still take: of the machine and of its control group; None if unknown."""
+    """Return how many bytes this process can still use, by machine and control groups; None if unknown."""
     found = [value for value in (_read_machine(), *_read_control_groups()) if value is not None]
     return max(min(found), 0) if found else None
 
@@ -21,7 +22,7 @@ def _read_machine() -> int | None:
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration, ValueError):  # not Linux: only what is installed is known
+    except (OSError, StopIteration, ValueError):  # not Linux: only the installed memory is known
         pass
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -30,7 +31,7 @@ def _read_machine() -> int | None:
 
 
 def _read_control_groups() -> list[int]:
-    """What the limits of containers and jobs leave; the limit of a group holds for all groups below it."""
+    """Return the memory left in each control group (container, job); a group's limit includes its subgroups."""
     try:
         entries = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
@@ -43,13 +44,13 @@ def _read_control_groups() -> list[int]:
     return [value for value in found if value is not None]
 
 
-def _read_group(group: Path, limit: str, used: str, given_back: str) -> int | None:
+def _read_group(group: Path, limit: str, used: str, cache_name: str) -> int | None:
     try:
-        ceiling = int((group / limit).read_text(encoding="ascii"))  # "max" where there is none
+        ceiling = int((group / limit).read_text(encoding="ascii"))  # "max" without a limit
         taken = int((group / used).read_text(encoding="ascii"))
         rows = (group / "memory.stat").read_text(encoding="ascii").splitlines()
     except (OSError, ValueError):
         return None
-    # Cached files count as used, and are given back when memory is short.
-    cached = next((int(row.split()[1]) for row in rows if row.startswith(f"{given_back} ")), 0)
+    # The system counts cached files as used, but frees them when memory is short.
+    cached = next((int(row.split()[1]) for row in rows if row.startswith(f"{cache_name} ")), 0)
     return ceiling - taken + cached

@@ -1,4 +1,4 @@
-"""Tables that grow: CSV files to which a training appends rows."""
+"""CSV files to which a training appends rows."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from rlctl.storage import files
 
 
 class Table:
-    """A CSV file that grows by rows. Rows that the disk does not take are kept, and written by a later `flush`.
+    """A CSV file that rows are appended to. If a write fails, the rows stay in memory for the next `flush`.
 
-    `size` is how many bytes of the file are rows of ours, and whole: a checkpoint remembers it.
+    `size` is the number of bytes of complete rows; a checkpoint stores it.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.size = _read_size(path)
-        self._waiting: list[dict[str, Any]] = []
+        self._pending: list[dict[str, Any]] = []
 
     def cut_back(self, size: int, sha256: str, steps: int) -> bool:
-        """Cut the file back to its first `size` bytes; False if these are not the ones with this digest.
+        """Truncate the file to `size` bytes and return True, if they have this digest.
 
-        Of a file that was edited the whole rows stay whose first column is at most `steps`.
+        Otherwise the file was edited: keep its complete rows up to `steps` (the first column) and return False.
         """
         content = self.path.read_bytes()[:size] if self.size else b""
         intact = len(content) == size and (not size or files.digest(content) == sha256)
@@ -38,7 +38,7 @@ class Table:
         return intact
 
     def _keep_rows(self, steps: int) -> int:
-        """Write the file again with its rows up to `steps` and our line ends; return its size in bytes."""
+        """Rewrite the file with its complete rows up to `steps`; return its size in bytes."""
         header, *rows = self.path.read_text(encoding="utf-8", errors="replace").splitlines() or [""]
         whole = [row for row in rows if row.count(",") == header.count(",")]
         lines = [header, *(row for row in whole if _read_first_number(row) <= steps)]
@@ -52,21 +52,21 @@ class Table:
         return files.digest(self.path.read_bytes()[: self.size] if self.size else b"")
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Add a row, which the next `flush` writes; None becomes an empty field."""
-        self._waiting.append({key: "" if value is None else value for key, value in row.items()})
+        """Add a row for the next `flush`; None becomes an empty field."""
+        self._pending.append({key: "" if value is None else value for key, value in row.items()})
 
     def flush(self, *, sync: bool = False) -> None:
-        """Write the rows that wait; with `sync` down to the disk itself. All of them, or `OSError` and none."""
-        if self._waiting:
-            # Whoever edits or removes the file while a training runs loses rows, but no more than that.
+        """Write all pending rows, or raise `OSError` and write none; `sync` also syncs the file to disk."""
+        if self._pending:
+            # If a user edits or removes the file during a training, rows are lost, but the training continues.
             size = min(self.size, _read_size(self.path))
             columns = self._read_columns() if size else None
-            if columns is not None and next(iter(self._waiting[0])) not in columns:
+            if columns is not None and next(iter(self._pending[0])) not in columns:
                 files.set_aside(self.path)
                 size, columns = 0, None
             content = self._format_rows(columns).encode()
             files.append(self.path, content, size)
-            self.size, self._waiting = size + len(content), []
+            self.size, self._pending = size + len(content), []
         if sync and self.size:
             files.sync(self.path)
 
@@ -76,16 +76,16 @@ class Table:
 
     def _format_rows(self, columns: list[str] | None) -> str:
         text = io.StringIO()
-        names = columns or list(self._waiting[0])
+        names = columns or list(self._pending[0])
         writer = csv.DictWriter(text, names, restval="", extrasaction="ignore", lineterminator="\n")
         if columns is None:
             writer.writeheader()
-        writer.writerows(self._waiting)
+        writer.writerows(self._pending)
         return text.getvalue()
 
 
 def _read_first_number(row: str) -> float:
-    """Return the number in the first column of a row; infinity where there is none."""
+    """Return the number in the first column of a row; infinity if there is none."""
     try:
         return float(row.partition(",")[0])
     except ValueError:
@@ -93,5 +93,5 @@ def _read_first_number(row: str) -> float:
 
 
 def _read_size(path: Path) -> int:
-    """Return a file's size in bytes; 0 if it is not there."""
+    """Return a file's size in bytes; 0 if it does not exist."""
     return path.stat().st_size if path.exists() else 0

@@ -1,4 +1,4 @@
-"""Reading what somebody may have sent: regular files only, nothing unpickled, no more memory than the file may take."""
+"""Reads files that others may have sent: regular files only, nothing is unpickled, and memory is limited."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ Model = TypeVar("Model", bound="BaseModel")
 JSON_LIMIT = 16 * 2**20  # [bytes]
 _ALWAYS_READ = 1_000_000  # [bytes]
 _MEMBERS = 1000
-"""How many arrays a file may have."""
+"""Maximum number of arrays in a file."""
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""How arrays may be packed: as numpy does it. LZMA lets a file choose how much memory unpacking takes."""
+"""Allowed compressions: those of numpy. With LZMA the file itself would decide how much memory unpacking takes."""
 
 
 @contextlib.contextmanager
 def open_file(path: Path) -> Iterator[BinaryIO]:
     """Open a regular file; raises `ArtifactError` for one that is missing, unreadable, a folder, a pipe or a device."""
     try:
-        # A pipe would otherwise wait for somebody who writes.
+        # O_NONBLOCK: opening a pipe would otherwise wait for a writer.
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
         raise ArtifactError(f"{path}: no such file") from None
@@ -49,11 +49,11 @@ def open_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: Path, limit: int | None = None) -> bytes:
-    """Read a regular file of at most `limit` bytes, by default of what fits into memory; raises `ArtifactError`."""
+    """Read a regular file of at most `limit` bytes, or by default what fits into memory; raises `ArtifactError`."""
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if limit is not None and size > limit:
-            raise ArtifactError(f"{path}: too large: {format_bytes(size)}, at most {format_bytes(limit)} are read")
+            raise ArtifactError(f"{path}: too large: {format_bytes(size)}, the limit is {format_bytes(limit)}")
         _check_size(path, size)
         try:
             return file.read()
@@ -62,21 +62,21 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
 
 
 def _check_size(path: Path, size: int, what: str = "") -> None:
-    """Raise `ArtifactError` for more bytes than are read into memory: half of what is there."""
-    # To ask costs as much as to read a small file, of which `rlctl runs` reads thousands.
+    """Raise `ArtifactError` if `size` bytes are more than half of the available memory."""
+    # Measuring memory costs as much as reading a small file, and `rlctl runs` reads thousands of them.
     if size > _ALWAYS_READ and (there := memory.available()) is not None and size > there // 2:
         needs = f"{what}it needs {format_bytes(size)} of memory, and {format_bytes(there)} are free"
         raise ArtifactError(f"{path}: too large: {needs}")
 
 
 def check_safetensors(path: Path) -> None:
-    """Raise `ArtifactError` for what is not a regular file, or would take more memory than a policy may."""
+    """Raise `ArtifactError` for a policy file that is not a regular file, or too large for the memory."""
     with open_file(path) as file:
         _check_size(path, os.fstat(file.fileno()).st_size)
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; raises `ValueError` for what is damaged, nested too deeply or has a number too large to be one."""
+    """Parse JSON; raises `ValueError` if it is damaged, nested too deeply, or contains a number that is too large."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -84,7 +84,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def parse_model(text: str | bytes, model: type[Model], path: Path, what: str) -> Model:
-    """Read JSON as a model with a `format`; raises `ArtifactError` for what is damaged, or newer than this rlctl."""
+    """Parse JSON as a model that has a field `format`; raises `ArtifactError` if damaged or newer than this rlctl."""
     newest = model.model_fields["format"].default
     content = None
     try:
@@ -109,23 +109,23 @@ def _explain_error(error: ValueError, model: Any, content: Any) -> str:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays of an `.npz` file, by name, once what the archive says of their sizes was checked.
+    """Read the arrays of an `.npz` file by name, after a check of the sizes that the archive declares.
 
-    Raises `ArtifactError` for what is not a file, or is too large, and whatever numpy and zipfile raise for a damaged
-    one. An array whose own header says another size than the archive is one: numpy touches no memory before it is read.
+    Raises `ArtifactError` for a file that is missing or too large, and any exception of numpy or zipfile for a damaged
+    one. An array's own header may declare a larger size: numpy then fails, and it touches no memory before it reads.
     """
     import numpy as np
 
     with open_file(path) as file, zipfile.ZipFile(file) as archive:
         members = archive.infolist()
         if len(members) > _MEMBERS:
-            raise ValueError(f"it has {len(members):,} members, at most {_MEMBERS:,} are read")
+            raise ValueError(f"it has {len(members):,} members, the limit is {_MEMBERS:,}")
         for member in members:
             if not member.filename.endswith(".npy") or member.compress_type not in _PACKED:
-                raise ValueError(f"{member.filename!r} is not an array, or not packed as numpy does it")
+                raise ValueError(f"{member.filename!r} is not an array, or its compression is not numpy's")
         _check_size(path, sum(member.file_size for member in members), "unpacked ")
         arrays: dict[str, NDArray[Any]] = dict(np.load(path, allow_pickle=False))
     for name, content in arrays.items():
-        if not isinstance(content, np.ndarray):  # numpy gives back the bytes of what has no header
+        if not isinstance(content, np.ndarray):  # without a header numpy returns bytes
             raise ValueError(f"{name!r} is not an array")
     return arrays

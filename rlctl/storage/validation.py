@@ -1,4 +1,4 @@
-"""What is wrong with data that was checked against a model, and what its JSON schema expects, in words."""
+"""Explains pydantic's validation errors: what the JSON schema expects, what was given, the closest name."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _ANY = "any value"
 
 
 def find_schema(root: Schema, path: Sequence[str | int]) -> Schema:
-    """Return the part of a schema that describes the value at `path`, or the closest value around it."""
+    """Return the part of a schema that describes the value at `path`, or the innermost value around it."""
     return _descend(root, path)[0]
 
 
 def _descend(root: Schema, path: Sequence[str | int]) -> tuple[Schema, int]:
-    # How many parts of `path` a schema has comes with it: what comes after are names that pydantic has for types.
+    # Also returns how many parts of `path` the schema has; the rest are pydantic's names of types in a union.
     node = root
     for depth, part in enumerate(path):
         inner = next(
@@ -49,7 +49,7 @@ def _find_part(node: Schema, part: str | int) -> Schema | None:
 
 
 def list_keys(root: Schema, node: Schema) -> list[str]:
-    """Return the keys that a mapping may have; none if `node` describes no mapping, or one of any keys."""
+    """Return the allowed keys of a mapping; none if `node` is not a mapping, or allows any key."""
     return next(
         (
             list(alternative["properties"])
@@ -61,15 +61,15 @@ def list_keys(root: Schema, node: Schema) -> list[str]:
 
 
 def describe_value(root: Schema, node: Schema) -> str:
-    """Return what a value must be: `a number in (0, 1]`, `a whole number in [1, 1e9] or -1`."""
+    """Describe the allowed values: `a number in (0, 1]`, `a whole number in [1, 1e9] or -1`."""
     return " or ".join(dict.fromkeys(_describe(root, alternative) for alternative in _list_alternatives(root, node)))
 
 
 def explain_all(error: pydantic.ValidationError, root: Schema, explain: Callable[[Any, Place], str]) -> str:
-    """Return a line for every value that is wrong, three at most, as `explain` says it of a problem and its place."""
+    """Return a line per wrong value, at most three; `explain` writes the line for a problem and its place."""
     problems: dict[Place, Any] = {}
     for problem in error.errors(include_url=False):
-        problems.setdefault(_locate(problem, root), problem)  # pydantic has one for each type that a value may be of
+        problems.setdefault(_locate(problem, root), problem)  # of a union pydantic reports a problem per type
     lines = [explain(problem, place) for place, problem in problems.items()]
     return "\n".join(lines if len(lines) <= _MOST_LINES else [*lines[:2], f"and {len(lines) - 2} more mistakes"])
 
@@ -96,7 +96,7 @@ def _locate(problem: Any, root: Schema) -> Place:
 def explain(
     problem: Any, path: Sequence[str | int], root: Schema, values: Any, *, key: str, of: str = "", unit: str = ""
 ) -> str:
-    """Say what is wrong with the value at `path`, which is called `key`: what was expected, and the closest name."""
+    """Explain what is wrong with the value at `path`, which the message calls `key`."""
     if problem["type"] == "extra_forbidden":
         keys = list_keys(root, find_schema(root, path[:-1]))
         name, outer = path[-1], (find_schema(root, [*path[:-1], key_here]) for key_here in keys)
@@ -106,7 +106,7 @@ def explain(
         hint = f" Did you mean {inner[0]!r}?" if inner else did_you_mean(str(name), keys)
         return f"no key {key!r}{of}.{hint} Keys here: {', '.join(keys)}."
     label = f"{key}: " if key else ""
-    if problem["type"] == "value_error":  # of a check of ours that needs more than a type
+    if problem["type"] == "value_error":  # raised by a validator of rlctl
         return f"{label}{problem['ctx']['error']}"
     if problem["type"] == "missing":
         return f"{label}is missing"

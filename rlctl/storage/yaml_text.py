@@ -1,4 +1,4 @@
-"""YAML as people mean it: version 1.2 scalars (`3e-4` is a number, `on` is text), duplicate keys refused."""
+"""YAML with the scalars of version 1.2: `3e-4` is a number, `on` is text. Duplicate keys are errors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rlctl.storage import untrusted
 _PREFIX = "tag:yaml.org,2002:"
 _DEEPEST = 50
 _LONGEST = 2**20  # [bytes] of a file
-_MOST_DIGITS = 100  # of a whole number: one of thousands cannot even be read
+_MOST_DIGITS = 100  # of a whole number; Python itself refuses thousands
 
 
 class _Dumper(yaml.SafeDumper):
@@ -83,7 +83,7 @@ for _tag, _pattern, _first in (
         list("-+0123456789."),
     ),
 ):
-    # Text that looks like a number in either version of YAML is written in quotes.
+    # The dumper quotes text that is a number in YAML 1.1 or 1.2.
     for _class in (_Loader, _Dumper):
         _class.add_implicit_resolver(f"{_PREFIX}{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
 
@@ -118,7 +118,7 @@ def load(text: str, source: str) -> Any:
 
 
 def find_line(text: str, path: Sequence[str | int]) -> int:
-    """Return the line, from 1, of the key at `path` in YAML that `load` has read."""
+    """Return the line, from 1, of the key at `path` in valid YAML."""
     loader = _Loader(text)
     node = loader.get_single_node()
     line = 1
@@ -134,6 +134,6 @@ def find_line(text: str, path: Sequence[str | int]) -> int:
 
 
 def dump(value: Any) -> str:
-    """Write plain data as YAML, keys in the order they have."""
+    """Return plain data as YAML, with the keys in their order."""
     text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=100)
     return text

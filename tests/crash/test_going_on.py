@@ -90,7 +90,7 @@ def test_an_environment_that_is_mended(trials, folders):
     file.write_text(MENDABLE.replace("broken = True", "broken = False"))
     refused = trials.run(resume(run), folder)
     assert refused.code == 2
-    assert "mine.py is not what it was when the run began. What was learnt may not fit any more; " in refused.stderr
+    assert "mine.py has changed since the run began. The policy may no longer fit; " in refused.stderr
     forced = trials.run([*resume(run), "--force"], folder)
     assert forced.code == 0, forced.stderr
     assert "going on at step 64, not bit-exact: " in forced.stderr

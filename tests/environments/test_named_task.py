@@ -52,7 +52,7 @@ class Outer:
     ],
 )  # fmt: skip
 def test_functions_and_classes_of_other_things_are_not_called(task, kind):
-    with pytest.raises(ArtifactError, match=rf"^{kind} names .* as its task, and .*: not run") as caught:
+    with pytest.raises(ArtifactError, match=rf"^{kind} names .* as its task, but .*; not run") as caught:
         EnvSpec(task, {"command": "true", "cmd": "true"}, named_by=kind).make()
     assert len(str(caught.value).splitlines()) == 1
     assert ("--task" in str(caught.value)) == (kind == named_task.POLICY)

@@ -69,7 +69,7 @@ class Endless(gymnasium.Env):
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        (f"{__file__}:Endless", "time_feature: Endless has no time limit, so no time is left"),
+        (f"{__file__}:Endless", "time_feature: Endless has no time limit, so there is no remaining time to observe"),
         ("FrozenLake-v1", "time_feature: only flat observations of real numbers can have it, this task has Discrete"),
     ],
 )

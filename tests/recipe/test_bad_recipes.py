@@ -33,9 +33,9 @@ def refused(config, settings=()):
         ("n_envs:\t1\n", ":1: found character '\\t' that cannot start any token"),
         ("n_envs: [1\n", ":2: expected ',' or ']', but got '<stream end>'"),
         ("n_envs: 1\n---\nn_envs: 2\n", ":2: expected a single document in the stream, but found another document"),
-        ("- n_envs\n", ": a recipe is a mapping of keys to values, this is a list"),
-        ("ppo\n", ": a recipe is a mapping of keys to values, this is a str"),
-        ("7\n", ": a recipe is a mapping of keys to values, this is a int"),
+        ("- n_envs\n", ": expected a mapping of keys to values, got a list"),
+        ("ppo\n", ": expected a mapping of keys to values, got a str"),
+        ("7\n", ": expected a mapping of keys to values, got a int"),
         (BOMB, ":1: anchors and aliases (&name, *name) are not supported: write the values out"),
         (MERGE_BOMB, ":1: anchors and aliases (&name, *name) are not supported"),
         ("task: &a {b: *a}\n", ":1: anchors and aliases (&name, *name) are not supported"),
@@ -119,7 +119,7 @@ def test_what_looks_wrong_and_is_right(tmp_path):
         ("normalize.clip_observation=-1", "normalize.clip_observation: expected a number > 0, got -1"),
         (
             "normalize={reward: false, clip_reward: 1}",
-            "normalize: clip_reward has no effect with reward: false; what is normalised is clipped",
+            "normalize: clip_reward has no effect with reward: false, because only normalised values are clipped",
         ),
         ("reward_weights.a=.nan", "reward_weights.a: expected a number, got nan"),
         ("reward_weights.a=true", "reward_weights.a: expected a number, got True"),
@@ -129,7 +129,7 @@ def test_what_looks_wrong_and_is_right(tmp_path):
         ("stages=[{}, {}]", "stages: stage 1 of 2 (the recipe's own task) has no promotion rule"),
         ("stages=[{level: .nan}]", "stage 1: level: expected a number in [0, 1], got nan"),
         ("stages=[{level: 2}]", "stage 1: level: expected a number in [0, 1], got 2"),
-        ("stages=[{promote: {}}]", "stage 1: promote: give success or return, one of the two"),
+        ("stages=[{promote: {}}]", "stage 1: promote: give one of success and return"),
         (
             "stages=[{promote: {success: 0.5, window: 0}}]",
             "stage 1: promote.window: expected a whole number in [1, 1e6], got 0",
@@ -148,8 +148,8 @@ def test_values_that_cannot_be(setting, expected):
 
 
 def test_a_key_that_never_ends():
-    assert "a key is names joined by dots" in refused(None, ["task" + ".a" * 10_000 + "=1"])
-    assert "a key is names joined by dots" in refused(None, ["task..a=1"])
+    assert "write a key as names joined by dots" in refused(None, ["task" + ".a" * 10_000 + "=1"])
+    assert "write a key as names joined by dots" in refused(None, ["task..a=1"])
 
 
 def not_built(task, root, settings):

@@ -30,7 +30,7 @@ def test_a_preset_that_is_not_there():
         sources.resolve("reach", Path("presets/pppo"), {})
     assert str(caught.value) == (
         "no preset 'presets/pppo'. Did you mean 'presets/ppo'? "
-        "There are: presets/biped-ladder, presets/gear-arm-ladder, presets/ppo, presets/sac."
+        "Presets: presets/biped-ladder, presets/gear-arm-ladder, presets/ppo, presets/sac."
     )
 
 

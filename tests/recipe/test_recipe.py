@@ -116,8 +116,8 @@ def test_a_resolved_recipe_is_a_config(packaged, config):
             {"algo": "sac", "her": {"goal_selection_strategy": "past"}},
             "her.goal_selection_strategy: expected future or final or episode, got 'past'",
         ),
-        ({"her": {}}, "her: ppo cannot learn in hindsight; sac, td3, ddpg, dqn, tqc can"),
-        ({"algo": "crossq", "her": {}}, "her: crossq cannot learn in hindsight; sac, td3, ddpg, dqn, tqc can"),
+        ({"her": {}}, "her: ppo does not support hindsight replay; sac, td3, ddpg, dqn, tqc do"),
+        ({"algo": "crossq", "her": {}}, "her: crossq does not support hindsight replay; sac, td3, ddpg, dqn, tqc do"),
         ({"algo": "sacc", "her": {}}, "algo: expected ppo or a2c or sac or td3 or ddpg or dqn or tqc or crossq or"),
         ({"n_envs": "many"}, "n_envs: expected a whole number in [1, 10000], got 'many'"),
         ({"n_envs": 0}, "n_envs: expected a whole number in [1, 10000], got 0"),
@@ -171,7 +171,7 @@ def test_numbers_of_the_command_line():
     [
         (["task.size"], "--set 'task.size': write key=value, for example --set task.tolerance=0.02"),
         (["=3"], "--set '=3': write key=value, for example --set task.tolerance=0.02"),
-        (["task.a=1", "task.a.b=2"], "--set 'task.a.b=2': 'a' has been given a value already"),
+        (["task.a=1", "task.a.b=2"], "--set 'task.a.b=2': an earlier --set gives 'a' a value, so it cannot have keys"),
         (["task.a=[1"], "--set task.a:1: expected ',' or ']', but got '<stream end>'"),
     ],
 )
@@ -224,7 +224,7 @@ def test_what_is_changed_goes_over_what_was_trained_with():
 def test_a_file_that_is_none(tmp_path, config):
     with pytest.raises(ArtifactError, match=r"^no recipe file .*/missing.yaml; presets: presets/biped-ladder, "):
         resolve("a.py:A", tmp_path / "missing.yaml", {})
-    with pytest.raises(RecipeError, match=r"config.yaml: a recipe is a mapping of keys to values, this is a list$"):
+    with pytest.raises(RecipeError, match=r"config.yaml: expected a mapping of keys to values, got a list$"):
         resolve("a.py:A", config("- algo"), {})
     assert resolve("a.py:A", config("# nothing\n"), {}).algo == "ppo"
     (tmp_path / "config.yaml").write_bytes(b"\xff\xfe\x00")

@@ -17,12 +17,12 @@ RULE = {"success": 0.8, "window": 100}
     [
         (
             [{"task": {"tolerance": 0.2}}, {}],
-            "recipe: stages: stage 1 of 2 (tolerance 0.2) has no promotion rule, so training would never leave it; "
+            "recipe: stages: stage 1 of 2 (tolerance 0.2) has no promotion rule, so it would never end; "
             "add promote: {success: 0.8, window: 100} or promote: {return: 50.0, window: 100}",
         ),
         (
             [{"promote": RULE}, {"promote": RULE}],
-            "recipe: stages: stage 2 of 2 (the recipe's own task) is the last: leave out its promote",
+            "recipe: stages: stage 2 of 2 (the recipe's own task) is the last: remove its promote",
         ),
         (
             [{"promot": RULE}, {}],
@@ -36,11 +36,11 @@ RULE = {"success": 0.8, "window": 100}
         ),
         (
             [{"promote": {**RULE, "return": 1.0}}, {}],
-            "recipe: stage 1: promote: give success or return, one of the two: promote: {success: 0.8, window: 100}",
+            "recipe: stage 1: promote: give one of success and return: promote: {success: 0.8, window: 100}",
         ),
         (
             [{"promote": {"window": 9}}, {}],
-            "recipe: stage 1: promote: give success or return, one of the two: promote: {success: 0.8, window: 100}",
+            "recipe: stage 1: promote: give one of success and return: promote: {success: 0.8, window: 100}",
         ),
         (
             [{"promote": {"success": 80}}, {}],

@@ -34,7 +34,7 @@ def changed_run(rlctl, write_module, tmp_path):
 
 def test_a_rewritten_reward_is_noticed(rlctl, changed_run, write_module):
     old, new = changed_run
-    is_changed = "toy.py is not what it was when the run began"
+    is_changed = "toy.py has changed since the run began"
     assert is_changed in rlctl("eval", old, "--episodes", 2).stderr
     assert is_changed not in rlctl("eval", new, "--episodes", 2).stderr
     assert f"{is_changed}, in: Toy/{old.name}\n" in rlctl("runs").stdout

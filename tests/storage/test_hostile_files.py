@@ -68,13 +68,13 @@ def test_a_pickle_in_a_member(name, episode, tmp_path):
 @pytest.mark.parametrize(
     ("members", "message"),
     [
-        ([("evil.pkl", b"")], "'evil.pkl' is not an array, or not packed as numpy does it"),
+        ([("evil.pkl", b"")], "'evil.pkl' is not an array, or its compression is not numpy's"),
         ([("a.npy", header((10**12,)) + b"\0" * 80)], "x.npz: damaged, or not an .npz file: "),
         ([("a.npy", header((-8,)))], "x.npz: damaged, or not an .npz file: "),
         ([("a.npy", header((11,)) + b"\0" * 80)], "EOF: reading array data, expected 88 bytes got 80"),
         ([("a.npy", b"\x93NUMPY\x09\x00" + b"\0" * 99)], "we only support format version"),
         ([("a.npy", b"not an array")], "'a' is not an array"),
-        ([(f"{n}.npy", array_file(np.zeros(0))) for n in range(1001)], "it has 1,001 members, at most 1,000 are read"),
+        ([(f"{n}.npy", array_file(np.zeros(0))) for n in range(1001)], "it has 1,001 members, the limit is 1,000"),
     ],
 )
 def test_members_that_are_refused(members, message, tmp_path):
@@ -96,7 +96,7 @@ def test_a_name_that_points_outside_is_only_a_name(name, tmp_path):
 
 def test_packing_that_lets_a_file_choose_the_memory(tmp_path):
     archive(tmp_path / "x.npz", [("a.npy", array_file(np.zeros(3)))], zipfile.ZIP_LZMA)
-    with pytest.raises(ArtifactError, match=r"'a.npy' is not an array, or not packed as numpy does it$"):
+    with pytest.raises(ArtifactError, match=r"'a.npy' is not an array, or its compression is not numpy's$"):
         files.read_npz(tmp_path / "x.npz")
 
 
@@ -201,7 +201,7 @@ def test_json_that_is_too_large(tmp_path):
     path = tmp_path / "run.json"
     with path.open("wb") as file:
         file.truncate(10**9)  # takes no space on the disk
-    with pytest.raises(ArtifactError, match=r"run.json: too large: 1.0 GB, at most 16.8 MB are read$"):
+    with pytest.raises(ArtifactError, match=r"run.json: too large: 1.0 GB, the limit is 16.8 MB$"):
         files.read_json(path)
 
 

@@ -85,7 +85,7 @@ CHANGES = {
     "upgraded": (upgrade, "task mine came from mine-plugin 1.2 when the run began, and comes from mine-plugin 1.3 now"),
     "edited": (
         lambda folder: change(folder, "size = 1", "size = 1  # "),
-        "{folder}/mine_plugin.py is not what it was when the run began",
+        "{folder}/mine_plugin.py has changed since the run began",
     ),
 }
 

@@ -121,5 +121,5 @@ def test_the_task_is_removed_while_training(train, resume, tmp_path, settings):
         train("Mine", settings(2), envs=task)
     run = only_run(tmp_path)
     assert [row["steps"] for row in rows(run.evals_file)] == ["32"]
-    with pytest.raises(UsageError, match=r"mine.py is not there any more\. The policy may no longer fit"):
+    with pytest.raises(UsageError, match=r"mine.py no longer exists\. The policy may no longer fit"):
         resume(run)

@@ -79,7 +79,7 @@ def test_spaces_that_are_not():
 def test_whole_rollouts_are_said_where_they_are_many_more_steps():
     # 8 environments, 4096 / 8 = 512 steps each.
     assert describe_rounding(fill_defaults(Recipe(total_timesteps=10))) == (
-        "4,096 steps will be trained, not 10: ppo trains whole rollouts, of 4,096 steps here (n_steps x n_envs)"
+        "training takes 4,096 steps, not 10: ppo needs whole rollouts of 4,096 steps (n_steps x n_envs)"
     )
     assert describe_rounding(fill_defaults(Recipe(total_timesteps=300_000))) is None
     assert describe_rounding(fill_defaults(Recipe(algo="sac", total_timesteps=10))) is None
