@@ -100,7 +100,7 @@ _OLD = ".old.part"
 
 @contextlib.contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder to fill with `write_new`; it is renamed to `path` if the block succeeds, else removed."""
+    """Yield a temporary folder to fill with `write_new`; at the end it is renamed to `path`, or removed on errors."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     remove_tree(beside)
     try:
