@@ -116,10 +116,12 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
     with pytest.raises(UsageError, match=r"policy.txt: the name of a policy file ends in .safetensors"):
         export_actor(ExportRequest(str(run.path), checkpoint="best", policy=tmp_path / "policy.txt"))
     PolicyFile(info, tensors).write(target)
-    with pytest.raises(UsageError, match="no recipe is known of this policy; give the run"):
+    with pytest.raises(UsageError, match="the file does not contain the recipe of its training; give its run"):
         export_actor(ExportRequest(str(target), checkpoint="best", policy=tmp_path / "other.safetensors"))
     (tmp_path / "policy.onnx").touch()
-    with pytest.raises(UsageError, match=r"policy.onnx: no recipe is known of this policy; give the run"):
+    with pytest.raises(
+        UsageError, match=r"policy.onnx: the file does not contain the recipe of its training; give its run"
+    ):
         export_actor(ExportRequest(str(tmp_path / "policy.onnx"), checkpoint="best", policy=target))
 
 

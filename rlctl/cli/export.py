@@ -14,12 +14,12 @@ from rlctl.exporting.request import ExportRequest, Format
 
 def export(
     run: Run = None,
-    onnx: Annotated[bool, typer.Option("--onnx", help="Write an ONNX file; so without --c as well.")] = False,
+    onnx: Annotated[bool, typer.Option("--onnx", help="Write an ONNX file (the default without --c).")] = False,
     c: Annotated[bool, typer.Option("--c", help="Write a C99 header and source file without dependencies.")] = False,
     policy: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Write the actor with its measured score instead, as plugins ship it (.safetensors)."
+            metavar="FILE", help="Write the actor with its measured score instead, as plugins ship it: .safetensors."
         ),
     ] = None,
     checkpoint: Checkpoint = "best",
@@ -30,13 +30,12 @@ def export(
     ] = None,
     json: Json = None,
 ) -> None:
-    """Turn a policy into a self-contained ONNX file or C source, and verify that it acts the same."""
+    """Write a policy as a self-contained ONNX file or C source, and verify that it acts the same."""
     claim_stdout()
     checkpoint = choose_checkpoint(checkpoint, pretrained)
     if policy is not None and (output is not None or onnx or c):
-        raise UsageError("--policy FILE writes that file and no other: leave out --output, --onnx and --c")
-    wanted: dict[Format, bool] = {"onnx": onnx or not c, "c": c}
-    formats = tuple(name for name, is_wanted in wanted.items() if is_wanted)
+        raise UsageError("--policy FILE writes only that file: leave out --output, --onnx and --c")
+    formats: tuple[Format, ...] = ("onnx", "c") if onnx and c else ("c",) if c else ("onnx",)
     request = ExportRequest(run, formats, checkpoint, output, policy)
     if policy is not None:
         from rlctl.exporting import policy_file

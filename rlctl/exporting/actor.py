@@ -1,4 +1,4 @@
-"""A policy as one ONNX graph: from raw observations to the action the environment takes."""
+"""Writes a policy as one ONNX graph, from raw observations to actions of the environment's action space."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of t
 
 
 def build(policy: PolicyFile) -> onnx.ModelProto:
-    """Write a policy file as ONNX: normalisation, the deterministic actor, and SB3's clip or unscaling of its action.
+    """Write a policy file as ONNX: normalisation, the deterministic actor, and SB3's clipping or scaling of the action.
 
-    Raises `UsageError` for what has no translation.
+    Raises `UsageError` for a part that cannot be written as ONNX.
     """
     info = policy.info
     graph, network = Graph(), Network(policy)
@@ -41,17 +41,21 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
         value, state = emit_lstm(graph, value, (hidden, cell), lstm)
     value = emit(graph, value, [*network.trunk, *network.head])
     if isinstance(action_space, spaces.Box):
-        # Where tanh ends the network there was noise before it, of which a deterministic action has none.
+        # Exploration adds noise before this tanh; the deterministic action has none.
         value = graph.add("Tanh", value) if network.ends_with_tanh else value
         value, dtype = _emit_continuous(graph, value, action_space, network.is_squashed)
     else:
         value, dtype = _emit_discrete(graph, value, action_space), np.dtype(np.int64)
     shape: tuple[int | str, ...] = (BATCH, *(action_space.shape or ()))
-    graph.output(value, ACTION, dtype, shape, info.env.action_meaning or "action, as the environment takes it")
+    graph.output(value, ACTION, dtype, shape, info.env.action_meaning or "action of the environment")
     for name, part in zip(STATE_OUTPUTS, state, strict=False):
-        assert lstm is not None  # which has the state
+        assert lstm is not None  # only an LSTM has a state
         graph.output(part, name, np.float32, _find_state_shape(lstm), "LSTM state for the next step")
-    return graph.model(metadata(info), _describe(info))
+    description = (
+        f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps: raw observations in, "
+        "deterministic action out; normalisation and the action's bounds are inside"
+    )
+    return graph.model(make_metadata(info), description)
 
 
 def _find_state_shape(lstm: Lstm) -> tuple[int, str, int]:
@@ -76,7 +80,7 @@ def _describe_input(info: PolicyInfo) -> str:
 
 
 def _emit_part(graph: Graph, source: tuple[str, Any], network: Network, key: str) -> str:
-    """From a part of the observation to its features."""
+    """Add the layers from a part of the observation to its features."""
     (value, dtype), layers = source, network.parts[key]
     if dtype != np.float32 and not isinstance(layers[0], Normalize | OneHot):
         value = graph.cast(value, np.float32)
@@ -84,7 +88,7 @@ def _emit_part(graph: Graph, source: tuple[str, Any], network: Network, key: str
 
 
 def _emit_own(graph: Graph, inputs: Mapping[str, tuple[str, Any]], own: OwnGraph) -> str:
-    """From all parts of the observation to the latent of a user's network."""
+    """Add a user's network, from all parts of the observation to its last hidden layer."""
     values = {f"{OBSERVATION}{key}": value for key, (value, _) in inputs.items()}
     for key, layer in own.normalize.items():
         values[f"{OBSERVATION}{key}"] = emit(graph, inputs[key][0], [layer])
@@ -95,7 +99,7 @@ def _emit_own(graph: Graph, inputs: Mapping[str, tuple[str, Any]], own: OwnGraph
 def _emit_continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool) -> tuple[str, np.dtype[Any]]:
     if not np.issubdtype(space.dtype, np.floating):
         raise unsupported(f"an action of type {space.dtype}")
-    # As numpy promotes it in SB3: float32 stays, bounds in float64 make the action float64.
+    # As in SB3, bounds in float64 make the action float64.
     dtype = np.result_type(np.float32, space.dtype)
     if len(space.shape) != 1:
         value = graph.add("Reshape", value, graph.constant("action/shape", np.array([-1, *space.shape])))
@@ -113,25 +117,24 @@ def _emit_continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool
 
 
 def _emit_discrete(graph: Graph, value: str, space: spaces.Space[Any]) -> str:
-    """The most likely, or most valuable, choice. Counted from 0: SB3 takes no notice of a space's `start`."""
+    """Add the choice of the largest logit or value. It counts from 0: SB3 ignores the `start` of a space."""
     if isinstance(space, spaces.Discrete):
         return graph.add("ArgMax", value, axis=1, keepdims=0)
     if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1:
         sizes = graph.constant("action/sizes", space.nvec.astype(np.int64))
         parts = graph.add_with_outputs("Split", [value, sizes], len(space.nvec), axis=1)
-        chosen = [graph.add("ArgMax", part, axis=1, keepdims=1) for part in parts]
-        return graph.add("Concat", *chosen, axis=1)
+        return graph.add("Concat", *(graph.add("ArgMax", part, axis=1, keepdims=1) for part in parts), axis=1)
     if isinstance(space, spaces.MultiBinary):
-        # SB3 rounds the probability, which is one half where the logit is zero, and rounds halves to zero.
+        # SB3 rounds the probability: 1 for a logit above 0, and 0 for a logit of exactly 0.
         return graph.cast(graph.add("Greater", value, graph.constant("action/zero", np.float32(0.0))), np.int64)
     raise unsupported(f"an action of {space}")
 
 
-def metadata(info: PolicyInfo) -> dict[str, str]:
+def make_metadata(info: PolicyInfo) -> dict[str, str]:
     """Return the metadata of a policy's ONNX file.
 
-    Under `rlctl` the whole description as JSON. The other keys repeat what somebody needs who runs the file
-    elsewhere: lists are separated by commas, in the order of the observation's or the action's elements.
+    The key `rlctl` has the whole description as JSON. The other keys are for programs without rlctl; lists are
+    separated by commas, in the order of the elements of the observation or the action.
     """
     env = info.env
     plain = {
@@ -154,7 +157,7 @@ def metadata(info: PolicyInfo) -> dict[str, str]:
 
 
 def _format_joints(joints: Joints | None) -> dict[str, str]:
-    """Return the keys that the controllers of mjlab and BeyondMimic read, and in that form: values and commas."""
+    """Return the keys that the controllers of mjlab and BeyondMimic read, in their form: values and commas."""
     if joints is None:
         return {}
     numbers = {
@@ -179,11 +182,3 @@ def _format_bounds(info: PolicyInfo) -> dict[str, str]:
         "action_low": ",".join(f"{value:.9g}" for value in space.low.ravel().tolist()),
         "action_high": ",".join(f"{value:.9g}" for value in space.high.ravel().tolist()),
     }
-
-
-def _describe(info: PolicyInfo) -> str:
-    """Return a sentence on the graph, for those who open the file in a viewer."""
-    return (
-        f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps: raw observations in, "
-        "deterministic action out; normalisation and the action's bounds are inside"
-    )

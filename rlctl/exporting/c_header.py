@@ -1,4 +1,4 @@
-"""The header of a C policy: what each element of observation and action is, in words and as data."""
+"""The header of a C policy: it documents each element of observation and action, in a comment and as arrays."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class Element:
     name: str
     size: int
     unit: str = ""
-    """Empty where it is not known."""
+    """Empty if unknown."""
 
 
 class Layout:
-    """Which element of the C function's observation and action is what; `name` begins everything in the header."""
+    """The elements of the C function's observation and action; `name` is the prefix of all names in the header."""
 
     def __init__(self, name: str, info: PolicyInfo) -> None:
         self.name = name
@@ -65,11 +65,11 @@ class Layout:
         return [Element(f"action[{index}]", 1) for index in range(self.action_size)]
 
     def list_state(self) -> list[str]:
-        """Return the part of the state that remembers earlier observations."""
+        """Return the fields of the state that hold earlier observations."""
         return [f"{self.type} frames[{self.frames * self.size}]; /* oldest first */", "int begun;"]
 
     def describe_observation(self) -> list[str]:
-        """Return a line per name in an observation: its elements, size and unit."""
+        """Return a line per named part of the observation: its indices, name and unit."""
         lines, first = [], 0
         for part in self.observed:
             unit = f" [{part.unit}]" if part.unit else ""
@@ -79,8 +79,8 @@ class Layout:
         return lines
 
     def describe_action(self) -> list[str]:
-        """Return the meaning of the action, with its bounds."""
-        meaning, space = self.info.env.action_meaning or "as the environment takes it", self.action_space
+        """Return lines on the meaning of the action and its bounds."""
+        meaning, space = self.info.env.action_meaning or "action of the environment", self.action_space
         if not isinstance(space, spaces.Box):
             return [f"  {meaning}: {' '.join(str(space).split())}, counted from 0"]
         bounds = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)
@@ -88,7 +88,7 @@ class Layout:
         if self.info.env.joints and self.actions[0].name == self.info.env.joints.names[0]:
             ranges = [f"{joint.name}, {limits}" for joint, limits in zip(self.actions, ranges, strict=True)]
         elif len(set(ranges)) == 1:
-            return [f"  {meaning}; each {ranges[0]}"]
+            return [f"  {meaning}; every element {ranges[0]}"]
         return [f"  {meaning}", *(f"  [{index}] {limits}" for index, limits in enumerate(ranges))]
 
     def list_arrays(self) -> list[tuple[str, str, str, list[str]]]:
@@ -109,7 +109,7 @@ class Layout:
 
 
 def _find_bounds(parts: Iterable[spaces.Space[Any]], size: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the lowest and highest value of the last `size` elements: of a stack of frames those of the newest."""
+    """Return the lowest and highest value of the last `size` elements; with stacked frames, of the newest frame."""
     bounds = [_find_part_bounds(part) for part in parts]
     low, high = (np.concatenate([np.ravel(pair[side]) for pair in bounds])[-size:] for side in (0, 1))
     return low, high
@@ -129,8 +129,8 @@ def _write_numbers(values: NDArray[Any], kind: str) -> list[str]:
 
 
 def _quote(text: str) -> str:
-    """Return a C string of a text in UTF-8, whatever characters it has."""
-    plain = {*range(32, 127)} - set(b'"\\?')  # two question marks begin a trigraph
+    """Return a text in UTF-8 as a C string literal."""
+    plain = {*range(32, 127)} - set(b'"\\?')  # two question marks start a trigraph
     return '"' + "".join(chr(byte) if byte in plain else f"\\{byte:03o}" for byte in text.encode()) + '"'
 
 
@@ -147,12 +147,12 @@ def write_header(layout: Layout, members: list[str], prototype: str) -> str:
     upper, control_dt = name.upper(), info.env.control_dt
     declarations = [_declare_data(layout), f"{prototype};"]
     if members:
-        reset = f"/* Call it when an episode begins. */\nvoid {name}_reset({name}_state *state);"
+        reset = f"/* Call this function when an episode begins. */\nvoid {name}_reset({name}_state *state);"
         fields = "\n".join(f"    {member}" for member in members)
         declarations[1:1] = [f"typedef struct {{\n{fields}\n}} {name}_state;", reset]
     sizes = [
         f"#define {upper}_OBSERVATION_SIZE {layout.size}",
-        f"#define {upper}_OBSERVATION_PARTS {len(layout.observed)} /* with a name each */",
+        f"#define {upper}_OBSERVATION_PARTS {len(layout.observed)} /* named parts */",
         f"#define {upper}_ACTION_SIZE {layout.action_size}",
     ]
     if control_dt is not None:
@@ -170,20 +170,20 @@ def write_header(layout: Layout, members: list[str], prototype: str) -> str:
 
 def _describe(layout: Layout, has_state: bool) -> list[str]:
     name, info = layout.name, layout.info
-    stacked = f"; one observation, the last {layout.frames} are stacked inside" if layout.frames > 1 else ""
+    stacked = f"; the function stacks the last {layout.frames} observations itself" if layout.frames > 1 else ""
     return [
         f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps. Written by rlctl "
         f"{__version__}; do not edit.",
         *([f"Robot: {info.env.robot}."] if info.env.robot else []),
         *([f"Call {name}_act every {info.env.control_dt!r} s."] if info.env.control_dt is not None else []),
         "",
-        f"observation, {layout.size} elements, raw: normalisation is inside{stacked}",
+        f"observation, {layout.size} elements, not normalised: the function normalises it{stacked}",
         *layout.describe_observation(),
         f"action, {format_count(layout.action_size, 'element')}",
         *layout.describe_action(),
         "",
-        f"Nothing is allocated, and nothing is shared between calls{' but the state' if has_state else ''}.",
-        "A NaN in the observation gives NaN actions or an arbitrary choice: check what sensors say before.",
+        f"The function allocates no memory, and calls share no data{' except the state' if has_state else ''}.",
+        "A NaN in the observation gives NaN actions or an arbitrary choice: check sensor values first.",
     ]
 
 
@@ -192,11 +192,11 @@ def _declare_data(layout: Layout) -> str:
     arrays = [
         f"extern const {kind} {layout.name}_{array}[{upper}_{size}];" for kind, array, size, _ in layout.list_arrays()
     ]
-    return "\n".join(['/* The same as data; an unknown unit is "", bounds may be infinite. */', *arrays])
+    return "\n".join(['/* The same as arrays; an unknown unit is "", bounds may be infinite. */', *arrays])
 
 
 def write_comment(lines: list[str]) -> str:
-    """Return a comment that ends where it is to end, whatever names a task has."""
+    """Return a C comment; names of a task cannot end it early."""
     plain = [" ".join(line.split()) if line.lstrip() == line else line for line in lines]
     safe = [re.sub(r"[\r\n\v\f\0]", " ", line).replace("*/", "* /").replace("/*", "/ *").rstrip("\\") for line in plain]
     return "/* " + "\n".join(f" * {line}".rstrip() for line in safe)[3:] + "\n */"

@@ -1,4 +1,4 @@
-"""The layers of a network as the statements of a C function for one observation."""
+"""Writes the layers of a network as statements of a C function for one observation."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _ACTIVATIONS = {
     "silu": "{x} * sigmoid({x})",
 }
 _FUNCTIONS = {
-    # expf is several times as fast as tanhf; the difference of the two is below 2e-7.
+    # expf is several times as fast as tanhf; the results differ by less than 2e-7.
     "hyperbolic_tangent": "static float hyperbolic_tangent(float x)\n{\n"
     "    return 1.0f - 2.0f / (expf(2.0f * x) + 1.0f);\n}\n",
     "sigmoid": "static float sigmoid(float x)\n{\n    return 1.0f / (1.0f + expf(-x));\n}\n",
     "relu": "static float relu(float x)\n{\n    return x < 0.0f ? 0.0f : x;\n}\n",
     "elu": "static float elu(float x)\n{\n    return x < 0.0f ? expm1f(x) : x;\n}\n",
-    # Comparisons that are false for NaN, so that it is passed on and not turned into a bound.
+    # These comparisons are false for NaN: the result is NaN, not a bound.
     "bound": "static double bound(double x, double low, double high)\n{\n"
     "    return x < low ? low : x > high ? high : x;\n}\n",
     "find_largest": """static int find_largest(const float *values, int count)
@@ -42,7 +42,7 @@ _FUNCTIONS = {
     return largest;
 }
 """,
-    # Weights lie input by input: the inner loop has independent sums, which compilers make SIMD instructions of.
+    # Weights are stored input by input: the sums of the inner loop are independent, so compilers use SIMD.
     "apply_linear": """static void apply_linear(const float *restrict weight, const float *restrict input, int inputs,
                          float *restrict output, int outputs)
 {
@@ -62,7 +62,7 @@ _FUNCTIONS = {
     }
 }
 """,
-    # Gates in the order input, forget, cell, output.
+    # The order of the gates is input, forget, cell, output.
     "apply_gates": """static void apply_gates(const float *gates, int count, float *hidden, float *cell)
 {
     for (int i = 0; i < count; ++i) {
@@ -73,11 +73,11 @@ _FUNCTIONS = {
 }
 """,
 }
-"""Functions that a source file gets if it calls them, in the order in which they stand there."""
+"""C functions; a source file has those that it calls, in this order."""
 
 
 class CWriter:
-    """Writes a network, layer by layer. A value is the name of a C array of floats and its size."""
+    """Writes a network layer by layer. The methods pass on values: the name and the size of a C array of floats."""
 
     def __init__(self) -> None:
         self.statements: list[str] = []
@@ -93,25 +93,29 @@ class CWriter:
         return [function for name, function in _FUNCTIONS.items() if re.search(rf"\b{name}\(", text)]
 
     def loop(self, count: int, statement: str) -> None:
-        """Add a statement for every `i` below `count`."""
+        """Add a loop of one statement over `i` below `count`."""
         self.statements += [f"for (int i = 0; i < {count}; ++i) {{", f"    {statement}", "}"]
 
     def write(self, network: Network, sizes: dict[str, int], source: str) -> tuple[str, int]:
-        """Write everything up to the head; `sizes` are the elements of each part of the observation in `source`.
+        """Write the network, head included, and return the head's value.
 
-        Returns the head's value.
+        `source` is the C array of the observation; `sizes` are the elements of its parts.
         """
-        counts = {key: _count_features(network.parts[key][0], size) for key, size in sizes.items()}
+        first_layers = {key: network.parts[key][0] for key in sizes}
+        counts = {
+            key: int(layer.sizes.sum()) if isinstance(layer, OneHot) else sizes[key]
+            for key, layer in first_layers.items()
+        }
         value, start, feature = self._declare("features", sum(counts.values())), 0, 0
         for key, size in sizes.items():
-            self._write_part(network.parts[key][0], source, start, size, value, feature)
+            self._write_part(first_layers[key], source, start, size, value, feature)
             start, feature = start + size, feature + counts[key]
         if network.lstm is not None:
             value, feature = self._write_lstm(network.lstm, value, feature)
         return self._write_layers([*network.trunk, *network.head], value, feature)
 
     def _write_part(self, layer: Layer, source: str, start: int, size: int, target: str, feature: int) -> None:
-        """Write a part of the observation as features: one-hot, normalised or as it is."""
+        """Write the features of a part of the observation: one-hot, normalised or unchanged."""
         if isinstance(layer, OneHot):
             for number, count in enumerate(layer.sizes.ravel().tolist()):
                 element = f"{target}[{_offset(feature)}]"
@@ -144,7 +148,7 @@ class CWriter:
             elif isinstance(layer, Clip):
                 self.loop(size, f"{x} = (float)bound({x}, {-layer.limit!r}, {layer.limit!r});")
             else:
-                assert isinstance(layer, Activation)  # images, which have other layers, are refused before
+                assert isinstance(layer, Activation)  # other layers are for images, which `write_c` refuses
                 self.loop(size, f"{x} = {_ACTIVATIONS[layer.name].format(x=x)};")
         return value, size
 
@@ -162,7 +166,7 @@ class CWriter:
         return value, size
 
     def write_action(self, network: Network, value: str, size: int, space: spaces.Space[Any], kind: str) -> None:
-        """Write the action of C type `kind` from the head's value: bounded or scaled, or the most likely choices."""
+        """Write the action from the head's value: clipped or scaled, as C type `kind`, or the most likely choices."""
         if isinstance(space, spaces.MultiBinary):
             self.loop(size, f"action[i] = {value}[i] > 0.0f;")
         elif not isinstance(space, spaces.Box):
@@ -183,7 +187,7 @@ class CWriter:
             self.loop(size, f"action[i] = {x};")
 
     def constant(self, name: str, values: NDArray[Any], kind: str = "float") -> str:
-        """Return the element `i` of a constant array; one number where all elements are the same."""
+        """Return element `i` of a constant array; a number if all elements are equal."""
         flat = values.ravel()
         if (flat == flat[0]).all():
             return write_number(flat[0], kind)
@@ -209,23 +213,19 @@ class CWriter:
         return f"{name}_{self._numbers[name]}"
 
 
-def _count_features(layer: Layer, size: int) -> int:
-    return int(layer.sizes.sum()) if isinstance(layer, OneHot) else size
-
-
 def _offset(offset: int) -> str:
     return f"{offset} + i" if offset else "i"
 
 
 def write_array(declaration: str, values: Sequence[str]) -> str:
-    """Return the definition of an array; `declaration` has its type and name."""
+    """Return the definition of an array; `declaration` is its type and name."""
     rows = [", ".join(values[low : low + _PER_LINE]) for low in range(0, len(values), _PER_LINE)]
     body = ",\n    ".join(rows)
     return f"{declaration}[{len(values)}] = {{\n    {body},\n}};\n"
 
 
 def write_number(value: Any, kind: str) -> str:
-    """Return a number as C reads it back, bit for bit."""
+    """Return a C literal with exactly the value of a number."""
     if kind == "int":
         return str(int(value))
     if np.isinf(value):

@@ -22,17 +22,17 @@ from rlctl.policy.layers import ScaleImage
 from rlctl.policy.network import Network
 
 LARGEST = 3_000_000
-"""Weights that a C file may have: some 40 MB of text, which a compiler takes a minute for."""
+"""Most weights in a C file: about 40 MB of text, for which a compiler needs a minute."""
 FLAGS = ("-std=c99", "-O3", "-Wall", "-Wextra", "-pedantic")
 _TIMEOUT_S = 300.0  # of a compiler
 
 
 @dataclasses.dataclass(frozen=True)
 class CSource:
-    """The texts of the two files, and what they define."""
+    """The content of a C header and its source file."""
 
     name: str
-    """Prefix of everything that the header declares."""
+    """Prefix of all names in the header."""
     header: str
     source: str
     prototype: str
@@ -41,7 +41,7 @@ class CSource:
 
     @property
     def harness(self) -> str:
-        """C with the same names for every policy, for a library that is called through ctypes."""
+        """Return C functions with the same names for every policy, for calls through ctypes."""
         state = f"({self.name}_state *)state, " if self.has_state else ""
         size = f"sizeof({self.name}_state)" if self.has_state else "0"
         return f"""#include <stddef.h>
@@ -68,26 +68,25 @@ void rlctl_repeat(const void *observation, void *state, void *action, long count
 
 
 def write_c(policy: PolicyFile, file_name: str) -> CSource:
-    """Write a policy as C; functions are called after the file, `reach.c` -> `reach_act`.
+    """Write a policy as C; names of functions begin with the name of the file: `reach.c` -> `reach_act`.
 
-    Raises `UsageError` for what has no translation: images, and networks of more than `LARGEST` weights.
+    Raises `UsageError` for images, a user's own network, and networks of more than `LARGEST` weights.
     """
     if (weights := sum(tensor.size for tensor in policy.actor_only().tensors.values())) > LARGEST:
         raise UsageError(
-            f"export --c: {weights:,} weights are too many for a C file (at most {LARGEST:,}); rlctl export --onnx"
+            f"export --c: {weights:,} weights are too many for a C file (at most {LARGEST:,}); use export --onnx"
         )
     kwargs = policy.info.policy_kwargs
     for key in own_modules.KEYS:
         if isinstance(own := kwargs.get(key), dict):
             raise UsageError(
-                f"export --c: the layer {own['class']} of policy_kwargs.{key} cannot be written as C; "
-                "rlctl export --onnx can"
+                f"export --c: the layer {own['class']} of policy_kwargs.{key} cannot be written as C; use export --onnx"
             )
     name, network = _make_identifier(file_name), Network(policy)
     layout = Layout(name, policy.info)
     has_images = any(isinstance(layer, ScaleImage) for part in network.parts.values() for layer in part)
     if has_images or (layout.frames > 1 and [len(part.shape or ()) for part in layout.parts.values()] != [1]):
-        raise UsageError("export --c: images cannot be written as C; rlctl export --onnx can")
+        raise UsageError("export --c: networks for images cannot be written as C; use export --onnx")
     if isinstance(layout.action_space, spaces.Box) and layout.action_space.dtype.kind != "f":
         raise UsageError(f"export --c: an action of type {layout.action_space.dtype} cannot be written as C")
     writer = CWriter()
@@ -135,7 +134,7 @@ def _stack_frames(layout: Layout) -> list[str]:
         return []
     size, total = layout.size, layout.frames * layout.size
     return [
-        f"for (int i = 0; i < {total}; ++i) {{ /* the first observation of an episode fills all frames */",
+        f"for (int i = 0; i < {total}; ++i) {{ /* the first observation of an episode is copied into all frames */",
         f"    const int older = state->begun && i < {total - size};",
         f"    state->frames[i] = older ? state->frames[i + {size}] : observation[i % {size}];",
         "}",
@@ -150,7 +149,7 @@ def find_compiler() -> list[str] | None:
 
 
 def build_library(code: CSource, info: PolicyInfo, folder: Path, compiler: list[str]) -> Path:
-    """Compile a policy in `folder` and return the library; raises `AnswerIsNo` if the compiler does not take it."""
+    """Compile a policy in `folder` and return the library; raises `AnswerIsNo` if the compiler fails."""
     (folder / f"{code.name}.h").write_text(code.header)
     (folder / f"{code.name}.c").write_text(code.source)
     (folder / "harness.c").write_text(code.harness)

@@ -1,15 +1,16 @@
-"""`rlctl export`: a policy file becomes an ONNX file or C source, which stays only if it acts the same."""
+"""`rlctl export`: write a policy as an ONNX file or C source, and keep the file only if it acts as the policy does."""
 
 from __future__ import annotations
 
 import shlex
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.report import ExportReport, format_agreement, format_closed_loop
 from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.verify import MIN_OBSERVATIONS, measure_latency, verify
 from rlctl.output import print_notes
 from rlctl.policy import onnx_file
 from rlctl.policy.file import PolicyFile, PolicyInfo
@@ -26,34 +27,25 @@ if TYPE_CHECKING:
     import onnx
 
     from rlctl.exporting.c_source import CSource
-    from rlctl.exporting.verify import Agreement, ClosedLoop
     from rlctl.policy.torch_policy import TorchPolicy
 
 C_OBSERVATIONS = 2000
-"""On which a C function is compared."""
-
-
-class _Export(NamedTuple):
-    # What the exports of one policy share.
-    file: Path
-    info: PolicyInfo
-    policy: TorchPolicy
-    workers: Workers
+"""Number of observations on which a C function is compared."""
 
 
 def export_policy(request: ExportRequest) -> list[ExportReport]:
     """Export a policy in one or more formats and verify each file in the policy's own environment.
 
-    Of several formats each file has its own suffix. Raises `UsageError` for a policy that has no such form, and
-    `AnswerIsNo` with the numbers if a file does not act as the policy does; then that file is not left.
+    The files of several formats differ in their suffix. Raises `UsageError` for a policy that a format cannot hold,
+    and `AnswerIsNo` with the numbers if a file does not act as the policy does; that file is not written.
     """
     source, formats, output = lookup.find_policy(request.run, request.checkpoint), request.formats, request.output
     print_notes(source.notes)
     if source.file.suffix == ".onnx":
-        raise UsageError(f"{source.file}: an ONNX file already; export the run or its .safetensors file")
+        raise UsageError(f"{source.file} is an ONNX file already; export the run or its .safetensors file")
     if output is None:
-        beside = Path() if request.checkpoint == PRETRAINED else source.file.parent
-        output = source.run.onnx_file if source.run else beside / source.file.name
+        folder = Path() if request.checkpoint == PRETRAINED else source.file.parent
+        output = source.run.onnx_file if source.run else folder / source.file.name
         output = output.with_suffix(f".{formats[0]}")
     return _export(source, [output.with_suffix(f".{name}") for name in formats])
 
@@ -61,7 +53,7 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
 def _export(source: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
     policy = check_playable(PolicyFile.read(source.file))
     if source.run is not None and any(isinstance(policy.info.policy_kwargs.get(key), dict) for key in KEYS):
-        import_named(source.run.recipe().policy_kwargs)  # they are the user's, whose run names them
+        import_named(source.run.recipe().policy_kwargs)  # the user's own networks, named by the user's run
     info = policy.info
     # The environments are built while torch is imported.
     with Workers(source.locate(info.spec), available_cores()) as workers:
@@ -72,25 +64,28 @@ def _export(source: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
         pin_threads()
         models = [(target, build(policy)) for target in targets if target.suffix == ".onnx"]
         sources = [(target, write_c(policy, target.stem)) for target in targets if target.suffix == ".c"]
-        job = _Export(source.file, info, TorchPolicy.load(source.file), workers)
+        torch_policy = TorchPolicy.load(source.file)
         _check_environment(source.file, info, workers)
-        return [*(_export_onnx(job, *model) for model in models), *(_export_c(job, *source) for source in sources)]
+        return [
+            *(_export_onnx(torch_policy, workers, target, model) for target, model in models),
+            *(_export_c(torch_policy, workers, target, code) for target, code in sources),
+        ]
 
 
 def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) -> None:
     try:
         built = workers.info
     except (UsageError, TaskError) as error:
-        message = f"{policy_file}: the export cannot be verified, its environment does not build: {error}"
+        message = f"{policy_file}: the export cannot be verified, because its environment does not build: {error}"
         raise type(error)(message, details=error.details) from None
     if difference := info.env.find_difference(built):
         raise ArtifactError(
-            f"{policy_file}: the export cannot be verified, its environment has changed: {difference}; "
-            "train again, or go back to the task's former version"
+            f"{policy_file}: the export cannot be verified, because its environment has changed: {difference}; "
+            "train again, or restore the task's previous version"
         )
 
 
-def _export_onnx(job: _Export, target: Path, model: onnx.ModelProto) -> ExportReport:
+def _export_onnx(policy: TorchPolicy, workers: Workers, target: Path, model: onnx.ModelProto) -> ExportReport:
     from rlctl.policy.onnx_policy import OnnxPolicy
 
     reports: list[ExportReport] = []
@@ -102,11 +97,11 @@ def _export_onnx(job: _Export, target: Path, model: onnx.ModelProto) -> ExportRe
         opset, size = model.opset_import[0].version, part.stat().st_size
         reports.append(
             ExportReport(
-                **_verify(job, target, exported, part, "the ONNX file", 1000),
+                **_verify(policy, workers, target, exported, part, "the ONNX file"),
                 size=size,
                 written=f"{target} ({size / 1000:,.1f} kB, opset {opset})",
-                interface=[(kind, ", ".join(map(_format_port, some))) for kind, some in ports.items()],
-                next=shlex.join(["rlctl", "eval", str(target), "--task", job.info.spec.task]),
+                interface=[(kind, ", ".join(map(_format_port, ports[kind]))) for kind in ports],
+                next=shlex.join(["rlctl", "eval", str(target), "--task", policy.info.spec.task]),
                 details={"opset": opset} | {kind: [_describe_port(port) for port in ports[kind]] for kind in ports},
             )
         )
@@ -124,24 +119,25 @@ def _format_port(port: Any) -> str:
     return f"{name} {dtype}[{', '.join(map(str, shape))}]"
 
 
-def _export_c(job: _Export, target: Path, code: CSource) -> ExportReport:
+def _export_c(policy: TorchPolicy, workers: Workers, target: Path, code: CSource) -> ExportReport:
     from rlctl.exporting.c_source import build_library, find_compiler
     from rlctl.policy.c_policy import CPolicy
 
     compiler = find_compiler()
-    # The name of a header is in the source, and a file's may not be an identifier: policy-1.c includes policy_1.h.
+    # The source includes the header by the identifier: policy-1.c includes policy_1.h.
     header = target.with_name(f"{code.name}.h")
     if compiler is None:
-        seen = {**_describe(job, target), "not_verified": "no C compiler (cc, or $CC) on this machine"}
+        fields = {**_describe(policy, target), "not_verified": "no C compiler (cc, or $CC) on this machine"}
     else:
         with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
-            library = build_library(code, job.info, Path(folder), compiler)
-            seen = _verify(job, target, CPolicy.load(library), library, "the C function", C_OBSERVATIONS)
+            library = build_library(code, policy.info, Path(folder), compiler)
+            exported = CPolicy.load(library)
+            fields = _verify(policy, workers, target, exported, library, "the C function", C_OBSERVATIONS)
     files.write_text(header, code.header)
     files.write_text(target, code.source)
     size = len(code.source.encode()) + len(code.header.encode())
     return ExportReport(
-        **seen,
+        **fields,
         size=size,
         written=f"{target} and {header.name} ({size / 1000:,.1f} kB, C99)",
         interface=[("function", code.prototype)],
@@ -150,11 +146,11 @@ def _export_c(job: _Export, target: Path, code: CSource) -> ExportReport:
     )
 
 
-def _describe(job: _Export, target: Path) -> dict[str, Any]:
-    info = job.info
+def _describe(policy: TorchPolicy, target: Path) -> dict[str, Any]:
+    info = policy.info
     return {
         "path": target,
-        "policy": job.file,
+        "policy": policy.file.path,
         "task": info.spec.task,
         "algo": info.algo,
         "training_steps": info.training_steps,
@@ -162,23 +158,22 @@ def _describe(job: _Export, target: Path) -> dict[str, Any]:
 
 
 def _verify(
-    job: _Export, target: Path, exported: Policy, file: Path, what: str, min_observations: int
+    policy: TorchPolicy,
+    workers: Workers,
+    target: Path,
+    exported: Policy,
+    file: Path,
+    what: str,
+    min_observations: int = MIN_OBSERVATIONS,
 ) -> dict[str, Any]:
-    """Return what a report says of a verified file."""
-    from rlctl.exporting.verify import measure_latency, verify
-
-    agreement, loop = verify(job.policy, exported, file, job.workers, min_observations)
+    """Return the fields of a report on a verified file; raises `AnswerIsNo` if it does not act as the policy does."""
+    agreement, loop = verify(policy, exported, file, workers, min_observations)
     if not (agreement.agrees and (loop.agrees or loop.magnified)):
-        raise AnswerIsNo(_explain_failure(job, target, what, agreement, loop))
-    latency = measure_latency(job.policy, exported)
-    return {**_describe(job, target), "agreement": agreement, "closed_loop": loop, "latency": latency}
-
-
-def _explain_failure(job: _Export, target: Path, what: str, agreement: Agreement, loop: ClosedLoop) -> str:
-    why = f"{what} does not act as {job.file} does"
-    if agreement.agrees:
-        why = (
-            "every action agrees, but the episodes do not: is the environment reproducible? "
-            f"rlctl check-env {job.info.spec.task}"
-        )
-    return f"{target}: not verified, not written: {why}\n{format_agreement(agreement)}\n{format_closed_loop(loop)}"
+        why = f"{what} does not act as {policy.file.path} does"
+        if agreement.agrees:
+            task = policy.info.spec.task
+            why = f"all actions agree, but the episodes differ; is the environment reproducible? rlctl check-env {task}"
+        numbers = f"{format_agreement(agreement)}\n{format_closed_loop(loop)}"
+        raise AnswerIsNo(f"{target}: not verified, not written: {why}\n{numbers}")
+    latency = measure_latency(policy, exported)
+    return {**_describe(policy, target), "agreement": agreement, "closed_loop": loop, "latency": latency}

@@ -1,4 +1,4 @@
-"""Builds one ONNX graph, node by node, of layers with their present weights."""
+"""Builds an ONNX graph node by node, from layers with their present weights."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from rlctl.policy.layers import (
 from rlctl.version import __version__
 
 OPSET = 17
-"""Read by onnxruntime 1.12 and newer."""
+"""onnxruntime 1.12 and newer read it."""
 IR_VERSION = 8
-"""The one that belongs to the opset; the onnx package would write its newest, which older runtimes refuse."""
+"""The version of this opset; the onnx package would write its newest one, which older runtimes refuse."""
 BATCH = "batch"
 """Name of the dynamic dimension."""
 
 
 class Graph:
-    """A graph that grows by `add`; values are known by their names.
+    """A graph under construction; values are identified by their names.
 
-    Inputs and outputs have the names a caller sees. Everything inside starts with a slash, so the two never meet.
+    Names of inner values start with a slash, so they differ from the names of inputs and outputs.
     """
 
     def __init__(self) -> None:
@@ -48,9 +48,9 @@ class Graph:
         self._outputs: list[onnx.ValueInfoProto] = []
 
     def input(self, name: str, dtype: Any, shape: Sequence[int | str], meaning: str) -> str:
-        """Add an input; raises `UsageError` if its name is taken, as a dict observation may have any key."""
+        """Add an input; raises `UsageError` if its name is empty, taken or starts with a slash."""
         if not name or name.startswith("/") or name in (port.name for port in self._inputs):
-            raise UsageError(f"export: an observation cannot be named {name!r} in an ONNX file")
+            raise UsageError(f"export: an observation named {name!r} cannot be written as ONNX; rename it in the task")
         self._inputs.append(helper.make_tensor_value_info(name, _find_type(dtype), list(shape), meaning))
         return name
 
@@ -66,14 +66,14 @@ class Graph:
         return self.add_with_outputs(operator, inputs, 1, **attributes)[0]
 
     def add_with_outputs(self, operator: str, inputs: Sequence[str], count: int, **attributes: Any) -> list[str]:
-        """Add a node and return the names of its outputs; an input named "" is left out."""
+        """Add a node and return the names of its outputs; an input named "" is an omitted one."""
         name = f"/{operator}_{len(self._nodes)}"
         outputs = [name if count == 1 else f"{name}.{index}" for index in range(count)]
         self._nodes.append(helper.make_node(operator, list(inputs), outputs, name=name, **attributes))
         return outputs
 
     def inline(self, graph: onnx.GraphProto, values: Mapping[str, str]) -> str:
-        """Add the nodes of another graph; `values` are those of its inputs. Return its first output."""
+        """Add the nodes of another graph and return its first output; `values` maps its inputs to our values."""
         names = dict(values)
         for tensor in graph.initializer:
             names[tensor.name] = self.constant(f"own/{tensor.name}", numpy_helper.to_array(tensor))
@@ -92,16 +92,18 @@ class Graph:
         return self.add("Cast", value, to=_find_type(dtype))
 
     def output(self, value: str, name: str, dtype: Any, shape: Sequence[int | str], meaning: str) -> None:
-        """Make a value an output, under a name."""
+        """Make a value an output with a name."""
         if name in (port.name for port in self._inputs):
-            raise UsageError(f"export: an observation cannot be named {name!r} in an ONNX file, an output is")
+            raise UsageError(
+                f"export: an observation named {name!r} has the name of an ONNX output; rename it in the task"
+            )
         for node in self._nodes:
             for names in (node.input, node.output):
                 names[:] = [name if other == value else other for other in names]
         self._outputs.append(helper.make_tensor_value_info(name, _find_type(dtype), list(shape), meaning))
 
     def model(self, metadata: Mapping[str, str], meaning: str) -> onnx.ModelProto:
-        """Return the checked model; raises onnx's `ValidationError` if the graph makes no sense."""
+        """Return the checked model; raises onnx's `ValidationError` for an invalid graph."""
         graph = helper.make_graph(
             self._nodes, "policy", self._inputs, self._outputs, list(self._constants.values()), meaning
         )
@@ -118,8 +120,8 @@ class Graph:
 
 
 def unsupported(what: str) -> UsageError:
-    """Return the error for a part of a policy that has no translation."""
-    return UsageError(f"export: {what} cannot be written as ONNX yet")
+    """Return the error for a part of a policy that cannot be written as ONNX."""
+    return UsageError(f"export: {what} cannot be written as ONNX")
 
 
 def _find_type(dtype: Any) -> int:
@@ -151,8 +153,8 @@ def _emit_convolution(graph: Graph, value: str, layer: Convolution) -> str:
 
 
 def _emit_batch_renorm(graph: Graph, value: str, layer: BatchRenorm) -> str:
-    # Step by step as sb3-contrib computes it: folded into one multiplication and addition, a mean that is large
-    # against its deviation would cost digits.
+    # The same steps as in sb3-contrib: as one multiplication and addition, a mean much larger than its deviation
+    # would lose digits.
     value = graph.add("Sub", value, graph.constant(f"{layer.name}.ra_mean", layer.mean))
     deviation = graph.constant(f"{layer.name}.deviation", np.sqrt(layer.variance + layer.epsilon))
     value = graph.add("Mul", graph.add("Div", value, deviation), graph.constant(f"{layer.name}.scale", layer.scale))
@@ -250,7 +252,7 @@ def emit_lstm(graph: Graph, value: str, state: tuple[str, str], lstm: Lstm) -> t
 
 
 def _add_lstm_constants(graph: Graph, layer: LstmLayer, name: str) -> list[str]:
-    """Input weights, recurrent weights and biases of a layer, with a leading dimension for ONNX's directions."""
+    """Add input weights, recurrent weights and biases of a layer, with ONNX's leading dimension of directions."""
     weights = [_reorder_gates(weight) for weight in (layer.of_input, layer.of_hidden)]
     biases = [_reorder_gates(bias) for bias in layer.biases] or [np.zeros(len(weights[0]), np.float32)] * 2
     return [
@@ -261,6 +263,6 @@ def _add_lstm_constants(graph: Graph, layer: LstmLayer, name: str) -> list[str]:
 
 
 def _reorder_gates(values: NDArray[Any]) -> NDArray[Any]:
-    """From torch's order of gates, input forget cell output, to ONNX's, input output forget cell."""
+    """Change torch's order of gates (input, forget, cell, output) to ONNX's (input, output, forget, cell)."""
     i, f, c, o = np.split(values, 4)
     return np.concatenate([i, o, f, c])

@@ -1,4 +1,4 @@
-"""`rlctl export RUN --policy FILE`: the actor alone, with where it is from and what it scores."""
+"""`rlctl export RUN --policy FILE`: the actor only, with its origin and its scores."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class PolicyFileReport:
 def export_actor(request: ExportRequest) -> PolicyFileReport:
     """Measure a run's policy and write its actor to `request.policy`, with score, recipe, task version and commit.
 
-    Zero and random actions are measured on the same episodes. A policy file that was written this way is measured
-    again, with its task as it is now. Raises `UsageError` for any other policy without a run.
+    Zero and random actions are measured on the same episodes. A policy file written this way can be measured again,
+    on the present version of its task. Raises `UsageError` for any other policy without a run.
     """
-    assert request.policy is not None  # what is asked for here
+    assert request.policy is not None
     target, source = request.policy, lookup.find_policy(request.run, request.checkpoint)
     output.print_notes(source.notes)
     origin = _find_origin(source)
@@ -59,17 +59,17 @@ def export_actor(request: ExportRequest) -> PolicyFileReport:
 
 
 def _find_origin(source: FoundPolicy) -> dict[str, Any]:
-    """Return which training a policy is from, as `Provenance` has it."""
+    """Return the fields of `Provenance` on the training of a policy."""
     if source.run is not None:
         return {
             "run": "/".join(source.run.path.resolve().parts[-2:]),
             "git_commit": source.run.status().get("git_commit"),
             "recipe": source.run.recipe().model_dump(mode="json", by_alias=True),
         }
-    before = PolicyFile.read_info(source.file).provenance if source.file.suffix == ".safetensors" else None
-    if before is None:
-        raise UsageError(f"{source.file}: no recipe is known of this policy; give the run that it is from")
-    return before.model_dump(include={"run", "git_commit", "recipe"})
+    provenance = PolicyFile.read_info(source.file).provenance if source.file.suffix == ".safetensors" else None
+    if provenance is None:
+        raise UsageError(f"{source.file}: the file does not contain the recipe of its training; give its run instead")
+    return provenance.model_dump(include={"run", "git_commit", "recipe"})
 
 
 def show(report: PolicyFileReport, json: str | None) -> None:

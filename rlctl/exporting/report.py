@@ -1,4 +1,4 @@
-"""What an export reports: the file, how it was verified, what goes in and comes out."""
+"""The report of an export: the file, its inputs and outputs, and how it was verified."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class ExportReport:
     size: int
     """[bytes]"""
     written: str
-    """What was written, for people."""
+    """Text on the written files."""
     interface: list[tuple[str, str]]
-    """What goes in and comes out, for people: a word and a text each."""
+    """Inputs and outputs: pairs of a word and a text."""
     next: str
     """A command to continue with."""
     details: Mapping[str, Any]
-    """What only files of this format have."""
+    """JSON entries that only this format has."""
     agreement: Agreement | None = None
     closed_loop: ClosedLoop | None = None
     latency: Latency | None = None
@@ -37,7 +37,7 @@ class ExportReport:
     """Why it was not verified; empty if it was."""
 
     def as_json(self) -> dict[str, Any]:
-        """Return what is written as JSON."""
+        """Return the report as plain data."""
         result = {**dataclasses.asdict(self), **self.details, "verified": not self.not_verified}
         for name in ("written", "interface", "next", "details"):
             del result[name]
@@ -47,7 +47,7 @@ class ExportReport:
         return result
 
     def list_rows(self) -> list[tuple[str, str]]:
-        """Return the lines of the report: a word and a text each."""
+        """Return the lines of the report: pairs of a word and a text."""
         policy = f"{self.algo} for {self.task}, {self.training_steps:,} steps, from {self.policy}"
         rows = [("exported", self.written), ("policy", policy), *self.interface]
         if self.not_verified or not (self.agreement and self.closed_loop and self.latency):
@@ -66,7 +66,7 @@ class ExportReport:
 def show(reports: list[ExportReport], json: str | None) -> None:
     """Print the reports of one policy, or write them as JSON to a file or, for `-`, to stdout.
 
-    The JSON of one format is an object; of several it is one object per format, by the suffix of its file.
+    The JSON of one report is an object. Several reports are an object with an entry per format, `onnx` and `c`.
     """
     by_format = {report.path.suffix[1:]: report.as_json() for report in reports}
     if output.present(by_format if len(reports) > 1 else reports[0].as_json(), json):
@@ -81,7 +81,7 @@ def show(reports: list[ExportReport], json: str | None) -> None:
 
 
 def format_agreement(agreement: Agreement) -> str:
-    """Return the comparison on observations, in a line."""
+    """Return the comparison on observations as one line."""
     sizes = " and ".join(str(size) for size in agreement.batch_sizes)
     text = (
         f"max |difference| {agreement.max_difference:.1e} (limit {MAX_DIFFERENCE:.0e}) "
@@ -90,18 +90,19 @@ def format_agreement(agreement: Agreement) -> str:
     if agreement.beyond_limit:
         text += f"; {agreement.beyond_limit:,} actions beyond the limit"
     if agreement.near_ties:
-        text += f"; {agreement.near_ties:,} near-ties chosen differently"
+        text += f"; {agreement.near_ties:,} different choices between nearly equal logits"
     return text
 
 
 def format_closed_loop(loop: ClosedLoop) -> str:
-    """Return the comparison of whole episodes, in a line."""
+    """Return the comparison of whole episodes as one line."""
     episodes = output.format_count(loop.episodes, "episode")
-    success = "" if loop.same_success is None else f"success same in {loop.same_success}, "
-    length = f"length {'same ' if loop.same_success is None else ''}in {loop.same_length}"
+    success = "" if loop.same_success is None else f"same success in {loop.same_success}, "
+    length = f"same length in {loop.same_length}"
     text = (
         f"{episodes}: {success}{length}, return within {loop.max_return_difference:.1e} "
         f"(mean {loop.mean_return:.5g} and {loop.mean_return_exported:.5g})"
     )
-    chaotic = "; the episodes are chaotic: a change in the last bits makes the original policy differ as much"
-    return text + chaotic * loop.magnified
+    if loop.magnified:
+        text += "; the episodes are chaotic: a change in the last bits makes the original policy differ as much"
+    return text

@@ -1,4 +1,4 @@
-"""What an export is asked for."""
+"""The request of an export."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ Format = Literal["onnx", "c"]
 
 @dataclasses.dataclass(frozen=True)
 class ExportRequest:
-    """What `rlctl export` is asked for; raises `UsageError` for what excludes each other."""
+    """What to export and where to; raises `UsageError` for a file name with a wrong suffix."""
 
     run: str | None
-    """What the user typed: a run, a policy file, a task that ships one, or None for the latest run."""
+    """A run, a policy file, a task, or None for the latest run."""
     formats: tuple[Format, ...] = ("onnx",)
     checkpoint: str = "best"
     output: Path | None = None
-    """Default: in the run's folder, next to a policy file that belongs to none, or here for a shipped policy."""
+    """Default: in the run's folder, next to a policy file without a run, or in this folder for a shipped policy."""
     policy: Path | None = None
     """Write the actor with its measured score to this file instead, as plugins ship it."""
     episodes: int = 100
-    """Played for that score."""
+    """Episodes of that measurement."""
 
     def __post_init__(self) -> None:
         if self.policy is not None and self.policy.suffix != ".safetensors":

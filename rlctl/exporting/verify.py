@@ -1,4 +1,4 @@
-"""Is the exported file the policy? Compared on real rollouts, observation by observation and in closed loop; timed."""
+"""Verifies an export: compares it with the policy per observation and in closed loop, and measures its latency."""
 
 from __future__ import annotations
 
@@ -27,32 +27,32 @@ if TYPE_CHECKING:
     from rlctl.policy.torch_policy import TorchPolicy
 
 MAX_DIFFERENCE = 1e-5
-"""Largest |difference| of an action element; relative to the element where that is larger than 1."""
+"""Limit of |difference| of an action element; relative for elements larger than 1."""
 MAX_RETURN_DIFFERENCE = 1e-3
-"""Largest difference of an episode's return, relative."""
+"""Limit of the relative difference of an episode's return."""
 MIN_OBSERVATIONS = 1000
 EPISODES = 20
-"""Episodes played in closed loop by each of the two policies."""
+"""Episodes that each of the two policies plays in closed loop."""
 _LAST_BITS = 2.0**-21
-"""Relative; of a 32-bit number the last three bits, about as much as another order of additions makes in a network."""
+"""Relative change: the last three bits of a float32, about the effect of another order of additions in a network."""
 _REPETITIONS = 300
 _WARM_UP = 30
-_CALLS = 10  # of a C function within one measurement
+_CALLS = 10  # calls of a C function per measurement
 
 
 @dataclasses.dataclass
 class Agreement:
-    """How close two policies came on the same observations."""
+    """Differences of two policies on the same observations."""
 
     observations: int = 0
     max_difference: float = 0.0
-    """Largest |difference| of an action element, in the action's own units."""
+    """Largest |difference| of an action element, in the units of the action."""
     beyond_limit: int = 0
-    """Actions that differ by more than the limit; for discrete actions, that differ at all."""
+    """Number of actions that differ by more than the limit; discrete actions that differ at all."""
     near_ties: int = 0
-    """Discrete actions that differ because their logits agree within the limit: either choice is right."""
+    """Number of different discrete actions whose logits are equal within the limit: both choices are right."""
     batch_sizes: list[int] = dataclasses.field(default_factory=lambda: [1])
-    """How many observations the exported policy was given at once."""
+    """Numbers of observations per call of the exported policy."""
 
     @property
     def agrees(self) -> bool:
@@ -61,7 +61,7 @@ class Agreement:
 
 
 class Comparison:
-    """Collects how far apart actions are. `add` right after the torch policy has acted: its logits are looked at."""
+    """Collects differences of actions. Call `add` right after the torch policy has acted: it reads its logits."""
 
     def __init__(self, torch_policy: TorchPolicy) -> None:
         self.agreement = Agreement()
@@ -78,7 +78,7 @@ class Comparison:
     def add(self, expected: NDArray[Any], actions: NDArray[Any]) -> None:
         """Compare two arrays of actions, shape (rows, ...)."""
         difference = np.abs(expected.astype(np.float64) - actions).reshape(len(expected), -1)
-        # Written so that NaN is beyond the limit.
+        # With this comparison NaN is beyond the limit.
         limit = MAX_DIFFERENCE * np.maximum(1.0, np.abs(expected)).reshape(difference.shape)
         differs = ~(difference <= limit).all(axis=1)
         if not isinstance(self._space, spaces.Box):
@@ -96,7 +96,7 @@ class Comparison:
         )
 
     def close(self) -> None:
-        """Stop looking at logits."""
+        """Stop reading logits."""
         if not isinstance(self._space, spaces.Box):
             self._hook.remove()
 
@@ -104,8 +104,8 @@ class Comparison:
 def _list_margins(
     space: spaces.Space[Any], logits: NDArray[np.float32], expected: NDArray[Any], action: NDArray[Any]
 ) -> list[tuple[float, float]]:
-    """By how much, per choice, the logit of the expected one is ahead, and the size of that logit."""
-    if isinstance(space, spaces.MultiBinary):  # against a logit of zero, which is a probability of one half
+    """Return per choice how much larger the logit of the expected choice is, and the size of that logit."""
+    if isinstance(space, spaces.MultiBinary):  # compared with a logit of 0, a probability of 0.5
         wrong = np.flatnonzero(expected != action)
         return [(abs(float(logits[index])), 0.0) for index in wrong]
     sizes = space.nvec if isinstance(space, spaces.MultiDiscrete) else [len(logits)]
@@ -116,18 +116,19 @@ def _list_margins(
 
 @dataclasses.dataclass(frozen=True)
 class ClosedLoop:
-    """The same episodes, played once with each policy."""
+    """Comparison of the same episodes, played with both policies."""
 
     episodes: int
     same_success: int | None
-    """None where the task reports no success."""
+    """Number of episodes with the same success; None if the task reports no success."""
     same_length: int
+    """Number of episodes with the same length."""
     max_return_difference: float
-    """Relative to the larger of the episode's own return and the mean size of a return."""
+    """Relative to |return| of the episode or the mean |return|, whichever is larger."""
     mean_return: float
     mean_return_exported: float
     magnified: bool = False
-    """Whether the policy's own episodes come out as differently when the last bits of its weights change."""
+    """Whether the episodes of the original policy differ as much when the last bits of its weights change."""
 
     @property
     def agrees(self) -> bool:
@@ -141,13 +142,13 @@ class Latency:
     """Median time for one observation [us]."""
 
     exported_us: float
-    """With everything: normalisation, network, bounds. An ONNX file on onnxruntime, called from Python; C alone."""
+    """Normalisation, network and bounds: an ONNX file in onnxruntime, called from Python; C without Python."""
     sb3_us: float
-    """SB3's `policy.predict` of an observation that is normalised already."""
+    """SB3's `policy.predict` of a normalised observation."""
 
     @property
     def speedup(self) -> float:
-        """How many times as fast as SB3 the file is."""
+        """Return the latency of SB3 divided by that of the file."""
         return self.sb3_us / self.exported_us
 
 
@@ -158,11 +159,11 @@ def verify(
     workers: Workers,
     min_observations: int = MIN_OBSERVATIONS,
 ) -> tuple[Agreement, ClosedLoop]:
-    """Play the same episodes with both; on every observation of either, ask torch and the exported policy.
+    """Play the same episodes with both policies, and compare their actions on every observation of both.
 
-    `file` is the exported one, an ONNX file or a compiled library. Rollouts go on until `min_observations` were
-    compared. Where all actions agree and the episodes do not, the policy plays them with other last bits. Raises
-    `TaskError` if the environment fails.
+    `file` is the exported file, ONNX or a compiled library. Plays more episodes until `min_observations` are compared.
+    If all actions agree but the episodes differ, it tests whether the episodes are chaotic. Raises `TaskError` if the
+    environment fails.
     """
     comparison = Comparison(torch_policy)
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
@@ -179,21 +180,21 @@ def verify(
         _compare_actions(torch_policy, exported, more, comparison)
         played = total
     workers.set_other_policy(str(file.resolve()))
-    done = play_episodes(workers, seeds, record=True)
-    compared = comparison.agreement.observations
-    _compare_actions(torch_policy, exported, done, comparison)
-    comparison.agreement.observations = compared  # those of one policy's rollouts are counted
+    actual = play_episodes(workers, seeds, record=True)
+    observations = comparison.agreement.observations
+    _compare_actions(torch_policy, exported, actual, comparison)
+    comparison.agreement.observations = observations  # counts the original policy's episodes only
     comparison.close()
-    loop = compare_episodes(expected, done)
+    loop = compare_episodes(expected, actual)
     if comparison.agreement.agrees and not loop.agrees:
         loop = dataclasses.replace(loop, magnified=_magnifies_rounding(torch_policy.file, workers, expected))
     return comparison.agreement, loop
 
 
 def _magnifies_rounding(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> bool:
-    """Say whether an environment repeats itself, but not for a policy whose weights have other last bits.
+    """Return whether episodes are reproducible but change with the last bits of the policy's weights.
 
-    Contacts do that to a robot within some hundred steps; its episodes cannot tell whether a policy is the same.
+    Contacts cause this within some hundred steps; such episodes cannot show whether two policies are the same.
     """
     seeds = [episode.result.seed for episode in expected]
     workers.set_policy(policy)
@@ -212,7 +213,7 @@ def _change_last_bits(values: NDArray[Any]) -> NDArray[Any]:
 def _compare_actions(
     torch_policy: TorchPolicy, exported: Policy, episodes: Sequence[Episode], comparison: Comparison
 ) -> None:
-    """Ask both policies on all observations of some episodes."""
+    """Compare the actions of both policies on all observations of episodes."""
     for episode in episodes:
         assert episode.trajectory is not None  # recorded
         observations, length = episode.trajectory.observations, len(episode.trajectory.actions)
@@ -220,16 +221,16 @@ def _compare_actions(
         exported.reset()
         rows = 1 if torch_policy.is_recurrent else length
         for low in range(0, length, rows):
-            some = map_parts(operator.itemgetter(slice(low, low + rows)), observations)
-            actions = [exported.predict(take_row(some, row)) for row in range(rows)]
-            comparison.add(torch_policy.act(some), np.stack(actions))
+            batch = map_parts(operator.itemgetter(slice(low, low + rows)), observations)
+            actions = [exported.predict(take_row(batch, row)) for row in range(rows)]
+            comparison.add(torch_policy.act(batch), np.stack(actions))
         comparison.agreement.observations += length
 
 
 def _compare_batch(
     torch_policy: TorchPolicy, exported: OnnxPolicy, episodes: Sequence[Episode], comparison: Comparison
 ) -> None:
-    """Ask both policies on the first observations of some episodes, all at once."""
+    """Compare the actions of both policies on the first observations of episodes, in one batch."""
     trajectories = [episode.trajectory for episode in episodes]
     first = stack([take_row(trajectory.observations, 0) for trajectory in trajectories if trajectory is not None])
     torch_policy.reset()
@@ -237,19 +238,18 @@ def _compare_batch(
     comparison.agreement.batch_sizes.append(len(episodes))
 
 
-def compare_episodes(expected: Sequence[Episode], done: Sequence[Episode]) -> ClosedLoop:
+def compare_episodes(expected: Sequence[Episode], actual: Sequence[Episode]) -> ClosedLoop:
     """Compare episodes of the same seeds."""
-    pairs = [(ours.result, theirs.result) for ours, theirs in zip(expected, done, strict=True)]
+    pairs = [(ours.result, theirs.result) for ours, theirs in zip(expected, actual, strict=True)]
     returns = np.array([[ours.total_reward, theirs.total_reward] for ours, theirs in pairs])
-    # A return that happens to cancel out to nearly nothing is no measure of its own difference.
+    # The mean |return| is there for returns near 0, whose relative difference would be large.
     scale = np.maximum(np.abs(returns).max(axis=1), np.abs(returns).mean())
     difference = np.abs(returns[:, 0] - returns[:, 1])
     relative = np.divide(difference, scale, out=np.zeros_like(difference), where=scale > 0)
+    reports_success = any(result.success is not None for pair in pairs for result in pair)
     return ClosedLoop(
         episodes=len(pairs),
-        same_success=None
-        if all(ours.success is None and theirs.success is None for ours, theirs in pairs)
-        else sum(ours.success == theirs.success for ours, theirs in pairs),
+        same_success=sum(ours.success == theirs.success for ours, theirs in pairs) if reports_success else None,
         same_length=sum(ours.length == theirs.length for ours, theirs in pairs),
         max_return_difference=float(relative.max()),
         mean_return=float(returns[:, 0].mean()),
@@ -264,16 +264,13 @@ def measure_latency(torch_policy: TorchPolicy, exported: Policy) -> Latency:
     observation = space.sample()
     normalized: Any = torch_policy.normalize(observation)
     exported.reset()
-    return Latency(
-        exported_us=_measure_exported(exported, observation),
-        sb3_us=_measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True)),
-    )
-
-
-def _measure_exported(exported: Policy, observation: Any) -> float:
     if isinstance(exported, CPolicy):
-        return _measure_median_us(lambda: exported.repeat(observation, _CALLS)) / _CALLS
-    return _measure_median_us(lambda: exported.predict(observation))
+        exported_us = _measure_median_us(lambda: exported.repeat(observation, _CALLS)) / _CALLS
+    else:
+        exported_us = _measure_median_us(lambda: exported.predict(observation))
+    return Latency(
+        exported_us, sb3_us=_measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True))
+    )
 
 
 def _measure_median_us(call: Callable[[], Any]) -> float:

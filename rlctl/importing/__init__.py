@@ -1,1 +1,1 @@
-"""Models of other libraries become policies."""
+"""Reads models of other libraries and writes them as policy files."""

@@ -1,4 +1,4 @@
-"""`rlctl runs import`: a model of Stable-Baselines3 or rl-zoo3 becomes a policy file."""
+"""`rlctl runs import`: write a model of Stable-Baselines3 or rl-zoo3 as a policy file."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ def import_model(
     output: Path | None = None,
     changes: EnvChanges = UNCHANGED,
 ) -> ImportedPolicy:
-    """Read a model, and a VecNormalize if it has one, and write it as a policy of a task, once it acts.
+    """Read a model, with its VecNormalize if it has one, and write it as a policy of a task if it acts.
 
-    Raises `UsageError` for another ending of `output` than .safetensors, or where nothing was said and the model's name
-    is taken, `ArtifactError` for a file that is not a model, or one for other spaces than the task has.
+    Raises `UsageError` if `output` does not end in .safetensors, or if it is None and the file named after the model
+    exists; `ArtifactError` for a file that is not a model, or a model for other spaces than the task has.
     """
     from rlctl.policy.torch_policy import ALGORITHMS, build_network, describe_network, policy_name
 
@@ -49,7 +49,7 @@ def import_model(
         raise UsageError(f"--output {output}: the name of a policy file ends in .safetensors")
     target = output or Path(f"{file.stem}.safetensors")
     if output is None and target.exists():  # rl-zoo3 calls every model best_model.zip
-        raise UsageError(f"{target} is there already; give another name: --output FILE")
+        raise UsageError(f"{target} exists already; give another name: --output FILE")
     if algo is not None and algo not in ALGORITHMS:
         raise UsageError(f"--algo {algo}: no such algorithm.{did_you_mean(algo, ALGORITHMS)}")
     model = read_model(file, algo)
@@ -73,12 +73,12 @@ def import_model(
         versions={**collect_versions(), "stable-baselines3": model.version},
     )
     try:
-        # As described by the network itself, with what SB3 fills in: its defaults may change.
+        # All arguments of the network, because SB3's defaults may change.
         info = info.model_copy(update={"policy_kwargs": describe_network(build_network(info))})
     except (TypeError, ValueError, AssertionError) as error:
-        raise ArtifactError(f"{file}: its policy_kwargs make no network for {task}: {error}") from None
-    read = f"{file} with {normalization}" if normalization else str(file)
-    _write_checked(target, read, PolicyFile(info, _collect_tensors(model, statistics)))
+        raise ArtifactError(f"{file}: its policy_kwargs do not make a network for {task}: {error}") from None
+    source = f"{file} with {normalization}" if normalization else str(file)
+    _write_checked(target, source, PolicyFile(info, _collect_tensors(model, statistics)))
     return ImportedPolicy(target, info)
 
 
@@ -88,7 +88,7 @@ def _describe_env(spec: EnvSpec) -> EnvInfo:
 
 
 def _has_time_feature(model: SavedModel, env: EnvInfo) -> bool:
-    """Say whether a model observes one number more than a task gives, the last one, which is in [0, 1]."""
+    """Return whether a model observes one more number than the task returns, at the end and in [0, 1]."""
     ours, theirs = (_flat_part(space) for space in (env.spaces()[0], model.observation_space))
     if ours is None or theirs is None or theirs.shape[0] != ours.shape[0] + 1:
         return False
@@ -96,7 +96,7 @@ def _has_time_feature(model: SavedModel, env: EnvInfo) -> bool:
 
 
 def _flat_part(space: spaces.Space[Any]) -> spaces.Box | None:
-    """Return what the time feature is appended to, if the space has it: itself, or its entry `observation`."""
+    """Return the part of a space that gets the time feature: the space or its entry `observation`; None for others."""
     part = space.spaces.get("observation") if isinstance(space, spaces.Dict) else space
     return part if isinstance(part, spaces.Box) and len(part.shape) == 1 else None
 
@@ -104,22 +104,22 @@ def _flat_part(space: spaces.Space[Any]) -> spaces.Box | None:
 def _find_difference(
     model: SavedModel, task: str, observation: spaces.Space[Any], action: spaces.Space[Any]
 ) -> str | None:
-    """Say how the spaces of a task differ from a model's; None if the model can act in it.
+    """Return how the spaces of a task differ from a model's; None if the model can act in the task.
 
-    Bounds of actions must agree, because a policy scales to them; those of observations are often declared anew.
+    Bounds of actions must agree, because a policy scales actions to them; bounds of observations may differ.
     """
     from rlctl.policy.torch_policy import network_space
 
-    seen = network_space(observation)
-    if _describe_shape(seen) != _describe_shape(model.observation_space):
-        ours, theirs = _flat_part(seen), _flat_part(model.observation_space)
+    space = network_space(observation)
+    if _describe_shape(space) != _describe_shape(model.observation_space):
+        ours, theirs = _flat_part(space), _flat_part(model.observation_space)
         is_stack = ours is not None and theirs is not None and theirs.shape[0] % ours.shape[0] == 0
-        hint = ". Stacks of VecFrameStack, which begin with zeros, are not imported" if is_stack else ""
-        return f"it observes {_describe_shape(model.observation_space)}, {task} gives {_describe_shape(seen)}{hint}"
+        hint = ". Models with VecFrameStack cannot be imported: its first frames are zeros" if is_stack else ""
+        return f"it observes {_describe_shape(model.observation_space)}, {task} returns {_describe_shape(space)}{hint}"
     same = _describe_shape(action) == _describe_shape(model.action_space)
     if same and isinstance(action, spaces.Box) and isinstance(model.action_space, spaces.Box):
         same = np.allclose(action.low, model.action_space.low) and np.allclose(action.high, model.action_space.high)
-    return None if same else f"its actions are {model.action_space}, those of {task} {action}"
+    return None if same else f"its action space is {model.action_space}, that of {task} is {action}"
 
 
 def _describe_shape(space: spaces.Space[Any]) -> Any:
@@ -137,41 +137,42 @@ def _collect_tensors(model: SavedModel, normalization: SavedNormalization | None
     return tensors
 
 
-def _write_checked(output: Path, read: str, policy: PolicyFile) -> None:
-    """Write the file under another name, load it, and rename it only if it acts; errors name what was `read`."""
+def _write_checked(output: Path, source: str, policy: PolicyFile) -> None:
+    """Write the file under a temporary name, and rename it if it loads and acts; errors name `source`."""
     from rlctl.policy.torch_policy import TorchPolicy
 
     def write(part: Path) -> None:
         policy.write(part)
         try:
             load_policy(part)
-            TorchPolicy.load(part)  # which is stricter
+            TorchPolicy.load(part)  # checks the names of all tensors, too
         except ArtifactError as error:
-            raise ArtifactError(str(error).replace(str(part), read)) from None
+            raise ArtifactError(str(error).replace(str(part), source)) from None
 
     files.write_with(output, write)
 
 
 def show(result: ImportedPolicy, json: str | None) -> None:
-    """Print what was imported and what to type next, or JSON alone for `-`."""
+    """Print what was imported and the next commands, or only JSON for `-`."""
     from rlctl import output
 
     info, normalizes = result.info, result.info.clip_observation is not None
-    if json is not None:
-        content = {
-            "policy": str(result.file),
-            "algo": info.algo,
-            "task": info.spec.task,
-            "normalizes": normalizes,
-            "time_feature": info.spec.time_feature,
-        }
-        if output.present({**content, "training_steps": info.training_steps, "versions": info.versions}, json):
-            return
+    content = {
+        "policy": result.file,
+        "algo": info.algo,
+        "task": info.spec.task,
+        "normalizes": normalizes,
+        "time_feature": info.spec.time_feature,
+        "training_steps": info.training_steps,
+        "versions": info.versions,
+    }
+    if output.present(content, json):
+        return
     out = output.out()
     normalization = "with" if normalizes else "without"
     out.print(f"{result.file}: {info.algo}, step {info.training_steps:,}, {normalization} observation normalisation")
     if info.spec.time_feature:
-        out.print("it also observes the part of the episode that is left, the time feature of rl-zoo3")
+        out.print("it also observes the remaining fraction of the episode, rl-zoo3's time feature")
     out.print("next:")
     for command in (f"rlctl eval {result.file}", f"rlctl export {result.file} --onnx", f"rlctl replay {result.file}"):
         out.print(f"  {command}")

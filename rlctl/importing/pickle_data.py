@@ -1,7 +1,7 @@
-"""Reads what is written in a pickle as data: nothing in it is called, imported or made.
+"""Reads a pickle as data: nothing in it is imported or called.
 
-A pickle is a program for a small stack machine. This one runs its stacks and its memory of earlier values, but where
-the program would import a name or call it, the name or the call itself is the value.
+A pickle is a program for a stack machine. This machine has the same stack and memory, but where the program imports or
+calls something, the value is a description of that import or call.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MOST_OPCODES = 2_000_000
 
 
 class NotPlainData(ValueError):
-    """A pickle holds what is not on the list of what is read, or is damaged."""
+    """A pickle is damaged, or has data of a kind that is not supported."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Name:
 
 @dataclasses.dataclass(eq=False)
 class Call:
-    """What calling a name would give; `state` is what would then be put into it, `items` what would be set in it."""
+    """The call of a name, the state that the pickle sets on its result, and the items that it puts into it."""
 
     function: Name
     arguments: tuple[Any, ...]
@@ -44,7 +44,7 @@ class Call:
 
 @dataclasses.dataclass(frozen=True)
 class Persistent:
-    """A reference to something beside the pickle, such as a tensor's storage."""
+    """A reference to data outside the pickle, such as the storage of a tensor."""
 
     content: Any
 
@@ -54,13 +54,13 @@ _MARK = object()
 
 def _make_call(function: Any, arguments: Any, keywords: Any = None) -> Call:
     if not isinstance(function, Name) or not isinstance(arguments, tuple):
-        raise NotPlainData("a call of something that is not a name")
+        raise NotPlainData("a call of something other than a name")
     return Call(function, arguments if keywords is None else (*arguments, keywords))
 
 
 def _set_state(target: Any, state: Any) -> Any:
     if not isinstance(target, Call):
-        raise NotPlainData("a state for something that was not made by a call")
+        raise NotPlainData("a state for something other than the result of a call")
     target.state = state
     return target
 
@@ -93,11 +93,11 @@ _MAKES: dict[str, tuple[int, Callable[..., Any]]] = {
     "BUILD": (2, _set_state),
     "BINPERSID": (1, Persistent),
 }
-"""Of so many values from the top of the stack one is made."""
+"""Instruction -> the number of values that it pops, and the function that makes one value of them."""
 _COLLECTS: dict[str, Callable[[list[Any]], Any]] = {
     "TUPLE": tuple, "LIST": list, "FROZENSET": frozenset, "DICT": _pair,
 }  # fmt: skip
-"""Of the values above the mark one is made."""
+"""Instruction -> the function that makes one value of the values above the mark."""
 _ADDS: dict[str, tuple[int | None, Callable[[Any, list[Any]], None]]] = {
     "APPEND": (1, lambda target, items: target.extend(items)),
     "APPENDS": (None, lambda target, items: target.extend(items)),
@@ -105,14 +105,14 @@ _ADDS: dict[str, tuple[int | None, Callable[[Any, list[Any]], None]]] = {
     "SETITEM": (2, _set_items),
     "SETITEMS": (None, _set_items),
 }
-"""So many values, or with None those above the mark, are added to what is below them."""
+"""Instruction -> the number of values that it pops, None for those above the mark, and the function that adds them."""
 _IGNORED = frozenset({"PROTO", "FRAME", "READONLY_BUFFER"})
 
 
 def read(content: bytes) -> Any:
-    """Return the value a pickle describes, of plain types, `Name`, `Call` and `Persistent`.
+    """Return the value that a pickle describes, of plain types, `Name`, `Call` and `Persistent`.
 
-    Raises `NotPlainData` for a damaged pickle and for one that does what no model file does.
+    Raises `NotPlainData` for a damaged pickle, and for instructions that model files do not have.
     """
     machine = _Machine()
     try:
@@ -125,7 +125,7 @@ def read(content: bytes) -> Any:
     except NotPlainData:
         raise
     except (IndexError, KeyError, TypeError, AttributeError, ValueError):
-        raise NotPlainData("it is no pickle, or damaged") from None
+        raise NotPlainData("its pickle is damaged") from None
     raise NotPlainData("its pickle has no end")
 
 
@@ -164,7 +164,7 @@ class _Machine:
         elif name == "POP_MARK":
             self._pop_to_mark()
         elif name not in _IGNORED:
-            raise NotPlainData(f"the instruction {name}, which no model file has")
+            raise NotPlainData(f"the pickle instruction {name}, which model files do not have")
 
     def _pop(self, count: int) -> list[Any]:
         return [self.stack.pop() for _ in range(count)][::-1]
@@ -187,7 +187,7 @@ def read_array(value: Any) -> NDArray[Any]:
     if isinstance(value, bool | int | float | list | tuple):
         array = np.asarray(value)
         if array.dtype.kind not in "biuf":
-            raise NotPlainData("a list of something else than numbers")
+            raise NotPlainData("a list of something other than numbers")
         return array
     if not isinstance(value, Call):
         raise NotPlainData(f"{type(value).__name__} where an array is expected")
@@ -205,7 +205,7 @@ def read_array(value: Any) -> NDArray[Any]:
 
 
 def _make_array(content: Any, dtype: Any, shape: Any, order: str) -> NDArray[Any]:
-    if isinstance(content, Call) and str(content.function) in _BYTES:  # in the oldest protocols
+    if isinstance(content, Call) and str(content.function) in _BYTES:  # in pickle protocols 0 to 2
         content = content.arguments[0] if content.arguments else ""
     if isinstance(content, str):
         content = content.encode("latin1")
@@ -229,7 +229,7 @@ def read_dtype(value: Any) -> np.dtype[Any]:
 
 
 def read_plain(value: Any) -> Any:
-    """Return numbers, text, lists and mappings as they are; raises `NotPlainData` for anything else."""
+    """Return numbers, text, lists and mappings; raises `NotPlainData` for anything else."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Reads what Stable-Baselines3 and rl-zoo3 save, model.zip and vecnormalize.pkl, without unpickling anything."""
+"""Reads files of Stable-Baselines3 and rl-zoo3, model.zip and vecnormalize.pkl, without unpickling them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rlctl.importing.pickle_data import Call, Name, NotPlainData, Persistent, re
 from rlctl.storage import untrusted
 
 LARGEST_MEMBER = 500_000_000
-"""Bytes that a member of the archive may have unpacked."""
+"""Limit of the unpacked size of a member of the archive [bytes]."""
 
 _POLICIES = {
     "stable_baselines3.sac": "sac",
@@ -35,7 +35,7 @@ _POLICIES = {
     "sb3_contrib.crossq": "crossq",
     "sb3_contrib.common.recurrent": "recurrent_ppo",
 }
-"""Module of the policy class -> algorithm; a model does not name its algorithm."""
+"""Module of the policy class -> algorithm; a model does not contain the name of its algorithm."""
 _SAME_POLICY = ({"ppo", "a2c"}, {"td3", "ddpg"})
 _ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu"}
 _EXTRACTORS = frozenset({"FlattenExtractor", "NatureCNN", "CombinedExtractor"})
@@ -52,20 +52,20 @@ class SavedModel:
 
     algo: str
     observation_space: spaces.Space[Any]
-    """As the network sees it: images with channels first."""
+    """The network's: images have the channels first."""
     action_space: spaces.Space[Any]
     policy_kwargs: dict[str, Any]
-    """Plain data; the activation by its name in recipes."""
+    """Plain data; `activation_fn` has its name in recipes."""
     tensors: dict[str, NDArray[Any]]
-    """The policy's state, by SB3's names."""
+    """The tensors of the policy, with the names of SB3's `state_dict`."""
     training_steps: int
     version: str
-    """Of Stable-Baselines3."""
+    """The version of Stable-Baselines3; empty if unknown."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SavedNormalization:
-    """The observation statistics of a `VecNormalize`, by key of a dict observation, "" for any other."""
+    """The statistics of a `VecNormalize`, by key of a dict observation; the key is "" for any other observation."""
 
     mean: dict[str, NDArray[np.float64]]
     var: dict[str, NDArray[np.float64]]
@@ -73,10 +73,10 @@ class SavedNormalization:
 
 
 def read_model(path: Path, algo: str | None = None) -> SavedModel:
-    """Read a model.zip; raises `ArtifactError` for what is not one, is too large, or holds what is not read.
+    """Read a model.zip; raises `ArtifactError` if it is not a model, is too large, or has unsupported data.
 
-    `algo` is for models whose algorithm does not follow from the file: A2C beside PPO, DDPG beside TD3. Any other
-    than the file's raises `UsageError`.
+    `algo` is for models whose file fits two algorithms, A2C and PPO, or DDPG and TD3. It raises `UsageError` if the
+    file does not fit it.
     """
     with _explain_errors(path, "a model"), untrusted.open_file(path) as file, zipfile.ZipFile(file) as archive:
         data = json.loads(_read_member(archive, "data"))
@@ -84,7 +84,7 @@ def read_model(path: Path, algo: str | None = None) -> SavedModel:
             raise NotPlainData("its data is not a mapping")
         saved_algo = _find_algorithm(data)
         if algo not in (None, saved_algo) and {algo, saved_algo} not in _SAME_POLICY:
-            raise UsageError(f"--algo {algo}: {path} is a model of {saved_algo}")
+            raise UsageError(f"--algo {algo}: {path} is a {saved_algo} model")
         return SavedModel(
             algo=algo or saved_algo,
             observation_space=read_space(_decode(data, "observation_space")),
@@ -98,11 +98,11 @@ def read_model(path: Path, algo: str | None = None) -> SavedModel:
 
 @contextlib.contextmanager
 def _explain_errors(path: Path, what: str) -> Iterator[None]:
-    """Make `ArtifactError` of whatever reading a file raises that nobody has checked."""
+    """Turn exceptions from reading an unchecked file into `ArtifactError`."""
     try:
         yield
     except NotPlainData as error:
-        raise ArtifactError(f"{path}: it holds what is not read from {what}: {error}") from None
+        raise ArtifactError(f"{path}: it has data that cannot be imported: {error}") from None
     except zipfile.BadZipFile:
         raise ArtifactError(f"{path}: not a zip archive, so not {what} of Stable-Baselines3") from None
     except (KeyError, ValueError, TypeError, AttributeError, OSError, RecursionError, NotImplementedError) as error:
@@ -116,15 +116,15 @@ def _read_member(archive: zipfile.ZipFile, name: str) -> bytes:
     try:
         member = archive.getinfo(name)
     except KeyError:
-        raise NotPlainData(f"no {name!r} in it; there is: {', '.join(archive.namelist()[:8])}") from None
+        raise NotPlainData(f"no file {name!r} in the archive; it has {', '.join(archive.namelist()[:8])}") from None
     if member.file_size > LARGEST_MEMBER:
-        raise NotPlainData(f"{name!r} would take {member.file_size:,} bytes, at most {LARGEST_MEMBER:,} are read")
+        raise NotPlainData(f"{name!r} has {member.file_size:,} bytes; the limit is {LARGEST_MEMBER:,}")
     with archive.open(member) as stream:
         return stream.read(member.file_size)
 
 
 def _decode(data: Mapping[str, Any], key: str) -> Any:
-    """Return an entry of the model's data: plain JSON, or the value its pickle describes."""
+    """Return an entry of the model's data: plain JSON, or the value that its pickle describes."""
     entry = data.get(key)
     if isinstance(entry, dict) and ":serialized:" in entry:
         return pickle_data.read(base64.b64decode(entry[":serialized:"]))
@@ -134,7 +134,7 @@ def _decode(data: Mapping[str, Any], key: str) -> Any:
 def _find_algorithm(data: Mapping[str, Any]) -> str:
     policy = _decode(data, "policy_class")
     if not isinstance(policy, Name):
-        raise NotPlainData("a policy class of its own")
+        raise NotPlainData("a policy class that the user wrote")
     algo = next((algo for module, algo in _POLICIES.items() if policy.module.startswith(module)), None)
     if algo is None:
         raise NotPlainData(f"policy class {policy}")
@@ -146,25 +146,24 @@ def _find_algorithm(data: Mapping[str, Any]) -> str:
 
 
 def _read_policy_kwargs(data: Mapping[str, Any]) -> dict[str, Any]:
-    given = _decode(data, "policy_kwargs") or {}
     kwargs: dict[str, Any] = {"use_sde": True} if data.get("use_sde") else {}
-    for key, value in given.items():
+    for key, value in (_decode(data, "policy_kwargs") or {}).items():
         if key in _TRAINING_ONLY:
             continue
         if key == "activation_fn":
             if not isinstance(value, Name) or value.qualname not in _ACTIVATIONS:
-                raise NotPlainData(f"activation_fn {value}; read are: {', '.join(_ACTIVATIONS)}")
+                raise NotPlainData(f"activation_fn {value}; supported: {', '.join(_ACTIVATIONS)}")
             kwargs[key] = _ACTIVATIONS[value.qualname]
         elif key == "features_extractor_class":
             if not isinstance(value, Name) or value.qualname not in _EXTRACTORS:
-                raise NotPlainData(f"a features extractor of its own: {value}")
+                raise NotPlainData(f"a features extractor that the user wrote: {value}")
         else:
             kwargs[key] = read_plain(value)
     return kwargs
 
 
 def read_space(value: Any) -> spaces.Space[Any]:
-    """Return the space that a pickle of gymnasium, or of the old gym, describes."""
+    """Return the space that a pickle of Gymnasium or of the old Gym describes."""
     kind, state = _split_object(value, "gym.spaces.", "gymnasium.spaces.")
     if kind == "Box":
         shape = tuple(state["_shape"] if "_shape" in state else state["shape"])
@@ -180,14 +179,14 @@ def read_space(value: Any) -> spaces.Space[Any]:
     if kind == "Dict":
         parts = state["spaces"].items
         return spaces.Dict([(str(k), read_space(v)) for k, v in (parts() if callable(parts) else parts.items())])
-    raise NotPlainData(f"a space of the kind {kind}")
+    raise NotPlainData(f"a {kind} space")
 
 
 def _split_object(value: Any, *modules: str) -> tuple[str, dict[str, Any]]:
-    """Return the class name and the attributes of an object of certain modules."""
+    """Return the class name and the attributes of an object from one of the modules."""
     if not isinstance(value, Call) or not str(value.function).startswith(modules) or not isinstance(value.state, dict):
-        given, module = getattr(value, "function", value), modules[-1].rstrip(".")
-        raise NotPlainData(f"{short_repr(given)} where an object of {module} is expected")
+        actual, module = getattr(value, "function", value), modules[-1].rstrip(".")
+        raise NotPlainData(f"{short_repr(actual)} where an object of {module} is expected")
     return value.function.qualname, value.state
 
 
@@ -202,7 +201,7 @@ def read_normalization(path: Path) -> SavedNormalization | None:
             return None
         epsilon = float(state.get("epsilon", 1e-8))
         if epsilon != 1e-8:
-            raise NotPlainData(f"an epsilon of {epsilon:g}, Stable-Baselines3's own is 1e-08")
+            raise NotPlainData(f"an epsilon of {epsilon:g}; only Stable-Baselines3's default, 1e-08, is supported")
         statistics = state["obs_rms"]
         parts = statistics if isinstance(statistics, dict) else {"": statistics}
         fields = {
@@ -216,23 +215,23 @@ def read_normalization(path: Path) -> SavedNormalization | None:
 
 
 def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
-    """Return the tensors, by name, of a state dict that `torch.save` wrote (torch 1.6 or newer: a zip archive)."""
+    """Return the tensors, by name, of a state dict that `torch.save` wrote as a zip archive (torch 1.6 or newer)."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         prefix = next(
             (name.removesuffix("data.pkl") for name in archive.namelist() if name.endswith("/data.pkl")), None
         )
         if prefix is None:
-            raise NotPlainData("policy.pth without data.pkl: written by a torch older than 1.6")
+            raise NotPlainData("policy.pth has no data.pkl: a torch older than 1.6 wrote it")
         order = _read_member(archive, f"{prefix}byteorder") if f"{prefix}byteorder" in archive.namelist() else b"little"
         if order != b"little":
             raise NotPlainData("tensors of a big-endian machine")
         state = pickle_data.read(_read_member(archive, f"{prefix}data.pkl"))
         entries = state.items if isinstance(state, Call) else state
         tensors: dict[str, NDArray[Any]] = {}
-        left = LARGEST_MEMBER
+        bytes_left = LARGEST_MEMBER
         for name, value in dict(entries).items():
             tensors[str(name)] = tensor = _read_tensor(value, archive, prefix)
-            if (left := left - tensor.nbytes) < 0:  # many names may share one storage
+            if (bytes_left := bytes_left - tensor.nbytes) < 0:  # many names may share one storage
                 raise NotPlainData(f"tensors of more than {LARGEST_MEMBER:,} bytes")
         return tensors
 
@@ -250,10 +249,10 @@ def _read_tensor(value: Any, archive: zipfile.ZipFile, prefix: str) -> NDArray[A
     numbers = np.frombuffer(_read_member(archive, f"{prefix}data/{key}"), dtype)
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
     if min((offset, *shape, *strides), default=0) < 0 or (0 not in shape and last >= numbers.size):
-        raise NotPlainData("a tensor that reaches out of its storage")
+        raise NotPlainData("a tensor that reads outside its storage")
     if 0 in shape:
         return np.zeros(shape, dtype)
-    if math.prod(shape) > numbers.size:  # strides of 0 repeat numbers without end
+    if math.prod(shape) > numbers.size:  # strides of 0 would repeat numbers
         raise NotPlainData("a tensor larger than its storage")
     steps = [stride * dtype.itemsize for stride in strides]
     return as_strided(numbers[offset:], shape, steps).copy()

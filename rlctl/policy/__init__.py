@@ -1,1 +1,1 @@
-"""Policy files, and policies that act; NumPy, no torch but in `torch_policy`."""
+"""Policy files, and policies that act with NumPy. Only `torch_policy` imports torch."""

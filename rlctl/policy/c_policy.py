@@ -1,4 +1,4 @@
-"""Policies exported as C, compiled into a shared library and called through ctypes: how an export is verified."""
+"""Policies exported as C, compiled and called through ctypes; `rlctl export --c` verifies its files with them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ LIBRARY_SUFFIX = ".so"
 
 
 def observation_type(info: PolicyInfo) -> np.dtype[Any]:
-    """Return the type of the C function's observation: float, or double where the environment observes in float64."""
+    """Return the type of the C function's observation: double if a part of the observation is float64, else float."""
     types = [part.dtype for part in split_space(info.env.spaces()[0]).values()]
     return np.dtype(np.float64 if np.float64 in types else np.float32)
 
 
 def action_type(info: PolicyInfo) -> np.dtype[Any]:
-    """Return the type of the C function's action: as the environment takes it, int for choices."""
+    """Return the type of the C function's action: the environment's, or int for discrete actions."""
     space = info.env.spaces()[1]
     return np.result_type(np.float32, space.dtype) if isinstance(space, spaces.Box) else np.dtype(np.intc)
 
@@ -44,11 +44,11 @@ class CPolicy(Policy):
         library.rlctl_state_size.restype = ctypes.c_size_t
         self._keys = list(split_space(self.observation_space))
         size = sum(math.prod(part.shape or ()) for part in split_space(self.observation_space).values())
-        # C gets one observation and stacks frames by itself: the newest is the last.
+        # The C function gets the newest frame and stacks frames itself.
         self._observation = np.zeros(size // info.spec.frame_stack, observation_type(info))
         self._frames = info.spec.frame_stack
         self._action = np.zeros(math.prod(self.action_space.shape or ()), action_type(info))
-        # Opaque, and a multiple of four bytes.
+        # The C struct of the state; its size is a multiple of four bytes.
         self._memory = np.zeros(library.rlctl_state_size() // 4, np.float32)
         self._pointers = tuple(array.ctypes.data for array in (self._observation, self._memory, self._action))
         self._shape = self.action_space.shape or ()
@@ -56,7 +56,7 @@ class CPolicy(Policy):
 
     @classmethod
     def load(cls, path: Path) -> CPolicy:
-        """Load a library whose description is the JSON file beside it; raises `ArtifactError` if it does not load."""
+        """Load a library with the JSON description next to it; raises `ArtifactError` if it does not load."""
         try:
             info = PolicyInfo.model_validate(json.loads(path.with_suffix(".json").read_text()))
             return cls(info, ctypes.CDLL(str(path)))
@@ -64,7 +64,7 @@ class CPolicy(Policy):
             raise ArtifactError(f"{path}: the compiled policy does not load: {error}") from None
 
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the action for one observation; a policy that remembers does so until `reset`."""
+        """Return the action for one observation; a recurrent state is kept until `reset`."""
         if not deterministic:
             raise UsageError("an exported policy cannot sample: only its deterministic action is in the C file")
         self._fill(split(observation))
@@ -76,7 +76,7 @@ class CPolicy(Policy):
         self._memory[:] = 0.0
 
     def repeat(self, observation: Any, count: int) -> None:
-        """Act `count` times on one observation, within C."""
+        """Compute the action for one observation `count` times in a C loop, to measure its time."""
         self._fill(split(observation))
         self.library.rlctl_repeat(*self._pointers, count)
 

@@ -1,4 +1,4 @@
-"""Policy files: tensors, normalisation, and as JSON everything needed to use them, in a `.safetensors` file.
+"""Policy files: `.safetensors` with the network, the normalisation, and JSON that describes how to use them.
 
 They are read without pickle.
 """
@@ -29,7 +29,7 @@ SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq")
 DETERMINISTIC = ("td3", "ddpg")
 """Algorithms whose policy has no distribution to sample from."""
 ACTOR_CRITIC = (*SQUASHED_GAUSSIAN, *DETERMINISTIC)
-"""Algorithms whose policy has an `actor` of its own."""
+"""Algorithms whose policy has a separate `actor`."""
 GRAPH = "graph/actor"
 """The tensor that holds a user's network, an ONNX graph as bytes; see `rlctl.policy.own_graph`."""
 
@@ -52,22 +52,21 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
     clip_observation: float | None = Field(None, gt=0)
     """Clip of normalised observations; None where observations are not normalised."""
     normalized_keys: list[str] = []
-    """Which entries of a dict observation are normalised."""
+    """Keys of the normalised parts of a dict observation; `""` for any other observation."""
     env: EnvInfo
-    """What the environment is."""
     spec: PolicySpec
-    """What the environment is made from; of a curriculum in its last stage."""
+    """How to build the environment; for a curriculum, its last stage."""
     stages: list[PolicySpec] = []
     """Stages of the curriculum."""
     training_steps: int = 0
     evaluation: Score | None = None
-    """Of the best policy of a run: why it is the best."""
+    """The score that made it the best policy of its run; None for any other policy."""
     versions: dict[str, str] = {}
     provenance: Provenance | None = None
-    """Of an exported policy."""
+    """Where an exported policy comes from; None for any other policy."""
 
     def derive_spec(self, task: str | None = None, changes: EnvChanges = UNCHANGED) -> EnvSpec:
-        """Return what this policy was trained for, or another task, with changes."""
+        """Return the spec of the environment it was trained in, or of another task, with `changes`."""
         if task is not None and task != self.spec.task:
             return changes.apply(EnvSpec(task, frame_stack=self.spec.frame_stack, time_feature=self.spec.time_feature))
         return changes.apply(dataclasses.replace(self.spec, named_by=POLICY if task is None else ""))
@@ -84,21 +83,21 @@ Tensors = Mapping[str, NDArray[Any]]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PolicyFile:
-    """A policy as its file holds it: a description and tensors."""
+    """The content of a policy file: a description and tensors."""
 
     info: PolicyInfo
     tensors: Tensors = dataclasses.field(repr=False)
     path: Path | None = None
-    """Where it was read from."""
+    """The file that was read."""
 
     @classmethod
     def read(cls, path: Path) -> PolicyFile:
         """Read a policy file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
         metadata, info, tensors = _read(path)
         if "sha256" not in metadata:
-            raise ArtifactError(f"{path}: damaged: its metadata has no sha256, which every policy of rlctl has")
+            raise ArtifactError(f"{path}: damaged: its metadata has no sha256; rlctl writes one into every policy file")
         if metadata["sha256"] != compute_digest(metadata["rlctl"], tensors):
-            raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
+            raise ArtifactError(f"{path}: damaged: its content does not match its sha256")
         for name, values in tensors.items():
             if not np.isfinite(values).all():
                 raise ArtifactError(f"{path}: damaged: {short_repr(name)} is not finite")
@@ -116,7 +115,7 @@ class PolicyFile:
         return {name.removeprefix(prefix): values for name, values in self.tensors.items() if name.startswith(prefix)}
 
     def actor_only(self) -> PolicyFile:
-        """Return the policy with the tensors that acting needs: the actor's and the normalisation's."""
+        """Return the policy with only the tensors of the actor and of the normalisation."""
         names = list_actor_tensors(self.info.algo, self.tensors)
         return dataclasses.replace(self, tensors={name: self.tensors[name] for name in names})
 
@@ -138,7 +137,7 @@ class PolicyFile:
 
 
 def list_actor_tensors(algo: str, names: Iterable[str]) -> list[str]:
-    """Return which of the tensors of a policy file acting needs."""
+    """Return the names of the tensors that acting needs: those of the actor and of the normalisation."""
     names = list(names)
     prefixes = (GRAPH, "normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(algo)))
     return [name for name in names if name.startswith(prefixes)]
@@ -153,7 +152,7 @@ def _list_prefixes(algo: str) -> tuple[str, ...]:
 
 
 def compute_digest(info: str, tensors: Tensors) -> str:
-    """Return the sha256 of a policy file's content: a disk may return other bits, and they load as well."""
+    """Return the sha256 of a policy file's content; it detects damage that would still load."""
     content = hashlib.sha256(info.encode())
     for name, values in sorted(tensors.items()):
         content.update(f"{name} {values.dtype} {values.shape}".encode())
@@ -175,7 +174,7 @@ def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], PolicyInfo,
 
 
 def parse_info(text: str | None, path: Path) -> PolicyInfo:
-    """Check the metadata of a policy; `path` is for the error."""
+    """Return the checked metadata of a policy; raises `ArtifactError`, which names `path`."""
     if text is None:
         raise ArtifactError(f"{path}: not an rlctl policy: its metadata has no 'rlctl' entry")
     return untrusted.parse_model(text, PolicyInfo, path, "policy")

@@ -1,6 +1,6 @@
-"""The layers of a policy's actor as data: NumPy plays them on one observation, `rlctl.exporting` writes them as ONNX.
+"""The layers of a policy's actor. NumPy applies them to one observation; `rlctl.exporting` writes them as ONNX or C.
 
-Arrays are used in place: if they are in shared memory, new numbers written there act once `prepare` was called.
+Arrays are not copied: new weights in shared memory take effect when `prepare` is called.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ class Layer(abc.ABC):
     """A function of one array."""
 
     name: str
-    """What the layer is called in SB3's `state_dict`, or what it does."""
+    """The layer's name in SB3's `state_dict`, or its function."""
 
     @abc.abstractmethod
     def __call__(self, value: Any) -> Array:
-        """Return what the layer makes of one observation's value, without a batch dimension."""
+        """Return the layer's output for one input, without a batch dimension."""
 
-    def prepare(self) -> None:  # noqa: B027 (most have nothing to compute)
-        """Compute what follows from the numbers alone, again after they have changed."""
+    def prepare(self) -> None:  # noqa: B027 (most layers have nothing to compute)
+        """Compute values that depend only on the weights; call it again when the weights have changed."""
 
 
 def apply(layers: Iterable[Layer], value: Any) -> Array:
@@ -74,7 +74,7 @@ class Convolution(Layer):
 
 @dataclasses.dataclass(slots=True)
 class BatchRenorm(Layer):
-    """sb3-contrib's batch renormalisation, as it acts."""
+    """sb3-contrib's batch renormalisation in evaluation mode."""
 
     mean: Array
     variance: Array
@@ -89,7 +89,7 @@ class BatchRenorm(Layer):
 
 @dataclasses.dataclass(slots=True)
 class Normalize(Layer):
-    """The running normalisation of an observation."""
+    """Normalisation of an observation by its running mean and variance."""
 
     mean: Array
     variance: Array
@@ -101,17 +101,17 @@ class Normalize(Layer):
     _low: Array = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
-        # Whole arrays: with a plain number a function of so few elements takes twice as long.
+        # Arrays, because NumPy takes twice as long for a scalar and so few elements.
         self._high = np.full(np.shape(self.mean), self.clip)
         self._low = -self._high
         self.prepare()
 
     def prepare(self) -> None:
-        """Compute the deviation from the variance, which may have changed."""
+        """Compute the standard deviation from the variance."""
         self._deviation = np.sqrt(self.variance + self.epsilon)
 
     def __call__(self, value: Array) -> Array:
-        # In float64 as VecNormalize: an element that hardly varies is multiplied by up to 10,000.
+        # In float64 as VecNormalize: an element with little variance is multiplied by up to 10,000.
         normalized: Array = (value - self.mean) / self._deviation
         np.minimum(normalized, self._high, out=normalized)
         np.maximum(normalized, self._low, out=normalized)
@@ -120,10 +120,10 @@ class Normalize(Layer):
 
 @dataclasses.dataclass(slots=True)
 class OneHot(Layer):
-    """Discrete values, each as zeros and a one."""
+    """One-hot encoding of discrete values."""
 
     sizes: Array
-    """How many values there are, shape () for a single one."""
+    """Number of choices of each discrete value; shape () for a single one."""
     _offsets: Array = dataclasses.field(init=False)
     _total: int = dataclasses.field(init=False)
 
@@ -139,7 +139,7 @@ class OneHot(Layer):
 
 @dataclasses.dataclass(slots=True)
 class ScaleImage(Layer):
-    """Bytes of an image to numbers in [0, 1], with the channels first."""
+    """Scales the bytes of an image to [0, 1], and moves the channels first."""
 
     channels_last: bool
 
@@ -151,7 +151,7 @@ class ScaleImage(Layer):
 
 @dataclasses.dataclass(slots=True)
 class Flatten(Layer):
-    """Any array as a row of float32."""
+    """Flattens an array to one dimension, in float32."""
 
     def __call__(self, value: Any) -> Array:
         return np.asarray(value, np.float32).ravel()
@@ -159,7 +159,7 @@ class Flatten(Layer):
 
 @dataclasses.dataclass(slots=True)
 class Clip(Layer):
-    """Limits to [-limit, limit]."""
+    """Clips to [-limit, limit]."""
 
     limit: float
 
@@ -184,7 +184,7 @@ class Lstm:
         self.state = np.zeros((2, len(layers), layers[0].of_hidden.shape[1]), np.float32)
 
     def step(self, value: Array) -> Array:
-        """Return the output of the last layer, shape (hidden,); the state goes one step on."""
+        """Advance the state by one step and return the output of the last layer, shape (hidden,)."""
         state = self.state
         for number, layer in enumerate(self.layers):
             gates = layer.of_input.dot(value) + layer.of_hidden.dot(state[0, number])
@@ -198,12 +198,12 @@ class Lstm:
 
 @dataclasses.dataclass(slots=True)
 class LstmLayer:
-    """Weights of torch's LSTM: gates input, forget, cell and output below each other, shape (4 x hidden, ...)."""
+    """Weights of torch's LSTM, shape (4 x hidden, ...): the gates input, forget, cell and output, stacked."""
 
     of_input: Array
     of_hidden: Array
     biases: list[Array]
-    """Two, or none."""
+    """Two, shape (4 x hidden,); or none."""
 
 
 def _sigmoid(value: Array) -> Array:

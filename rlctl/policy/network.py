@@ -1,6 +1,6 @@
-"""The network that acts, read from a policy file: from one raw observation to the parameters of the action.
+"""The network of an actor, read from a policy file: from one raw observation to the parameters of the action.
 
-Its layers follow from the names of the file's tensors, which are those of SB3's `state_dict`.
+The tensors have the names of SB3's `state_dict`; the layers are derived from these names.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 _BATCH_RENORM_EPSILON = 1e-3
 _RELU_BY_DEFAULT = (*ACTOR_CRITIC, "dqn")
 _NATURE_STRIDES = {"0": 4, "2": 2, "4": 1}
-"""Strides of the convolutions of SB3's NatureCNN, the only one here, by their index."""
+"""Strides of the convolutions of SB3's NatureCNN by their index. No other CNN is supported."""
 
 
 class Network:
-    """The layers of an actor: of the parts of an observation, then an LSTM if it has one, trunk and head.
+    """The layers of an actor: features of each part of the observation, an LSTM if it has one, trunk and head.
 
-    Raises `UsageError` for a layer that is not known.
+    Raises `UsageError` for an unsupported layer.
     """
 
     def __init__(self, policy: PolicyFile) -> None:
@@ -38,7 +38,7 @@ class Network:
         owner = "actor." if algo in ACTOR_CRITIC else "q_net." if algo == "dqn" else "pi_"
         extractor = f"{owner}features_extractor"
         self.own = read.own_graph()
-        """The part that a user wrote, instead of `parts` and, but for an LSTM, of `trunk`; None without."""
+        """A user's own network. It replaces `parts`, and without an LSTM also `trunk`; None for SB3's networks."""
         self.parts = {
             key: read.features(key, space, f"{extractor}.extractors.{key}" if key else extractor)
             for key, space in split_space(info.env.spaces()[0]).items()
@@ -47,23 +47,23 @@ class Network:
         """Layers from each part of a raw observation to its features."""
         self.lstm = read.lstm("lstm_actor") if algo == "recurrent_ppo" else None
         self.trunk, self.head = _read_actor(algo, read)
+        """The head's output: the mean of the action, for TD3 and DDPG the action, logits, or DQN's values."""
         if self.own is not None and self.lstm is None:
             self.trunk = []
             if algo in (*DETERMINISTIC, "dqn"):
                 self.head = []
-        """The head's result is the mean of the action, the action of TD3 and DDPG, logits, or values."""
         self.is_squashed = algo in ACTOR_CRITIC or bool(info.policy_kwargs.get("squash_output"))
-        """Whether actions in a Box are in [-1, 1], and scaled to its bounds."""
-        self.ends_with_tanh = self.is_squashed and algo not in DETERMINISTIC  # of these the head does
-        """Whether tanh comes after the head, and after noise that is added to its result."""
+        """Whether the network's actions are in [-1, 1] and are scaled to the bounds of the Box."""
+        self.ends_with_tanh = self.is_squashed and algo not in DETERMINISTIC  # their head has the tanh
+        """Whether tanh is applied to the head's output plus noise."""
         name = "actor.log_std" if algo in SQUASHED_GAUSSIAN else "log_std"
         self.log_std = read.tensors.get(name)
-        """Parameter of PPO's and gSDE's noise; None where there is none, or a layer computes it."""
+        """The noise parameter of PPO and gSDE; None if there is none, or if a layer computes it."""
         self._log_std_layer = read.linear(name) if f"{name}.weight" in read.tensors else None
         self.prepare()
 
     def prepare(self) -> None:
-        """Compute what follows from the numbers alone, again after they have changed."""
+        """Compute values that depend only on the weights; call it again when the weights have changed."""
         if self.own is not None:
             self.own.prepare()
         for part in self.parts.values():
@@ -72,7 +72,7 @@ class Network:
         self._std = None if self.log_std is None else np.exp(self.log_std)
 
     def compute_latent(self, observation: object) -> Array:
-        """Return what the head starts from; a recurrent network goes one step on."""
+        """Return the head's input, shape (size,); advances a recurrent state by one step."""
         parts = self.parts
         if self.own is not None:
             value = self.own(observation)
@@ -85,11 +85,11 @@ class Network:
         return apply(self.trunk, value)
 
     def compute_std(self, latent: Array) -> Array:
-        """Return the standard deviation: of a layer, or the parameter."""
+        """Return the standard deviation of a Gaussian action, shape (elements,)."""
         if self._log_std_layer is not None:
             deviation: Array = np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
             return deviation
-        assert self._std is not None  # only Gaussian heads ask
+        assert self._std is not None  # called for Gaussian heads only
         return self._std
 
 
@@ -107,48 +107,50 @@ def _read_actor(algo: str, read: _Reader) -> tuple[list[Layer], list[Layer]]:
     return read.sequence("mlp_extractor.policy_net", end=read.activation), [read.linear("action_net")]
 
 
+def read_normalization(policy: PolicyFile) -> dict[str, layers.Normalize]:
+    """Return the normalisation of the parts of an observation, by key."""
+    clip, tensors = float(policy.info.clip_observation or np.inf), policy.tensors
+    names = {key: f"normalize/{key}" for key in policy.info.normalized_keys}
+    return {
+        key: layers.Normalize(name, tensors[f"{name}/mean"], tensors[f"{name}/var"], clip)
+        for key, name in names.items()
+    }
+
+
 class _Reader:
-    """Makes layers of the tensors of a policy file."""
+    """Turns the tensors of a policy file into layers."""
 
     def __init__(self, policy: PolicyFile) -> None:
         info = self.info = policy.info
         self.policy_tensors = policy.tensors
+        self.normalize = read_normalization(policy)
         self.tensors = {name.removeprefix("policy/"): values for name, values in policy.tensors.items()}
         name = info.policy_kwargs.get("activation_fn", "relu" if info.algo in _RELU_BY_DEFAULT else "tanh")
         own = GRAPH in self.tensors and info.algo != "recurrent_ppo"
-        if not own and name not in (*layers.ACTIVATIONS,):
-            known, name = ", ".join(layers.ACTIVATIONS), name["class"] if isinstance(name, dict) else name
+        if not own and (isinstance(name, dict) or name not in layers.ACTIVATIONS):
+            known = ", ".join(layers.ACTIVATIONS)
+            name = name["class"] if isinstance(name, dict) else name
             of = " of a recurrent policy" if info.algo == "recurrent_ppo" else ""
-            raise UsageError(f"a network{of} with activation {name!r} cannot be played; known: {known}")
-        self.activation = Activation("" if own else name)  # in a user's graph there are others
+            raise UsageError(f"a network{of} with activation {name!r} is not supported; supported: {known}")
+        self.activation = Activation("" if own else name)  # a user's graph contains its activations
 
     def own_graph(self) -> OwnGraph | None:
-        """Return the part that a user wrote."""
         if GRAPH not in self.tensors:
             return None
         from rlctl.policy.own_graph import OwnGraph  # only here: it imports onnxruntime
 
-        keys = {key: f"normalize/{key}" for key in self.info.normalized_keys}
-        clip = float(self.info.clip_observation or np.inf)
-        normalize = {
-            key: layers.Normalize(name, self.tensors[f"{name}/mean"], self.tensors[f"{name}/var"], clip)
-            for key, name in keys.items()
-        }
-        return OwnGraph(self.policy_tensors, normalize)
+        return OwnGraph(self.policy_tensors, self.normalize)
 
     def features(self, key: str, space: spaces.Space[object], extractor: str) -> list[Layer]:
-        """Return the layers from a raw observation to its features: normalised, one-hot, convolved or flat."""
+        """Return the layers from a part of a raw observation to its features."""
         if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
             sizes = space.n if isinstance(space, spaces.Discrete) else space.nvec
             return [layers.OneHot(f"one_hot/{key}", np.asarray(sizes))]
-        result: list[Layer] = []
-        if key in self.info.normalized_keys:
-            name, clip = f"normalize/{key}", float(self.info.clip_observation or np.inf)
-            result.append(layers.Normalize(name, self.tensors[f"{name}/mean"], self.tensors[f"{name}/var"], clip))
+        result: list[Layer] = [self.normalize[key]] if key in self.normalize else []
         if not _is_image(space):
             return [*result, layers.Flatten("flatten")]
         shape, relu = space.shape or (), Activation("relu")
-        # Channels last, as SB3 decides.
+        # SB3 takes the smallest dimension for the channels.
         result.append(layers.ScaleImage(f"image/{key}", min(range(3), key=lambda axis: shape[axis]) != 0))
         result += self.sequence(f"{extractor}.cnn", end=relu, activation=relu)
         return [*result, layers.Flatten("flatten"), *self.sequence(f"{extractor}.linear", end=relu, activation=relu)]
@@ -156,7 +158,7 @@ class _Reader:
     def sequence(self, prefix: str, end: Layer | None = None, activation: Layer | None = None) -> list[Layer]:
         """Return the layers of a `torch.nn.Sequential`; `end` follows its last linear layer.
 
-        Layers without tensors have no names: between two that have some there is an activation.
+        An index without tensors is an activation, unless it is the last.
         """
         pattern = re.compile(rf"{re.escape(prefix)}\.(\d+)\.")
         indices = sorted({int(match[1]) for name in self.tensors if (match := pattern.match(name))})
@@ -172,7 +174,6 @@ class _Reader:
         return result
 
     def linear(self, name: str) -> Linear:
-        """Return a fully connected layer."""
         return Linear(name, self.tensors[f"{name}.weight"], self.tensors[f"{name}.bias"])
 
     def _layer(self, name: str) -> Layer:
@@ -187,12 +188,11 @@ class _Reader:
         if dimensions == 4:
             stride = _NATURE_STRIDES[name.rpartition(".")[2]]
             return layers.Convolution(name, self.tensors[f"{name}.weight"], self.tensors[f"{name}.bias"], stride)
-        raise UsageError(f"layer {name} of this network cannot be played: neither linear, convolution nor batch renorm")
+        raise UsageError(f"layer {name} is not supported: it is neither linear, convolution nor batch renorm")
 
     def lstm(self, name: str) -> layers.Lstm:
-        """Return an LSTM."""
         if f"{name}.weight_ih_l0_reverse" in self.tensors or f"{name}.weight_hr_l0" in self.tensors:
-            raise UsageError("an LSTM with two directions or a projection cannot be played")
+            raise UsageError("a bidirectional LSTM, or one with a projection, is not supported")
         lstm_layers: list[layers.LstmLayer] = []
         while f"{name}.weight_ih_l{(index := len(lstm_layers))}" in self.tensors:
             of_input, of_hidden = (self.tensors[f"{name}.{kind}_l{index}"] for kind in ("weight_ih", "weight_hh"))
@@ -203,7 +203,7 @@ class _Reader:
 
 
 def _is_image(space: spaces.Space[object]) -> bool:
-    """Say whether SB3 takes a space for an image."""
+    """Return whether SB3 treats a space as an image."""
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) != 3:
         return False
     return bool((space.low == 0).all() and (space.high == 255).all())

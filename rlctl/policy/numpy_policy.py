@@ -1,4 +1,4 @@
-"""Policy files in this process, with the same bits as in workers. Imports no torch."""
+"""Policy files that act in this process with NumPy, bit for bit as in workers. Imports no torch."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MEAN, _SAMPLE = Exploration(), Exploration(stochastic=True)
 
 
 class NumpyPolicy(Policy):
-    """A policy file in this process: acts with the same bits as in workers, without torch."""
+    """A policy file that acts in this process, bit for bit as in workers."""
 
     def __init__(self, policy: PolicyFile) -> None:
         super().__init__(policy.info)
@@ -27,7 +27,7 @@ class NumpyPolicy(Policy):
         self.reset()
 
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the action for one observation; `deterministic=False` samples it, otherwise in every episode."""
+        """Return the action for one observation; `deterministic=False` samples it, with new noise in every episode."""
         self.player.explore(_MEAN if deterministic else _SAMPLE)
         if self._step == 0:
             self.player.begin_segment(self._seed, 0)
@@ -43,7 +43,7 @@ class NumpyPolicy(Policy):
 
 
 def check_playable(policy: PolicyFile) -> PolicyFile:
-    """Act once, on a made-up observation, and return the policy.
+    """Act once on an observation of zeros, and return the policy.
 
     Raises `ArtifactError` if the tensors do not fit their description.
     """
@@ -59,7 +59,7 @@ def check_playable(policy: PolicyFile) -> PolicyFile:
         player.try_once(deterministic=False)
     except UsageError:
         raise
-    except Exception as error:  # any exception from numpy, for a description that nobody has checked
+    except Exception as error:  # any exception from NumPy: the description is unchecked until here
         text = short_repr(str(error), 200)
         raise ArtifactError(f"{policy.path}: its tensors do not fit its description: {text}") from None
     return policy

@@ -1,4 +1,4 @@
-"""ONNX files of rlctl: sealed by a sha256 when they are written, and checked before a runtime reads them."""
+"""ONNX files of rlctl: written with a sha256, and checked before onnxruntime reads them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     import onnx
 
 METADATA_KEY = "rlctl"
-"""Where an exported file keeps its description."""
+"""Metadata key of the policy's description."""
 DIGEST_KEY = "sha256"
-"""Where it keeps the sha256 of all its bytes, with zeros in the place of the digest."""
+"""Metadata key of the sha256 of the file's bytes, computed with zeros in place of the digest."""
 
 _ZEROS = b"0" * 64
 
@@ -27,14 +27,14 @@ def encode(model: onnx.ModelProto) -> bytes:
     entry.key, entry.value = DIGEST_KEY, _ZEROS.decode()
     content: bytes = model.SerializeToString()
     if content.count(_ZEROS) != 1:
-        raise ValueError("it has 64 zeros as text, which is where the sha256 goes")
+        raise ValueError("its bytes contain the text of 64 zeros, which marks the place of the sha256")
     return content.replace(_ZEROS, files.digest(content).encode())
 
 
 def check(content: bytes) -> None:
-    """Raise `ValueError` for what is not as rlctl wrote it, or holds more than a policy needs.
+    """Raise `ValueError` for a file that is damaged, or that has more than a policy needs.
 
-    Loops, branches and functions need not end; a tensor in another file would read what the sender names.
+    Loops, branches and functions may never end; a tensor in another file would read a path that the sender chose.
     """
     import onnx
     from google.protobuf.message import DecodeError
@@ -55,7 +55,7 @@ def check(content: bytes) -> None:
     inside = [tensor for attribute in attributes for tensor in (attribute.t, *attribute.tensors)]
     for tensor in (*model.graph.initializer, *inside):
         if tensor.external_data or tensor.data_location != onnx.TensorProto.DEFAULT:
-            raise ValueError("a tensor of it is in another file")
+            raise ValueError("one of its tensors is in another file")
     metadata = {entry.key: entry.value for entry in model.metadata_props}
     if METADATA_KEY in metadata:
         _check_digest(content, metadata.get(DIGEST_KEY, ""))
@@ -63,7 +63,7 @@ def check(content: bytes) -> None:
 
 def _check_digest(content: bytes, digest: str) -> None:
     if not digest:
-        raise ValueError("its metadata has no sha256, which every export of rlctl has; export it again")
-    digest = str(digest)  # of text that is damaged, protobuf returns the bytes
+        raise ValueError("its metadata has no sha256; rlctl writes one into every export; export it again")
+    digest = str(digest)  # protobuf returns bytes for damaged text
     if files.digest(content.replace(digest.encode(), _ZEROS)) != digest:
-        raise ValueError("its sha256 is not the one it was exported with")
+        raise ValueError("its content does not match its sha256")

@@ -1,4 +1,4 @@
-"""Exported policies on onnxruntime. Imports neither torch nor SB3."""
+"""Exported policies that act with onnxruntime. Imports neither torch nor SB3."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rlctl.policy.policy import Policy
 from rlctl.storage import untrusted
 
 SINGLE_INPUT = "obs"
-"""Name of the input of an observation that is not a dictionary; those of a dictionary are named by their keys."""
+"""Name of the input for an observation that is not a dictionary; a dictionary has one input per key."""
 ACTION = "action"
 STATE_INPUTS = ("state_h", "state_c")
 """LSTM state of a recurrent policy, each of shape (layers, batch, hidden); zeros when an episode begins."""
@@ -27,11 +27,11 @@ STATE_OUTPUTS = ("state_h_out", "state_c_out")
 """The LSTM state for the next step."""
 
 _FATAL_ONLY = 4
-_LARGEST = 2 * 2**30  # [bytes] of a file, the most that its format can hold
+_LARGEST = 2 * 2**30  # [bytes], the limit of the format
 
 
 class OnnxPolicy(Policy):
-    """An ONNX file written by `rlctl export`, with the description it carries. Deterministic."""
+    """An ONNX file written by `rlctl export`, with its description. Deterministic."""
 
     def __init__(self, info: PolicyInfo, session: onnxruntime.InferenceSession) -> None:
         super().__init__(info)
@@ -57,7 +57,7 @@ class OnnxPolicy(Policy):
         if text is None:
             raise ArtifactError(
                 f"{path}: not an ONNX file of rlctl: its metadata has no {METADATA_KEY!r} entry; "
-                "make one with rlctl export --onnx"
+                "write one with rlctl export --onnx"
             )
         info = parse_info(text, path)
         try:
@@ -69,7 +69,7 @@ class OnnxPolicy(Policy):
         return policy
 
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the action for one observation, the deterministic one; a recurrent policy remembers."""
+        """Return the deterministic action for one observation; a recurrent state is kept until `reset`."""
         if not deterministic:
             raise UsageError("an exported policy cannot sample: only its deterministic action is in the ONNX file")
         batch = {key or SINGLE_INPUT: part[None] for key, part in self.read_observation(observation).items()}

@@ -1,7 +1,7 @@
-"""A user's network as a policy file keeps it: an ONNX graph from an observation to the last hidden layer.
+"""A user's network in a policy file: an ONNX graph from an observation to the last hidden layer.
 
-It is played by onnxruntime, so that neither torch nor the user's module is needed to act. The weights are inputs of the
-graph with the names of the policy file's tensors: where these are in shared memory, new numbers act at once.
+onnxruntime plays it, so acting needs neither torch nor the user's module. The weights are inputs of the graph and have
+the names of the policy file's tensors: new weights in shared memory take effect at once.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from rlctl.policy.layers import Normalize
 from rlctl.policy.onnx_policy import make_options
 
 OBSERVATION = "observation/"
-"""Begins the names of the inputs for the parts of an observation, which end with their keys."""
+"""Prefix of the inputs for the parts of an observation; the key of the part follows."""
 OUTPUT = "latent"
 
 
 class OwnGraph:
-    """Computes the latent of one observation after the other; raises `ValueError` for a graph that is not sound."""
+    """Computes the last hidden layer for an observation; raises `ValueError` for a graph that does not load."""
 
     def __init__(self, tensors: Tensors, normalize: Mapping[str, Normalize]) -> None:
         self.content = np.asarray(tensors[GRAPH], np.uint8).tobytes()
         onnx_file.check(self.content)
         self.normalize = normalize
-        """The normalisation of the parts of an observation that have one."""
+        """By key of the part of an observation."""
         try:
             self._session = onnxruntime.InferenceSession(
                 self.content, make_options(), providers=["CPUExecutionProvider"]
@@ -43,7 +43,7 @@ class OwnGraph:
         self._keys = [name.removeprefix(OBSERVATION) for name in inputs if name.startswith(OBSERVATION)]
 
     def prepare(self) -> None:
-        """Compute what follows from the statistics of the normalisation, again after they have changed."""
+        """Prepare the normalisation; call it again when its statistics have changed."""
         for layer in self.normalize.values():
             layer.prepare()
 

@@ -1,7 +1,7 @@
-"""Networks that a user writes: `FILE.py:CLASS` or `MODULE:CLASS`, as `policy_kwargs` of a recipe name them.
+"""Networks that a user writes: `policy_kwargs` of a recipe name them as `FILE.py:CLASS` or `MODULE:CLASS`.
 
-A policy file says which classes it was trained with. They are imported only if the user names them: in a recipe, as
-the run's recipe, or in `$RLCTL_NETWORKS`, a list of files. A policy file alone never causes an import.
+A policy file names the classes of its training. They are imported only if the user names them too: in a recipe, in the
+recipe of a run, or in `$RLCTL_NETWORKS`, a list of files. A policy file alone never causes an import.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def import_named(policy_kwargs: Mapping[str, Any]) -> dict[str, type]:
 
 
 def locate(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `policy_kwargs` with absolute paths of a user's files, so that a run can be continued from anywhere."""
+    """Return `policy_kwargs` with absolute paths of a user's files, so that a run can be resumed from any folder."""
     located = dict(policy_kwargs)
     for key in KEYS:
         place, _, name = str(located.get(key, "")).rpartition(":")
@@ -54,7 +54,7 @@ def _import(key: str, name: str) -> type:
 
 
 def describe_class(cls: type) -> dict[str, str]:
-    """Return name, file and the file's sha256 of a class, as plain data for a policy file."""
+    """Return the name of a class, its file and the file's sha256, as plain data for a policy file."""
     module = sys.modules[cls.__module__]
     if cls.__module__.startswith("torch.nn."):
         return {"class": cls.__qualname__, "module": "torch.nn"}
@@ -65,7 +65,7 @@ def describe_class(cls: type) -> dict[str, str]:
 def find_class(description: Mapping[str, str]) -> type:
     """Return the class that a policy file describes, if the user has named its module.
 
-    Raises `ArtifactError` for a module that nobody named, that is gone, or that has changed since the training.
+    Raises `ArtifactError` for a module that the user has not named, or that is missing or has changed.
     """
     name = str(description["class"])
     if description.get("module") == "torch.nn" and inspect.isclass(
@@ -75,15 +75,17 @@ def find_class(description: Mapping[str, str]) -> type:
     file = Path(str(description["file"]))
     shown = f"{file}:{name}"
     if not file.is_file():
-        raise ArtifactError(f"it was trained with {shown}, and that file is missing; put it back")
+        raise ArtifactError(f"it was trained with {shown}, and that file is missing; restore it")
     module = _find_module(file)
     if module is None:
         raise ArtifactError(
-            f"it was trained with {shown}, which a policy file alone does not import; give the run, or name the file: "
+            f"it was trained with {shown}, which a policy file alone does not import; give the run, or set "
             f"{VARIABLE}={file}"
         )
     if files.digest(file.read_bytes()) != description["sha256"]:
-        raise ArtifactError(f"it was trained with {shown}, which has changed since: put the former version back")
+        raise ArtifactError(
+            f"it was trained with {shown}, which has changed since; restore the version of the training"
+        )
     cls = getattr(module, name, None)
     if not inspect.isclass(cls):
         raise ArtifactError(f"it was trained with {shown}, which has no such class")
@@ -91,7 +93,7 @@ def find_class(description: Mapping[str, str]) -> type:
 
 
 def _find_module(file: Path) -> Any:
-    """Return the imported module of a file; one that the environment variable names is imported now."""
+    """Return the imported module of a file; imports a file that the environment variable names."""
     named = [Path(entry).expanduser().resolve() for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry]
     if file in named:
         return import_file(str(file), file)
@@ -100,7 +102,7 @@ def _find_module(file: Path) -> Any:
 
 
 def describe_change(described: Mapping[str, Any], present: Mapping[str, Any]) -> str | None:
-    """Say which own class differs between the `policy_kwargs` of two policies; None where they are the same."""
+    """Return which own class differs between the `policy_kwargs` of two policies; None if all are the same."""
     for key in KEYS:
         before, now = described.get(key), present.get(key)
         if before != now and isinstance(before, dict) and isinstance(now, dict):

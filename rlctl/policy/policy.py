@@ -1,4 +1,4 @@
-"""A policy to run: an observation in, an action out, both as NumPy arrays."""
+"""What every policy that acts has: an observation in, an action out, both as NumPy arrays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rlctl.policy.file import PolicyInfo
 
 
 class Policy(abc.ABC):
-    """A policy that can be run, one observation after the other."""
+    """A policy that acts for one environment at a time."""
 
     def __init__(self, info: PolicyInfo) -> None:
         self.info = info
@@ -29,24 +29,24 @@ class Policy(abc.ABC):
 
     @abc.abstractmethod
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the action for one observation, as the environment takes it.
+        """Return the action for one observation, in the environment's action space.
 
-        A recurrent policy remembers; call `reset` when an episode begins. Raises `ValueError` for an observation of
-        another shape.
+        Call `reset` when an episode begins: a recurrent policy keeps a state. Raises `ValueError` for an observation
+        of another shape.
         """
 
     @abc.abstractmethod
     def reset(self) -> None:
-        """Begin an episode: forget what is remembered."""
+        """Clear the recurrent state; call it when an episode begins."""
 
     def read_observation(self, observation: Any) -> dict[str, NDArray[Any]]:
         """Return the parts of an observation by key, in their dtypes; raises `ValueError` for another shape."""
-        given = split(observation)
-        parts = {}
+        raw_parts, parts = split(observation), {}
         for key, (shape, dtype) in self._parts.items():
-            value = np.asarray(given[key], dtype) if key in given else None
-            if value is not None and value.dtype.kind == "u" and (odd := value != given[key]).any():
-                raise ValueError(f"observation has {np.asarray(given[key])[odd][0]:g}, the policy expects {dtype}")
+            value = np.asarray(raw_parts[key], dtype) if key in raw_parts else None
+            if value is not None and value.dtype.kind == "u" and (changed := value != raw_parts[key]).any():
+                number = np.asarray(raw_parts[key])[changed][0]
+                raise ValueError(f"observation has {number:g}, the policy expects {dtype}")
             if value is None or value.shape != shape:
                 expected = join({key: shape for key, (shape, _) in self._parts.items()})
                 raise ValueError(
@@ -57,9 +57,9 @@ class Policy(abc.ABC):
         return parts
 
     def try_once(self, *, deterministic: bool = True) -> None:
-        """Act once, on a made-up observation; raises `ValueError` for an action that the action space cannot have.
+        """Act once on an observation of zeros; raises `ValueError` for an action that does not fit the action space.
 
-        Whatever else is wrong with a file that somebody has written by hand raises here too.
+        A file that does not fit its description raises other exceptions here, too.
         """
         spaces = split_space(self.observation_space).items()
         zeros = {key: np.full(space.shape or (), getattr(space, "start", 0), space.dtype) for key, space in spaces}
@@ -74,8 +74,8 @@ class Policy(abc.ABC):
 
 
 def _describe_additions(spec: EnvSpec) -> str:
-    """Say what a policy observes beyond what its task returns, and where that comes from."""
-    added = ["the part of the episode that is left"] if spec.time_feature else []
+    """Return which parts of the observation are not from the task, and how to get them."""
+    added = ["the remaining fraction of the episode"] if spec.time_feature else []
     if spec.frame_stack > 1:
         added.append(f"{spec.frame_stack} frames")
     return f", with {' and '.join(added)}, as policy.info.spec.make() returns it" if added else ""

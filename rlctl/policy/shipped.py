@@ -1,6 +1,6 @@
-"""Policies that ship with a plugin, `policies/<task>.safetensors` beside its module: where they are from, what they do.
+"""Policies that ship with a plugin, `policies/<task>.safetensors` next to its module: origin and scores.
 
-A shipped policy is the actor alone, as `rlctl export RUN --policy FILE` writes it.
+A shipped policy has the actor only; `rlctl export RUN --policy FILE` writes it.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ Interval = tuple[float, float]
 
 
 class MeasuredScore(pydantic.BaseModel, extra="forbid"):
-    """What a policy, or a baseline, scored over a list of episodes that its training has not seen."""
+    """The score of a policy or a baseline on episodes that were not used in training."""
 
     episodes: int
     seed: int
-    """Of the list of episodes: `rlctl eval --episodes N --seed SEED` plays the same."""
+    """`rlctl eval --episodes N --seed SEED` plays the same episodes."""
     mean_return: float
     return_interval: Interval
-    """Of the mean."""
+    """For the mean."""
     success: float | None
     success_interval: Interval | None
     mean_length: float
     """[steps]"""
     ended_early: float | None
-    """Part of the episodes that ended before the time limit, by a fall or else; None where none is known."""
+    """Fraction of the episodes that ended before the time limit, such as by a fall; None without a time limit."""
     action_change: float
-    """Mean of |action - action before|, over elements and steps; 0 for discrete actions."""
+    """Mean of |action - previous action|, over elements and steps; 0 for discrete actions."""
 
 
 class Provenance(pydantic.BaseModel, extra="forbid"):
-    """Where an exported policy is from, and what was measured of it."""
+    """Where an exported policy comes from, and its scores."""
 
     run: str
-    """Name of the run, with its task."""
+    """`TASK/RUN`, the last two folders of the run's path."""
     origin: dict[str, str] = {}
     """Distribution and version of the task that it was measured on."""
     source_sha256: str | None = None
-    """Of that task's file."""
+    """sha256 of that task's file."""
     git_commit: str | None = None
-    """Of the folder in which it was trained."""
+    """Commit of the folder in which it was trained."""
     recipe: dict[str, Any]
     """The resolved recipe."""
     score: MeasuredScore
@@ -65,9 +65,12 @@ def list_shipped() -> list[str]:
 
 
 def find_shipped_policy(task: str | None) -> Path:
-    """Return the file of a task's shipped policy; raises `UsageError` for no task, `ArtifactError` for no policy."""
+    """Return the file of a task's shipped policy.
+
+    Raises `UsageError` for None or a task that is not installed, `ArtifactError` for a task without one.
+    """
     if task is None:
-        raise UsageError(f"--pretrained: give a task that ships a policy: {', '.join(list_shipped()) or 'none does'}")
+        raise UsageError(f"--pretrained: give a task that ships a policy: {', '.join(list_shipped()) or 'none'}")
     entry = installed.find(task)
     if entry is None:
         names = [entry.name for entry in installed.list_installed()]
@@ -75,6 +78,6 @@ def find_shipped_policy(task: str | None) -> Path:
             f"no task {task!r} is installed, and only installed tasks ship policies.{did_you_mean(task, names)}"
         )
     if (file := entry.policy_file) is None:
-        others = ", ".join(list_shipped()) or "none does"
+        others = ", ".join(list_shipped()) or "none"
         raise ArtifactError(f"{task} ships no policy; train one: rlctl train {task}. Tasks that ship one: {others}")
     return file

@@ -1,4 +1,4 @@
-"""SB3's own networks, and policies on them: what exports are compared with. Imports torch."""
+"""SB3's networks, and policies that act with them, for comparison with exports. Imports torch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rlctl.environments.dict_spaces import Observations, join, split
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.policy import own_modules
 from rlctl.policy.file import PolicyFile, PolicyInfo, list_actor_tensors
-from rlctl.policy.layers import Normalize
+from rlctl.policy.network import read_normalization
 from rlctl.policy.policy import Policy
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -44,8 +44,8 @@ ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "silu": torch.nn.SiLU,
 }
 
-# Of no use to a policy that is run, and no plain data.
-_NOT_KEPT = frozenset(
+# Not plain data, and not needed to act.
+_LEFT_OUT = frozenset(
     {
         "observation_space",
         "action_space",
@@ -60,7 +60,7 @@ _NOT_KEPT = frozenset(
 
 
 def pin_threads() -> None:
-    """Let torch and NumPy use one thread: the last bit of a result depends on how many; small networks gain nothing."""
+    """Make torch and NumPy use one thread: the last bits of a result depend on it, and small networks gain nothing."""
     torch.set_num_threads(1)
     threadpool_limits(1, "blas")
 
@@ -78,7 +78,7 @@ def policy_name(algo: str, observation_space: spaces.Space[Any]) -> str:
 def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
     """Return the observation space as SB3's networks see it: images with channels first."""
     if isinstance(space, spaces.Dict):
-        # Pairs, because from a plain dict Gymnasium would sort the keys, and the network takes them in their order.
+        # Pairs, because Gymnasium sorts the keys of a plain dict, and the network depends on their order.
         return spaces.Dict([(key, network_space(value)) for key, value in space.spaces.items()])
     if isinstance(space, spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
         return VecTransposeImage.transpose_space(space)
@@ -86,7 +86,7 @@ def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
 
 
 def is_own_extractor(cls: type) -> bool:
-    """Return whether a features extractor is a user's, not one of Stable-Baselines3."""
+    """Return whether a features extractor is a user's own, not one of Stable-Baselines3."""
     return cls.__module__.partition(".")[0] not in ("stable_baselines3", "sb3_contrib")
 
 
@@ -96,38 +96,38 @@ def find_activation(name: Any) -> type[torch.nn.Module]:
 
 
 def describe_network(policy: BasePolicy) -> dict[str, Any]:
-    """Return the constructor's arguments of a network as plain data, for `build_network`."""
+    """Return the constructor arguments of a network as plain data, for `build_network`."""
     described = {}
-    for name, value in {**policy._get_constructor_parameters(), **_list_left_out(policy)}.items():
+    for name, value in {**policy._get_constructor_parameters(), **_list_missing_arguments(policy)}.items():
         if name == "features_extractor_class" and is_own_extractor(value):
             value = own_modules.describe_class(value)
-        elif name in _NOT_KEPT or value is None:
+        elif name in _LEFT_OUT or value is None:
             continue
         if name == "activation_fn":
-            known = next((known for known, cls in ACTIVATIONS.items() if cls is value), None)
-            value = known or own_modules.describe_class(value)
+            names = [activation for activation, cls in ACTIVATIONS.items() if cls is value]
+            value = names[0] if names else own_modules.describe_class(value)
         described[name] = value
     return described
 
 
-def _list_left_out(policy: BasePolicy) -> dict[str, Any]:
-    """Arguments that change a network and that its own `_get_constructor_parameters` leaves out."""
-    left_out: dict[str, Any] = {}
+def _list_missing_arguments(policy: BasePolicy) -> dict[str, Any]:
+    """Return arguments that change a network but are missing in SB3's `_get_constructor_parameters`."""
+    missing: dict[str, Any] = {}
     if hasattr(policy, "share_features_extractor"):
-        left_out["share_features_extractor"] = policy.share_features_extractor
+        missing["share_features_extractor"] = policy.share_features_extractor
     if isinstance(policy, RecurrentActorCriticPolicy):
-        left_out |= {
+        missing |= {
             "lstm_hidden_size": policy.lstm_actor.hidden_size,
             "n_lstm_layers": policy.lstm_actor.num_layers,
             "shared_lstm": policy.shared_lstm,
             "enable_critic_lstm": policy.enable_critic_lstm,
             "lstm_kwargs": policy.lstm_kwargs,
         }
-    return left_out
+    return missing
 
 
 def build_network(info: PolicyInfo) -> BasePolicy:
-    """Build an untrained network from a policy's description."""
+    """Build an untrained network from a policy's description; raises `ArtifactError` for an unknown one."""
     observation_space, action_space = info.env.spaces()
     if info.algo not in ALGORITHMS:
         raise ArtifactError(f"policy for an unknown algorithm {info.algo!r}")
@@ -149,49 +149,44 @@ def build_network(info: PolicyInfo) -> BasePolicy:
 
 
 class _NoOptimizer:
-    """Stands where SB3 puts an optimiser: a policy that is run needs none, and torch's imports its compiler (0.8 s)."""
+    """Replaces the optimiser: acting needs none, and torch's optimisers import its compiler (0.8 s)."""
 
     def __init__(self, parameters: Any, **settings: Any) -> None:
         del parameters, settings
 
 
 class TorchPolicy(Policy):
-    """A policy file on the network it was trained with. Deterministic."""
+    """A policy file that acts with SB3's network, as in training. Deterministic."""
 
     def __init__(self, policy: PolicyFile, network: BasePolicy) -> None:
         super().__init__(policy.info)
         self.file = policy
         self.network = network
-        info, tensors = policy.info, policy.tensors
-        clip = float(info.clip_observation or np.inf)
-        self._normalize = {
-            key: Normalize("", tensors[f"normalize/{key}/mean"], tensors[f"normalize/{key}/var"], clip)
-            for key in info.normalized_keys
-        }
-        self.is_recurrent = info.algo == "recurrent_ppo"
+        self._normalize = read_normalization(policy)
+        self.is_recurrent = policy.info.algo == "recurrent_ppo"
         self._state: Any = None
         network.set_training_mode(False)
 
     @classmethod
     def load(cls, path: Path) -> TorchPolicy:
-        """Read a policy file; raises `ArtifactError` if it is not one or does not fit together."""
+        """Read a policy file; raises `ArtifactError` if it is not one, or its tensors do not fit its description."""
         policy = PolicyFile.read(path)
         try:
             return cls._build(policy)
         except ArtifactError as error:
             raise ArtifactError(f"{path}: {error}") from None
-        except Exception as error:  # whatever torch and SB3 raise for a description that nobody has checked
+        except Exception as error:  # any exception from torch or SB3: the description is unchecked until here
             raise ArtifactError(
                 f"{path}: its tensors do not fit its description: {short_repr(str(error), 200)}"
             ) from None
 
     @classmethod
     def _build(cls, policy: PolicyFile) -> TorchPolicy:
-        """Build the network that a description asks for, and try it."""
+        """Build the network, load its weights and act once."""
         network = build_network(policy.info)
         state = {name: torch.from_numpy(value.copy()) for name, value in policy.weights.items()}
         mismatch = network.load_state_dict(state, strict=False)
-        # A shipped policy has no critic, and to act takes none.
+        # A shipped policy has no critic, and acting needs none.
         missing = list_actor_tensors(policy.info.algo, [f"policy/{name}" for name in mismatch.missing_keys])
         if missing or mismatch.unexpected_keys:
             raise ValueError(f"tensors missing: {missing}, unknown: {mismatch.unexpected_keys}")
@@ -200,19 +195,19 @@ class TorchPolicy(Policy):
         return torch_policy
 
     def normalize(self, observations: Observations) -> Observations:
-        """Return observations, one or several, as the network gets them."""
+        """Return one or several observations, normalised."""
         parts = split(observations)
         changed = {key: normalize(parts[key]) for key, normalize in self._normalize.items()}
         normalized: Observations = join({**parts, **changed})
         return normalized
 
     def act(self, observations: Observations) -> NDArray[Any]:
-        """Return the actions for several observations; a recurrent policy remembers as many states."""
+        """Return the actions for a batch of observations; a recurrent policy keeps one state per row."""
         actions, self._state = self.network.predict(self.normalize(observations), self._state, deterministic=True)
         return actions
 
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the action for one observation; a recurrent policy remembers."""
+        """Return the action for one observation; a recurrent state is kept until `reset`."""
         parts = self.read_observation(observation)
         return np.asarray(self.act(join({key: part[None] for key, part in parts.items()}))[0])
 

@@ -196,7 +196,7 @@ def digest(content: bytes) -> str:
 def check_digest(path: Path, expected: str) -> None:
     """Raise `ArtifactError` if a file is missing or its sha256 is not `expected`."""
     if digest(untrusted.read_bytes(path)) != expected:
-        raise ArtifactError(f"{path}: damaged: its sha256 is not the one it was saved with")
+        raise ArtifactError(f"{path}: damaged: its content does not match its sha256")
 
 
 _SEAL = "\n# sha256 of the above: "

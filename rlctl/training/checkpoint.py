@@ -200,7 +200,7 @@ def _read_state(folder: Path) -> State:
     if isinstance(content.get("format"), int) and content["format"] > FORMAT:
         raise ArtifactError(f"{file}: checkpoint format {content['format']} is newer than this rlctl reads ({FORMAT})")
     if sealed.get("sha256") != _seal(content):
-        raise ArtifactError(f"{file}: damaged: its sha256 is not the one it was saved with")
+        raise ArtifactError(f"{file}: damaged: its content does not match its sha256")
     try:
         state = State.model_validate(content)
     except pydantic.ValidationError as error:

@@ -103,9 +103,9 @@ def test_not_verified_is_not_kept(small, train, write, tmp_path):
         export(path, target)
     first, agreement, loop = str(raised.value).splitlines()
     assert first.startswith(f"{target}: ")
-    assert "every action agrees, but the episodes do not" in first
+    assert "all actions agree, but the episodes differ" in first
     assert agreement.startswith("max |difference| ")
-    assert "20 episodes: length same in 20, return within " in loop
+    assert "20 episodes: same length in 20, return within " in loop
     assert [each.name for each in target.parent.iterdir()] == ["policy.onnx"]
     assert target.read_bytes() == b"former"
 
@@ -185,14 +185,14 @@ def test_episodes_are_compared_in_numbers():
     assert loop.max_return_difference == pytest.approx(0.02 / (60.02 / 6))
     assert not loop.agrees
     assert compare_episodes(ours, ours).agrees
-    assert format_closed_loop(loop).startswith("3 episodes: success same in 2, length in 2, return within ")
+    assert format_closed_loop(loop).startswith("3 episodes: same success in 2, same length in 2, return within ")
 
 
 def test_success_is_not_compared_where_there_is_none():
     episodes = [Episode(EpisodeResult(0, index, 1.0, 20, None, {}, None)) for index in range(3)]
     loop = compare_episodes(episodes, episodes)
     assert loop.agrees
-    assert format_closed_loop(loop) == "3 episodes: length same in 3, return within 0.0e+00 (mean 1 and 1)"
+    assert format_closed_loop(loop) == "3 episodes: same length in 3, return within 0.0e+00 (mean 1 and 1)"
 
 
 def test_environment_that_is_gone(small, train, write, tmp_path):
@@ -201,7 +201,7 @@ def test_environment_that_is_gone(small, train, write, tmp_path):
     spec = EnvSpec(f"{file}:Small")
     path = write(train("ppo", spec, steps=0), "ppo", spec)
     file.unlink()
-    with pytest.raises(UsageError, match=r"cannot be verified, its environment does not build: .*no file"):
+    with pytest.raises(UsageError, match=r"cannot be verified, because its environment does not build: .*no file"):
         export(path)
     assert not path.with_suffix(".onnx").exists()
 
@@ -225,7 +225,7 @@ def test_output_must_be_called_onnx(name, small, train, write, tmp_path):
 
 def test_onnx_file_is_not_exported_again(tmp_path):
     (tmp_path / "policy.onnx").write_bytes(b"")
-    with pytest.raises(UsageError, match="an ONNX file already"):
+    with pytest.raises(UsageError, match="is an ONNX file already"):
         export(tmp_path / "policy.onnx")
 
 

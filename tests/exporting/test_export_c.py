@@ -136,7 +136,9 @@ def test_without_a_compiler_it_is_not_verified(small, train, write, monkeypatch)
 
 
 def test_images_are_refused(small, train, write):
-    with pytest.raises(UsageError, match=r"^export --c: images cannot be written as C; rlctl export --onnx can$"):
+    with pytest.raises(
+        UsageError, match=r"^export --c: networks for images cannot be written as C; use export --onnx$"
+    ):
         write_source(write(train("ppo", small("image"), steps=0), "ppo", small("image")))
 
 
@@ -145,7 +147,7 @@ def test_what_c_cannot_carry_is_refused_on_the_command_line(rlctl, small, train,
     path = write(train("ppo", small("image"), steps=0), "ppo", small("image"))
     done = rlctl("export", path.name, "--c", "--onnx", cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr == "error: export --c: images cannot be written as C; rlctl export --onnx can\n"
+    assert done.stderr == "error: export --c: networks for images cannot be written as C; use export --onnx\n"
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
 
 

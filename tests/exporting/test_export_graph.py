@@ -231,11 +231,11 @@ def test_recurrent_state_goes_in_and_out_after_the_action(small, train, write):
 @pytest.mark.parametrize(
     ("observation", "action", "algo", "policy_kwargs", "message"),
     [
-        ("vector", "integer", "ppo", {}, "an action of type int32 cannot be written as ONNX yet"),
-        ("taken", "box", "ppo", {}, "an observation cannot be named 'action' in an ONNX file, an output is"),
+        ("vector", "integer", "ppo", {}, "an action of type int32 cannot be written as ONNX"),
+        ("taken", "box", "ppo", {}, "an observation named 'action' has the name of an ONNX output"),
         (
             "vector", "box", "recurrent_ppo", {"lstm_kwargs": {"bidirectional": True}},
-            "an LSTM with two directions or a projection cannot be played",
+            "a bidirectional LSTM, or one with a projection, is not supported",
         ),
     ],
 )  # fmt: skip

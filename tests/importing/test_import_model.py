@@ -142,13 +142,13 @@ def test_a_call_that_is_not_on_the_list_is_refused_and_not_made(save, tmp_path):
         import_model(**request)
         original = request["file"].read_bytes()
         edit_data(request["file"], **{key: serialized(attack if key != "policy_kwargs" else {"net_arch": attack})})
-        with pytest.raises(ArtifactError, match="it holds what is not read"):
+        with pytest.raises(ArtifactError, match="it has data that cannot be imported"):
             import_model(**request)
         request["file"].write_bytes(original)
     edit_data(request["file"], unknown=serialized(attack))
     import_model(**request)  # what is not needed is not looked at
     request["normalization"].write_bytes(pickle.dumps(attack))
-    with pytest.raises(ArtifactError, match=r"vecnormalize.pkl: it holds what is not read"):
+    with pytest.raises(ArtifactError, match=r"vecnormalize.pkl: it has data that cannot be imported"):
         import_model(**request)
     assert not proof.exists()
 
@@ -165,7 +165,7 @@ def test_other_files_are_refused(save, tmp_path, monkeypatch):
             read_model(tmp_path / name)
     with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
         archive.writestr("one.jpg", "x")
-    with pytest.raises(ArtifactError, match=r"no 'data' in it; there is: one.jpg"):
+    with pytest.raises(ArtifactError, match=r"no file 'data' in the archive; it has one.jpg"):
         read_model(tmp_path / "photos.zip")
     with pytest.raises(ArtifactError, match="no such file"):
         read_model(tmp_path / "nothing.zip")
@@ -180,7 +180,7 @@ def test_other_files_are_refused(save, tmp_path, monkeypatch):
         import_model(tmp_path / "nothing.zip", "reach", output=Path("policy"))
     monkeypatch.chdir(tmp_path)
     Path("best_model.safetensors").write_bytes(b"of another")
-    with pytest.raises(UsageError, match=r"best_model\.safetensors is there already; give another name: --output FILE"):
+    with pytest.raises(UsageError, match=r"best_model\.safetensors exists already; give another name: --output FILE"):
         import_model(Path("agents/best_model.zip"), "reach")
 
 
@@ -195,20 +195,20 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path):
 def test_a_stack_of_frames_is_named_as_such(tmp_path):
     env = VecFrameStack(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]), 3)
     PPO("MlpPolicy", env, device="cpu").save(tmp_path / "model.zip")
-    with pytest.raises(ArtifactError, match=r"Box\(9,\), Pendulum-v1 gives Box\(3,\). Stacks of VecFrameStack"):
+    with pytest.raises(ArtifactError, match=r"Box\(9,\), Pendulum-v1 returns Box\(3,\). Models with VecFrameStack"):
         import_model(tmp_path / "model.zip", "Pendulum-v1")
 
 
 def test_other_spaces_are_refused(save):
     _, _, request = save()
-    with pytest.raises(ArtifactError, match=r"model.zip: it observes Box\(3,\), reach gives Box"):
+    with pytest.raises(ArtifactError, match=r"model.zip: it observes Box\(3,\), reach returns Box"):
         import_model(request["file"], "reach", normalization=request["normalization"])
     discrete = EnvChanges({"observation": "vector", "action": "discrete"})
-    with pytest.raises(ArtifactError, match="its actions are Box"):
+    with pytest.raises(ArtifactError, match="its action space is Box"):
         import_model(request["file"], SMALL, changes=discrete)
     with pytest.raises(UsageError, match="--algo pppo"):
         import_model(request["file"], SMALL, algo="pppo")
-    with pytest.raises(UsageError, match=r"--algo sac: .*model\.zip is a model of ppo"):
+    with pytest.raises(UsageError, match=r"--algo sac: .*model\.zip is a ppo model"):
         import_model(request["file"], SMALL, algo="sac")
     _, other, _ = save(observation="dict")
     other.save(str(request["normalization"]))

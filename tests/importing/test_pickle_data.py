@@ -77,7 +77,7 @@ def test_tensors_cannot_reach_out_of_their_storage():
     with zipfile.ZipFile(short, "w") as archive:
         for each, content in members.items():
             archive.writestr(each, content)
-    with pytest.raises(NotPlainData, match="reaches out of its storage"):
+    with pytest.raises(NotPlainData, match="reads outside its storage"):
         read_tensors(short.getvalue())
 
 

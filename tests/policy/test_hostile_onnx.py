@@ -66,9 +66,9 @@ def test_a_tensor_in_another_file(write, tmp_path):
     for place in ("secret", "../secret", str(tmp_path / "secret")):
         del outside.external_data[:]
         outside.external_data.add(key="location", value=place)
-        assert "a tensor of it is in another file" in refused(write([node("Add", "obs", "w")], [outside]))
+        assert "one of its tensors is in another file" in refused(write([node("Add", "obs", "w")], [outside]))
     inside = node("Constant", to="c", value=outside)
-    assert "a tensor of it is in another file" in refused(write([inside, node("Add", "obs", "c")]))
+    assert "one of its tensors is in another file" in refused(write([inside, node("Add", "obs", "c")]))
 
 
 def test_a_loop_that_never_ends(write):
@@ -145,7 +145,7 @@ def test_changed_weights_are_named_as_such(write):
     model = onnx.load(path)
     model.graph.initializer[0].CopyFrom(constant("w", np.zeros(4, np.float32)))
     onnx.save(model, path)
-    assert refused(path).endswith("its sha256 is not the one it was exported with")
+    assert refused(path).endswith("its content does not match its sha256")
 
 
 def test_an_export_without_a_digest(write):
@@ -155,7 +155,7 @@ def test_an_export_without_a_digest(write):
     del model.metadata_props[:]
     model.metadata_props.extend(kept)
     onnx.save(model, path)
-    assert refused(path).endswith("its metadata has no sha256, which every export of rlctl has; export it again")
+    assert refused(path).endswith("its metadata has no sha256; rlctl writes one into every export; export it again")
 
 
 def test_any_cut_and_any_flipped_byte(write):

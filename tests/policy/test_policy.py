@@ -151,7 +151,9 @@ def test_a_policy_without_a_digest(path):
     policy = PolicyFile.read(path)
     info, tensors = policy.info, policy.tensors
     path.write_bytes(save(tensors, metadata={"rlctl": info.model_dump_json()}))
-    with pytest.raises(ArtifactError, match=r"damaged: its metadata has no sha256, which every policy of rlctl has$"):
+    with pytest.raises(
+        ArtifactError, match=r"damaged: its metadata has no sha256; rlctl writes one into every policy file$"
+    ):
         rlctl.load_policy(path)
 
 
@@ -215,7 +217,9 @@ def test_a_wrong_shape_names_what_the_recipe_adds(tmp_path):
     info = describe()
     info = info.model_copy(update={"spec": dataclasses.replace(info.spec, frame_stack=4, time_feature=True)})
     PolicyFile(info, tensors_of(info)).write(tmp_path / "policy.safetensors")
-    with pytest.raises(ValueError, match=r"expects \(5,\), with the part of the episode that is left and 4 frames, as"):
+    with pytest.raises(
+        ValueError, match=r"expects \(5,\), with the remaining fraction of the episode and 4 frames, as"
+    ):
         rlctl.load_policy(tmp_path / "policy.safetensors").predict(np.zeros(4))
 
 

@@ -123,10 +123,12 @@ def test_a_policy_file_alone_imports_nothing(trained, tmp_path, monkeypatch):
     monkeypatch.setenv(own_modules.VARIABLE, str(nets))
     TorchPolicy.load(file)
     nets.write_text(nets.read_text() + "# changed\n")
-    with pytest.raises(ArtifactError, match=r"policy\.safetensors: .*which has changed since: put the former version"):
+    with pytest.raises(
+        ArtifactError, match=r"policy\.safetensors: .*which has changed since; restore the version of the training"
+    ):
         TorchPolicy.load(file)
     nets.unlink()
-    with pytest.raises(ArtifactError, match=r"nets\.py:Gated, and that file is missing; put it back"):
+    with pytest.raises(ArtifactError, match=r"nets\.py:Gated, and that file is missing; restore it"):
         TorchPolicy.load(file)
 
 

@@ -1,1 +1,1 @@
-"""What chooses the actions of an environment: a policy file, an exported file, zero, random, a function."""
+"""Players choose the actions of an environment: a policy file, an exported file, zero, random, or a function."""

@@ -27,9 +27,9 @@ BASELINES = ("zero", "random")
 
 
 def load_function(text: str) -> Callable[..., Any]:
-    """Import a function, `module:function` or `path/to/file.py:function`, which returns an action for an observation.
+    """Import `module:function` or `path/to/file.py:function`, a function from an observation to an action.
 
-    Raises `UsageError` for text that names none, `TaskError` for a file whose import fails.
+    Raises `UsageError` for text without a function, `TaskError` for a file whose import fails.
     """
     if ":" not in text:
         close = did_you_mean(text, BASELINES)
@@ -46,7 +46,7 @@ def load_function(text: str) -> Callable[..., Any]:
 
 
 class ZeroPlayer(Player):
-    """Plays the action 0, or what is nearest to it in the space; of discrete actions the first."""
+    """Plays the action 0, clipped to the action space; for discrete actions the first."""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         if isinstance(space, spaces.Box):
@@ -55,25 +55,25 @@ class ZeroPlayer(Player):
             self._action = np.full(space.shape or (), getattr(space, "start", 0), np.int64)
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return the same action always."""
+        """Return the same action at every step."""
         return self._action, self._action
 
 
 class RandomPlayer(Player):
-    """Plays uniform actions of a space."""
+    """Plays uniformly random actions."""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         self._space = space
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return an action that follows from seed and step alone."""
+        """Return an action that depends only on seed and step."""
         self._space.seed(int(make_generator(seed, 0, step).integers(2**31)))
         action = self._space.sample()
         return action, action
 
 
 class FunctionPlayer(Player):
-    """Plays the actions that a user's function returns for observations; those of a Box are clipped to it."""
+    """Plays the actions that a user's function returns; actions of a Box are clipped to its bounds."""
 
     def __init__(self, name: str, space: spaces.Space[Any]) -> None:
         self._function = load_function(name)
@@ -82,24 +82,24 @@ class FunctionPlayer(Player):
         self._space = space
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Call the function; raises `PolicyError` for what it raises, and for what is not an action."""
+        """Call the function; raises `PolicyError` if it raises, or if it returns no action of the space."""
         try:
-            given = self._function(map_parts(np.copy, observation))
+            result = self._function(map_parts(np.copy, observation))
         except Exception as error:
             details = format_plugin_traceback(error) or None
             raise PolicyError(f"policy {self._name}: {describe_exception(error)}", details=details) from error
-        action = self._check(given)
+        action = self._check(result)
         return action, action
 
-    def _check(self, given: Any) -> Any:
+    def _check(self, result: Any) -> Any:
         space = self._space
         try:
-            action = np.asarray(given, space.dtype)
+            action = np.asarray(result, space.dtype)
         except (ValueError, TypeError):
             action = np.zeros(0)
-        if action.shape == (space.shape or ()) and given is not None:
+        if action.shape == (space.shape or ()) and result is not None:
             if isinstance(space, spaces.Box) and np.isfinite(action).all():
                 return np.clip(action, space.low, space.high)
             if space.contains(action if space.shape else action[()]):
                 return action
-        raise PolicyError(f"policy {self._name}: it returned {short_repr(given)}, the actions are {space}")
+        raise PolicyError(f"policy {self._name}: it returned {short_repr(result)}, the action space is {space}")

@@ -13,11 +13,11 @@ from rlctl.policy.players.baselines import FunctionPlayer, RandomPlayer, ZeroPla
 from rlctl.policy.players.player import Player
 
 SERVER = ("ws://", "wss://")
-"""How the address of a policy server begins; its player is `rlctl.deploy.server.client.RemotePlayer`."""
+"""Prefixes of the address of a policy server; its player is `rlctl.deploy.server.client.RemotePlayer`."""
 
 
 def make_player(name: str, space: spaces.Space[Any]) -> Player:
-    """Return the player of an action space for `zero`, `random`, an exported file, or a name for `load_function`."""
+    """Return the player for `zero`, `random`, an exported file, or a function as `load_function` takes it."""
     if name == "zero":
         return ZeroPlayer(space)
     if name == "random":
@@ -26,13 +26,13 @@ def make_player(name: str, space: spaces.Space[Any]) -> Player:
 
 
 class ExportedPlayer(Player):
-    """Plays an exported policy, an ONNX file or compiled C: its deterministic action."""
+    """Plays the deterministic action of an exported policy, an ONNX file or compiled C."""
 
     def __init__(self, path: str) -> None:
         self._policy = CPolicy.load(Path(path)) if path.endswith(LIBRARY_SUFFIX) else load_policy(Path(path))
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return the deterministic action; at step 0 a recurrent policy forgets."""
+        """Return the deterministic action; step 0 resets a recurrent policy."""
         if step == 0:
             self._policy.reset()
         action = self._policy.predict(observation)

@@ -1,4 +1,4 @@
-"""What every player has: one action after the other, and noise that follows from the episode's seed and the step."""
+"""What every player has: an action per step, and noise that depends only on the episode's seed and the step."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ import numpy as np
 from rlctl.policy.layers import Array
 
 _BLOCK = 64
-"""Steps whose random numbers are drawn together."""
+"""Number of steps whose random numbers are drawn together."""
 _STEP_NOISE = 0
-"""Use of random numbers: the steps' noise."""
+"""Random stream of the noise of steps."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Exploration:
-    """How actions differ from the deterministic ones; plain data, sent to workers with each segment."""
+    """How a policy explores; plain data that is sent to workers with each segment."""
 
     stochastic: bool = False
     """Sample from the policy's distribution."""
     warmup: bool = False
-    """Ignore the policy: uniform actions."""
+    """Take uniform actions instead of the policy's."""
     epsilon: float = 0.0
-    """Probability of a uniform action, of DQN."""
+    """DQN's probability of a uniform action."""
     action_noise: float = 0.0
-    """Standard deviation of Gaussian noise on the scaled action, of off-policy algorithms."""
+    """Standard deviation of the Gaussian noise of off-policy algorithms, on the action in [-1, 1]."""
     sde_every: int = 0
-    """Steps after which gSDE draws a matrix again; 0: only where a segment begins."""
+    """Steps between gSDE's matrices; 0: a new one for each segment."""
 
 
 class Noise:
-    """Random numbers of the steps of one episode; those of a step do not depend on which steps came before."""
+    """Random numbers of the steps of one episode; they do not depend on which steps were drawn before."""
 
     def __init__(self, size: int) -> None:
         self._size = size
@@ -43,7 +43,10 @@ class Noise:
         self._uniform: Array = np.zeros(0)
 
     def draw(self, seed: int, step: int) -> tuple[Array, Array]:
-        """Return standard normal and uniform numbers in [0, 1) of a step, from 0: shapes (2, size) and (size + 1,)."""
+        """Return standard normal numbers, shape (2, size), and uniform numbers in [0, 1), shape (size + 1,), of a step.
+
+        Steps count from 0.
+        """
         block, row = divmod(step, _BLOCK)
         if block != self._block or seed != self._seed:
             self._seed, self._block = seed, block
@@ -54,32 +57,32 @@ class Noise:
 
 
 def make_generator(seed: int, use: int, counter: int) -> np.random.Generator:
-    """Return the generator of a step of the episode of a seed, for one use of random numbers."""
-    # A counter-based generator begins anywhere without drawing what comes before.
+    """Return the generator of a step or block (`counter`) of an episode, in the random stream `use`."""
+    # A counter-based generator can start anywhere without drawing the numbers before.
     return np.random.Generator(np.random.Philox(key=np.array([seed, use], np.uint64), counter=[0, counter, 0, 0]))
 
 
 class Player(abc.ABC):
-    """Chooses the actions of one environment after the other."""
+    """Chooses the actions of environments, one at a time."""
 
     @abc.abstractmethod
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return the action that is stored and the one that the environment takes, for a step of an episode, from 0."""
+        """Return the action to store and the action for the environment; `step` counts from 0."""
 
     def explore(self, exploration: Exploration) -> None:  # noqa: B027 (most players cannot)
-        """Explore this way from now on."""
+        """Use this exploration from now on."""
 
     def close(self) -> None:  # noqa: B027
-        """Release what it holds, such as a connection."""
+        """Release resources such as a connection."""
 
     def report(self) -> dict[str, Any]:
-        """Return plain data about the episode that ended, for its result."""
+        """Return plain data about the finished episode, for its result."""
         return {}
 
     def begin_segment(self, seed: int, step: int) -> None:  # noqa: B027 (most players have nothing to do)
-        """Continue at a step of an episode; the policy's numbers may have changed."""
+        """Continue at a step of an episode; the policy's weights may have changed."""
 
     @property
     def state(self) -> Array | None:
-        """Recurrent state that the next step starts from, to be read and written; None if there is none."""
+        """Recurrent state before the next step, for reading and writing; None if there is none."""
         return None

@@ -1,4 +1,4 @@
-"""Plays a policy with NumPy: its network, and noise that follows from the episode's seed and the step."""
+"""Plays a policy with NumPy: its network, and noise that depends only on the episode's seed and the step."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from rlctl.policy.network import Network
 from rlctl.policy.players.player import Exploration, Noise, Player, make_generator
 
 _MATRIX = 1
-"""Use of random numbers: gSDE's matrices."""
+"""Random stream of gSDE's matrices."""
 
 
 class PolicyPlayer(Player):
-    """Plays a policy whose tensors may change between segments."""
+    """Plays a policy whose weights may change between segments."""
 
     def __init__(self, policy: PolicyFile) -> None:
         info = policy.info
@@ -41,33 +41,33 @@ class PolicyPlayer(Player):
         return None if self._network.lstm is None else self._network.lstm.state
 
     def explore(self, exploration: Exploration) -> None:
-        """Explore from the next action on."""
+        """Use this exploration from the next action on."""
         self.exploration = exploration
 
     def begin_segment(self, seed: int, step: int) -> None:
-        """Use the present numbers; gSDE draws its matrix for this step."""
+        """Take over changed weights; gSDE draws its matrix for this step."""
         self._network.prepare()
         if self._uses_sde and self.exploration.stochastic:
             self._draw_matrix(seed, step)
 
     def _draw_matrix(self, seed: int, step: int) -> None:
-        """Draw gSDE's exploration matrix, shape (latent, actions); with reduced parameters a column serves all."""
+        """Draw gSDE's exploration matrix, shape (latent, actions); `log_std` has one column or one per action."""
         log_std = self._network.log_std
-        assert log_std is not None  # gSDE has it as a parameter
+        assert log_std is not None  # a parameter of gSDE
         std = _expln(log_std) if self._settings.get("use_expln") else np.exp(log_std)
         size = (log_std.shape[0], len(self._low))
         self._matrix = std * make_generator(seed, _MATRIX, step).standard_normal(size, np.float32)
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return the action that is stored, shape (elements,), and that of the environment; an LSTM goes one step on.
+        """Return the action to store, shape (elements,), and the action for the environment; advances an LSTM's state.
 
         Raises `DivergedError` for an action that is not finite.
         """
         exploration = self.exploration
         if exploration.warmup:
             return self._act_uniform(*self._noise.draw(seed, step))
-        every = exploration.sde_every
-        if every and step % every == 0 and self._uses_sde and exploration.stochastic:
+        period = exploration.sde_every
+        if period and step % period == 0 and self._uses_sde and exploration.stochastic:
             self._draw_matrix(seed, step)
         network = self._network
         latent = network.compute_latent(observation)
@@ -109,7 +109,7 @@ class PolicyPlayer(Player):
         if isinstance(space, spaces.Box):
             value = (2.0 * uniform[:-1] - 1.0).astype(np.float32)
             return value, self._unscale(value)
-        choice = np.floor(uniform[:-1] * _choices(space)).astype(np.int64).reshape(space.shape or ())
+        choice = np.floor(uniform[:-1] * _count_choices(space)).astype(np.int64).reshape(space.shape or ())
         return choice, choice
 
     def _act_discrete(self, values: Array, seed: int, step: int) -> tuple[Any, Any]:
@@ -134,7 +134,7 @@ class PolicyPlayer(Player):
 
 
 def _choose(values: Array, uniform: Array | None, index: int) -> int:
-    """Return the most likely choice of some logits, or with a uniform number a sample."""
+    """Return the choice with the largest logit or, for uniform numbers, a sampled one."""
     if uniform is None:
         return int(values.argmax())
     cumulative = np.cumsum(np.exp(values.astype(np.float64) - values.max()))
@@ -142,7 +142,7 @@ def _choose(values: Array, uniform: Array | None, index: int) -> int:
     return min(choice, len(values) - 1)
 
 
-def _choices(space: spaces.Space[Any]) -> Array:
+def _count_choices(space: spaces.Space[Any]) -> Array:
     if isinstance(space, spaces.Discrete):
         return np.array([space.n])
     if isinstance(space, spaces.MultiDiscrete):
@@ -151,5 +151,5 @@ def _choices(space: spaces.Space[Any]) -> Array:
 
 
 def _expln(log_std: Array) -> Array:
-    """Return gSDE's smoother alternative to exp, which grows slower above 0."""
+    """Return SB3's alternative to exp for gSDE; it grows more slowly above 0."""
     return np.where(log_std <= 0, np.exp(np.minimum(log_std, 0)), np.log1p(np.maximum(log_std, 0) + 1e-6) + 1.0)

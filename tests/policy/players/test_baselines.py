@@ -55,9 +55,9 @@ def test_a_function_acts_within_the_space(functions):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("of_another_shape", r"it returned \[1.0\], the actions are Box\(-1.0, 1.0, \(2,\), float32\)"),
-        ("nothing", "it returned None, the actions are Box"),
-        ("not_a_number", r"it returned \[nan, 0.0\], the actions are Box"),
+        ("of_another_shape", r"it returned \[1.0\], the action space is Box\(-1.0, 1.0, \(2,\), float32\)"),
+        ("nothing", "it returned None, the action space is Box"),
+        ("not_a_number", r"it returned \[nan, 0.0\], the action space is Box"),
         ("raises", "KeyError: 'hand'"),
     ],
 )
@@ -68,7 +68,7 @@ def test_what_a_function_does_wrong(functions, name, message):
 
 
 def test_a_discrete_action_is_one_of_the_space(functions):
-    with pytest.raises(PolicyError, match="the actions are Discrete"):
+    with pytest.raises(PolicyError, match="the action space is Discrete"):
         act(f"{functions}:to_goal", spaces.Discrete(2))
 
 
