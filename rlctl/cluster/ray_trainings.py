@@ -7,10 +7,13 @@ ends itself.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import dataclasses
 import os
 import platform
+import secrets
+import shutil
 import tempfile
 import time
 from collections import defaultdict
@@ -42,8 +45,16 @@ def connect(address: str) -> Any:
     if not address:
         # Without this Ray listens on all addresses of the machine, and writes a token into the home folder.
         folder = tempfile.mkdtemp(prefix="rlctl-ray-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)  # after Ray's own handler, which is registered later
+        token = Path(folder) / "token"
+        token.write_text(secrets.token_hex(32))  # its folder is this user's alone
         os.environ.update(
-            {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_TMPDIR": folder, "RAY_AUTH_TOKEN_PATH": f"{folder}/token"}
+            {
+                "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+                "RAY_TMPDIR": folder,
+                "RAY_AUTH_MODE": "token",
+                "RAY_AUTH_TOKEN_PATH": str(token),
+            }
         )
     try:
         import ray

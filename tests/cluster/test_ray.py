@@ -1,5 +1,6 @@
 """Trainings on a real Ray: a head without cores and two nodes of this machine, of which one is lost."""
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import importlib.util
@@ -16,6 +17,7 @@ from rlctl.errors import TaskError
 from rlctl.run.job import read_job
 from rlctl.training.request import run_training
 from rlctl.training.seeds import train_seeds
+from tests.cluster.conftest import LINE
 from tests.training.comparing import assert_same_run
 
 pytestmark = [
@@ -93,3 +95,40 @@ def _raylet(node):
 def test_a_cluster_that_is_not_there(tmp_path):
     with pytest.raises(TaskError, match="cannot be reached"):
         choose_executor("ray:127.0.0.1:1")(tmp_path, 1, None)
+
+
+def test_a_ray_of_its_own_trains_and_listens_on_loopback_alone(installed_rlctl, tmp_path):
+    """In processes of their own: Ray's environment variables would stay in this one."""
+    options = ["--set", "n_envs=2", "--set", "algo_kwargs.n_steps=32", "--set", "algo_kwargs.batch_size=32"]
+    command = ["train", LINE, "--seeds", "0-1", "--on", "ray", "--no-check", "-n", "3200", *options]
+    listening = set()
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        training = pool.submit(installed_rlctl, *command, timeout=200)
+        while not training.done():
+            listening |= {
+                connection.laddr.ip
+                for process in psutil.process_iter(["name"])
+                if process.info["name"] in ("raylet", "gcs_server")
+                for connection in _connections(process)
+                if connection.status == psutil.CONN_LISTEN
+            }
+            time.sleep(0.2)
+    assert training.result().returncode == 0, training.result().stderr
+    assert listening <= {"127.0.0.1", "::ffff:127.0.0.1"}
+    assert listening
+    assert len(list(tmp_path.glob("runs/Line/*_seeds/*_s*/policies/best.safetensors"))) == 2
+
+
+def _connections(process):
+    try:
+        return process.net_connections()
+    except psutil.Error:  # it has ended
+        return []
+
+
+def test_a_tuning_on_ray(installed_rlctl, tmp_path):
+    options = ["--set", "n_envs=2", "--set", "algo_kwargs.n_steps=32", "--set", "algo_kwargs.batch_size=32"]
+    search = ["--search", "algo_kwargs.learning_rate=1e-4:1e-2", "--trials", "3"]
+    done = installed_rlctl("tune", LINE, *search, "--on", "ray", "-n", "3200", *options, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert list(tmp_path.glob("runs/Line/*_tune/best.yaml"))
