@@ -41,7 +41,6 @@ LAYERS = [
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 MAY_IMPORT_TORCH = {  # besides training/
     "rlctl/policy/torch_policy.py",
-    "rlctl/evaluation/evaluate.py",  # seeds torch's generator where torch is there already
 }
 
 

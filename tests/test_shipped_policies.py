@@ -7,8 +7,8 @@ import rlctl as package
 from rlctl.environments import installed
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, RlctlError, UsageError
+from rlctl.evaluation.evaluate import measure_score
 from rlctl.evaluation.request import EvalRequest
-from rlctl.evaluation.score import measure_score
 from rlctl.exporting.policy_file import export_actor
 from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo

@@ -22,7 +22,7 @@ def evaluate(
         float | None, typer.Option(metavar="RATE", help="Gate: exit 1 below this success rate.")
     ] = None,
     min_success_lower: Annotated[
-        float | None, typer.Option(metavar="RATE", help="Gate on the lower bound of the 95 % interval.")
+        float | None, typer.Option(metavar="RATE", help="Gate: exit 1 if the 95 % interval begins below this rate.")
     ] = None,
     min_return: Annotated[
         float | None, typer.Option(metavar="RETURN", help="Gate: exit 1 below this mean return.")
@@ -31,10 +31,10 @@ def evaluate(
         list[str],
         typer.Option(
             metavar="NAME=LOW:HIGH:COUNT|all",
-            help="Map over an event or parameter of the task, e.g. mass=0.6:1.4:9; twice for two together.",
+            help="Vary an event or parameter of the task, e.g. mass=0.6:1.4:9; give it twice for a 2-D map.",
         ),
     ] = [],
-    push: Annotated[bool, typer.Option("--push", help="Find from which push on it fails.")] = False,
+    push: Annotated[bool, typer.Option("--push", help="Find the smallest push at which it fails.")] = False,
     sim: Annotated[
         str | None,
         typer.Option(metavar="mujoco[:SOLREF]", help="Play in MuJoCo too, with soft, medium and stiff contacts."),
@@ -42,10 +42,10 @@ def evaluate(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a long --vary.")] = False,
     json: Json = None,
 ) -> None:
-    """Say how good a policy is: success rate with its interval, returns, reward terms."""
+    """Evaluate a policy: success rate with its interval, returns, reward terms."""
     claim_stdout()
     from rlctl.evaluation.evaluate import Gates, run_evaluation
-    from rlctl.evaluation.report import show
+    from rlctl.evaluation.report import show, show_group, show_robustness
     from rlctl.run.directory import is_group
     from rlctl.run.group import read_group
 
@@ -54,19 +54,18 @@ def evaluate(
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings))
     if vary or push or sim is not None:
         if request.baseline is not None or request.limits is not None:
-            given = "--limits" if request.baseline is None else "--policy"
-            raise UsageError(f"{given} plays a task as it is: leave out --vary, --push and --sim")
-        from rlctl.evaluation import robustness_report
+            option = "--limits" if request.baseline is None else "--policy"
+            raise UsageError(f"{option} cannot be combined with --vary, --push or --sim")
         from rlctl.evaluation.vary import check_gates, measure_robustness
 
         robustness = measure_robustness(request, vary, push=push, sim=sim, yes=yes, gates=gates)
-        robustness_report.show(robustness, json)
+        show_robustness(robustness, json)
         return check_gates(robustness, gates)
     if request.run is not None and request.baseline is None and is_group(folder := Path(request.run)):
-        from rlctl.evaluation import group
+        from rlctl.evaluation.group import evaluate_group
 
-        scores = group.evaluate_group(read_group(folder), request)
-        group.show(scores, json)
+        scores = evaluate_group(read_group(folder), request)
+        show_group(scores, json)
         return scores.check(gates)
     result = run_evaluation(request, gates)
     show(result, json)

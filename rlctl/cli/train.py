@@ -41,7 +41,7 @@ def train(
     if seeds is not None or group_folder is not None:
         from rlctl import output
         from rlctl.cluster.executors import choose_executor
-        from rlctl.evaluation import group
+        from rlctl.evaluation.report import show_group
         from rlctl.training.seeds import train_seeds
         from rlctl.training.trainings import Detached
 
@@ -50,7 +50,7 @@ def train(
             result = train_seeds(request, seeds, jobs=jobs, make_trainings=make_trainings)
         except Detached as submitted:
             return output.print_notes([str(submitted)])
-        group.show(result.score, json)
+        show_group(result.score, json)
         return result.check()
     if on is not None or detach:
         raise UsageError("--on is about several seeds: give --seeds 0-4, or --resume GROUP")

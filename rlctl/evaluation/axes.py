@@ -1,4 +1,4 @@
-"""What `--vary` names: an event or a parameter of a task, and the values that it takes."""
+"""The axes of `--vary`: an event or a parameter of a task, and its values."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from rlctl.task.task import Task
 
 ALL = "all"
 MOST_CELLS = 1_000_000
-_VALUES = 5  # of an event with `--vary all`
-_WIDER = 2.0  # how much wider than its range an event is varied with `--vary all`
+_VALUES = 5  # per axis of `--vary all`
+_WIDER = 2.0  # width of an axis of `--vary all`, relative to the event's range
 _FORM = "write NAME=LOWEST:HIGHEST:VALUES, for example --vary mass=0.6:1.4:9"
 
 
@@ -38,7 +38,7 @@ def make_contact_axis(sim: str) -> Axis:
 
 
 def read_axes(texts: Sequence[str], spec: EnvSpec) -> list[list[Axis]]:
-    """Return the axes of each map that `--vary` asks for: one map, or with `all` one per event of the task.
+    """Return the axes of each map of `--vary`: a single map, or with `all` one per event of the task.
 
     Raises `UsageError` for a name that the task does not have, or values that it cannot take.
     """
@@ -46,15 +46,15 @@ def read_axes(texts: Sequence[str], spec: EnvSpec) -> list[list[Axis]]:
     if list(texts) == [ALL]:
         return [[axis] for axis in _vary_all(task, spec)]
     if ALL in texts or len(texts) > 2:
-        raise UsageError("--vary: give one or two things to vary together, or only `all`, for each event alone")
+        raise UsageError("--vary: give one or two axes, or only `all`, which varies each event alone")
     axes = [_read_axis(text, task, spec) for text in texts]
     if len({axis.setting for axis in axes}) < len(axes):
-        raise UsageError(f"--vary: {axes[0].setting} is there twice")
+        raise UsageError(f"--vary: {axes[0].setting} is given twice")
     return [axes]
 
 
 def count_cells(maps: Iterable[Sequence[Axis]]) -> int:
-    """Return how many cells maps of these axes have; raises `UsageError` for more than can be kept."""
+    """Return how many cells maps of these axes have; raises `UsageError` for more than `MOST_CELLS`."""
     cells = sum(math.prod(len(axis.values) for axis in axes) for axes in maps)
     if cells > MOST_CELLS:
         raise UsageError(f"--vary: {cells:,} cells; at most {MOST_CELLS:,} are possible")
@@ -62,7 +62,7 @@ def count_cells(maps: Iterable[Sequence[Axis]]) -> int:
 
 
 def change(axis: Axis, value: float) -> EnvChanges:
-    """Return the change of the environment that puts an axis at one of its values."""
+    """Return the change of the environment that sets an axis to a value."""
     kind, _, rest = axis.setting.partition(".")
     if kind == "events":
         event, _, parameter = rest.partition(".")
@@ -80,9 +80,9 @@ def _read_axis(text: str, task: Any, spec: EnvSpec) -> Axis:
     except ValueError:
         raise UsageError(f"--vary {short_repr(text)!r}: {_FORM}") from None
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise UsageError(f"--vary {text}: {low:g} to {high:g} is no range; {_FORM}")
+        raise UsageError(f"--vary {text}: {low:g} to {high:g} is not a range; {_FORM}")
     if count < 2:
-        raise UsageError(f"--vary {text}: {count} value; to evaluate at one, use --set; {_FORM}")
+        raise UsageError(f"--vary {text}: an axis needs two or more values; for a single value use --set; {_FORM}")
     if count > MOST_CELLS:
         raise UsageError(f"--vary {text}: at most {MOST_CELLS:,} values are possible")
     name = name.strip()
@@ -99,7 +99,7 @@ def _vary_event(
     ranges = event.ranges
     if not ranges or (parameter and parameter not in ranges):
         close = did_you_mean(parameter, ranges)
-        raise UsageError(f"--vary {name}: event {key!r} draws {', '.join(ranges) or 'nothing'}.{close}")
+        raise UsageError(f"--vary {name}: event {key!r} draws {', '.join(ranges) or 'no parameter'}.{close}")
     parameter = parameter or next(iter(ranges))
     limits = ranges[parameter]
     read_range(f"--vary {name}", list(span[:2]), RangeLimits(limits.low, limits.high, limits.above), UsageError)
@@ -146,7 +146,7 @@ def _vary_parameter(name: str, task: Any, span: tuple[float, float, int], spec: 
 
 
 def _is_whole(declared: inspect.Parameter, values: Sequence[float]) -> bool:
-    """Say whether it takes whole numbers: by its type, or where it has none if its default and `values` are whole."""
+    """Say whether a parameter takes only whole numbers: by its type, else by its default and `values`."""
     if declared.annotation is not declared.empty:
         return declared.annotation in (int, "int")
     return type(declared.default) is int and all(value.is_integer() for value in values)
@@ -160,8 +160,8 @@ def _find_numbers(task: type[Task]) -> dict[str, Any]:
 def _vary_all(task: Any, spec: EnvSpec) -> list[Axis]:
     """Return an axis per event: its range, twice as wide."""
     if not is_task(task) or not task.events:
-        raise UsageError(f"--vary all: {spec.task} offers no events; name one of its parameters")
-    # A colour changes only what a camera sees; who trains on pictures can name it.
+        raise UsageError(f"--vary all: {spec.task} has no events; name one of its parameters")
+    # Colours matter only to policies that use a camera; name the event to vary it.
     events = {name: event for name, event in task.events.items() if event.ranges and event.function is not set_color}
     spans = {name: _widen(event) for name, event in events.items()}
     return [
@@ -172,7 +172,7 @@ def _vary_all(task: Any, spec: EnvSpec) -> list[Axis]:
 
 
 def _widen(event: Event) -> tuple[float, float, int]:
-    """Return the range of an event's first parameter, twice as far from nominal, or from its middle."""
+    """Return the range of an event's first parameter, widened around its nominal value, or its middle."""
     parameter, limits = next(iter(event.ranges.items()))
     low, high = read_range(parameter, event.parameters.get(parameter, 0.0), limits).at(1.0)
     middle = event.nominal(parameter)

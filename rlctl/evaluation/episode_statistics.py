@@ -1,6 +1,6 @@
 """Statistics of a list of episodes.
 
-Formulas of a line or two are written out: importing scipy.stats takes longer than many an evaluation.
+Short formulas are written out: importing scipy.stats takes longer than many evaluations.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Spread:
 
     mean: float
     iqm: float
-    """Interquartile mean: of the middle half, so that a few odd episodes do not decide."""
+    """Interquartile mean: the mean of the middle half, which outliers do not change."""
     std: float
     """Sample standard deviation; 0 for one episode."""
     min: float
@@ -44,13 +44,13 @@ class Spread:
 
 
 def success_rate(results: Sequence[EpisodeResult]) -> float | None:
-    """Return the part of episodes that succeeded; None where the environment does not say."""
+    """Return the fraction of episodes that succeeded; None if the environment does not report success."""
     known = [result.success for result in results if result.success is not None]
     return sum(known) / len(known) if known else None
 
 
 def success_interval(results: Sequence[EpisodeResult]) -> tuple[float, float] | None:
-    """Return the 95 % interval of the success rate by Clopper and Pearson (1934), which covers it at least as often."""
+    """Return the 95 % interval of the success rate by Clopper and Pearson (1934), which is conservative."""
     known = [result.success for result in results if result.success is not None]
     if not known:
         return None
@@ -58,7 +58,7 @@ def success_interval(results: Sequence[EpisodeResult]) -> tuple[float, float] | 
 
 
 def _lower_bound(count: int, episodes: int) -> float:
-    """Return the rate at which `count` or more of the episodes have a probability of 2.5 %."""
+    """Return the success rate at which `count` or more successes have a probability of 2.5 %."""
     if count == 0:
         return 0.0
     numbers = np.arange(1, episodes + 1)
@@ -88,7 +88,7 @@ def summarize(results: Sequence[EpisodeResult]) -> Outcome:
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of independent values, by Student's t; the value itself, twice, for one."""
+    """Return the 95 % interval of the mean of independent values, by Student's t; for one value both ends are it."""
     from scipy.special import stdtrit
 
     mean, count = float(np.mean(values)), len(values)
@@ -99,9 +99,9 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 def mean_action_change(episodes: Sequence[Episode]) -> float:
-    """Return the mean of |action - action before| over elements and steps of recorded episodes.
+    """Return the mean of |action - previous action| over elements and steps of recorded episodes.
 
-    It is 0 for actions that are no real numbers, and for episodes of one step.
+    It is 0 for discrete actions, and for episodes of one step.
     """
     changes = [
         np.abs(np.diff(episode.trajectory.actions, axis=0)).ravel()

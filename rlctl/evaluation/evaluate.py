@@ -1,9 +1,10 @@
-"""`rlctl eval`: many episodes, each with its own seed, and honest numbers from them."""
+"""`rlctl eval`: play many episodes, each with its own seed, and return their statistics."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +12,24 @@ from rlctl import output
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
-from rlctl.evaluation.baseline import Baseline, choose_task, load_baseline
 from rlctl.evaluation.episode_statistics import (
     Spread,
     mean_action_change,
+    mean_interval,
     mean_metrics,
     mean_terms,
     success_interval,
     success_rate,
 )
+from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_player, load_baseline
 from rlctl.evaluation.request import EvalRequest
-from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.numpy_policy import check_playable, load_policy
+from rlctl.policy.file import PolicyInfo
 from rlctl.policy.players.player import Exploration
+from rlctl.policy.shipped import MeasuredScore
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
-from rlctl.run import lookup
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,10 +39,10 @@ class Evaluation:
     name: str
     """The policy's file, or the baseline."""
     policy: PolicyInfo | None
-    """None of a baseline."""
+    """None for a baseline."""
     spec: EnvSpec
     events: dict[str, bool]
-    """The events that the task offers, and whether each acted."""
+    """Whether each event of the task was active."""
     seed: int
     deterministic: bool
     played: list[Episode]
@@ -59,11 +60,15 @@ class Evaluation:
     unlimited: Evaluation | None = None
     """The same episodes without limits."""
     action_change: float | None = None
-    """Mean of |action - action before|, over elements and steps; None if it was not measured."""
+    """Mean of |action - previous action|, over elements and steps; None if it was not measured."""
 
     @property
     def episodes(self) -> list[dict[str, Any]]:
         """A flat row per episode, for a table: `pandas.DataFrame(evaluation.episodes)`."""
+        return [_flatten(row) for row in self.rows()]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row per episode, as the JSON of `rlctl eval` has it; terms and metrics are dicts."""
         return [_make_row(index, episode.result) for index, episode in enumerate(self.played)]
 
     def __repr__(self) -> str:
@@ -79,14 +84,19 @@ def _make_row(index: int, result: EpisodeResult) -> dict[str, Any]:
         "return": result.total_reward,
         "length": result.length,
         "final_distance": result.final_distance,
-        **{f"terms.{name}": value for name, value in result.terms.items()},
-        **{f"metrics.{name}": value for name, value in result.metrics.items()},
+        "terms": result.terms,
+        "metrics": result.metrics,
     }
+
+
+def _flatten(row: dict[str, Any]) -> dict[str, Any]:
+    nested = {f"{key}.{name}": value for key in ("terms", "metrics") for name, value in row.pop(key).items()}
+    return row | nested
 
 
 @dataclasses.dataclass(frozen=True)
 class Gates:
-    """What an evaluation must reach."""
+    """The minimum scores that an evaluation must reach."""
 
     min_success: float | None = None
     min_success_lower: float | None = None
@@ -112,7 +122,7 @@ class Gates:
             raise AnswerIsNo("gate missed: " + "; ".join(missed))
 
     def list_missed(self, rate: float | None, interval: tuple[float, float] | None, mean_return: float) -> list[str]:
-        """Return what is missed by a success rate, its interval and a mean return, a phrase for each gate."""
+        """Return a phrase for each gate that these scores miss."""
         missed = []
         if self.min_success is not None and rate is not None and rate < self.min_success:
             missed.append(f"success rate {rate:.3f} is below {self.min_success:g}")
@@ -126,77 +136,21 @@ class Gates:
 NO_GATES = Gates()
 
 
-def run_evaluation(request: EvalRequest, gates: Gates = NO_GATES) -> Evaluation:
-    """Find the policy, play its episodes, and return their statistics."""
+def run_evaluation(
+    request: EvalRequest,
+    gates: Gates = NO_GATES,
+    *,
+    print_notes: Callable[[Sequence[str]], None] = output.print_notes,
+) -> Evaluation:
+    """Find the policy, play its episodes, and return their statistics; `print_notes` as in `find_player`."""
     if request.baseline is not None:
         return _evaluate(load_baseline(request), choose_task(request), request, gates)
-    _, policy, spec = find_player(request)
+    _, policy, spec = find_player(request, print_notes)
     return _evaluate(policy, spec, request, gates)
 
 
-def find_player(request: EvalRequest) -> tuple[lookup.FoundPolicy, LoadedPolicy, EnvSpec]:
-    """Find and read the policy of a request, and what it is to be evaluated on."""
-    found = lookup.find_policy(request.run, request.checkpoint)
-    output.print_notes(found.notes)
-    policy = load_player(found.file, request.deterministic)
-    return found, policy, found.locate(choose_spec(policy.info, request))
-
-
-@dataclasses.dataclass(frozen=True)
-class LoadedPolicy:
-    """A policy that workers can play."""
-
-    path: Path
-    info: PolicyInfo
-    policy: PolicyFile | None
-    """None for an exported file, which the workers load themselves."""
-
-    @property
-    def name(self) -> str:
-        """The file, as it is shown."""
-        return str(self.path)
-
-    def give_to(self, workers: Workers) -> None:
-        """Let workers act with it; raises `ArtifactError` if it is for other spaces than their environments have."""
-        self.info.check_fits(workers.info, self.path)
-        if self.policy is None:
-            workers.set_other_policy(str(self.path.resolve()))
-        else:
-            workers.set_policy(self.policy)
-
-
-def load_player(path: Path, deterministic: bool) -> LoadedPolicy:
-    """Read and try a policy; raises `ArtifactError` for a damaged one."""
-    if path.suffix == ".onnx":
-        info = load_policy(path).info
-        if not deterministic:
-            raise UsageError("an exported policy cannot sample: only its deterministic action is in the ONNX file")
-        return LoadedPolicy(path, info, None)
-    policy = check_playable(PolicyFile.read(path))
-    return LoadedPolicy(path, policy.info, policy)
-
-
-def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:
-    """Return what to evaluate on: the policy's task or another, with changes, or the stage that was asked for."""
-    if request.spec is not None:  # the policy brings only how it observes
-        own = info.spec
-        return dataclasses.replace(request.spec, frame_stack=own.frame_stack, time_feature=own.time_feature)
-    if (stage := request.stage) is None:
-        return info.derive_spec(request.task, request.changes)
-    if request.task is not None and request.task != info.spec.task:
-        raise UsageError(
-            f"--stage: stages are those of {info.spec.task}, which the policy was trained on; leave out --task"
-        )
-    if not info.stages:
-        raise UsageError(f"--stage {stage}: this policy was trained without stages; leave out --stage")
-    if not 1 <= stage <= len(info.stages):
-        count = len(info.stages)
-        raise UsageError(f"--stage {stage}: this policy was trained in {count} stages; give a number from 1 to {count}")
-    return request.changes.apply(info.stages[stage - 1])
-
-
 def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
-    """Start workers for the episodes of a request: as many as there are cores, but no more than episodes."""
+    """Start the workers of a request: by default an environment per core, but no more than episodes."""
     n_envs = min(request.n_envs or available_cores(), request.episodes)
     return Workers(spec, n_envs, timeout_s=request.env_timeout_s)
 
@@ -218,7 +172,7 @@ def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalReques
 
 
 def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:
-    """Return limits as plain data; raises `RecipeError` for those that an environment's actions cannot have."""
+    """Return limits as plain data; raises `RecipeError` if they do not fit the environment's actions."""
     from rlctl.deploy.filter.fitting import fit_limits
     from rlctl.deploy.filter.limits import read_limits
 
@@ -256,4 +210,24 @@ def _summarize(
         final_distance=Spread.of(distances) if distances else None,
         max_steps=info.max_steps,
         action_change=mean_action_change(episodes) if request.measure_actions else None,
+    )
+
+
+def measure_score(
+    request: EvalRequest, print_notes: Callable[[Sequence[str]], None] = output.print_notes
+) -> MeasuredScore:
+    """Return the score of a request's policy as a shipped policy carries it, with the mean change of actions."""
+    evaluation = run_evaluation(dataclasses.replace(request, measure_actions=True), print_notes=print_notes)
+    results = [episode.result for episode in evaluation.played]
+    limit = evaluation.max_steps
+    return MeasuredScore(
+        episodes=len(results),
+        seed=evaluation.seed,
+        mean_return=evaluation.returns.mean,
+        return_interval=mean_interval([result.total_reward for result in results]),
+        success=evaluation.success_rate,
+        success_interval=evaluation.success_interval,
+        mean_length=evaluation.lengths.mean,
+        ended_early=None if limit is None else sum(result.length < limit for result in results) / len(results),
+        action_change=evaluation.action_change or 0.0,
     )

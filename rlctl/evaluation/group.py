@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from pydantic_core import to_jsonable_python
@@ -10,16 +11,15 @@ from pydantic_core import to_jsonable_python
 from rlctl import output
 from rlctl.errors import AnswerIsNo, ArtifactError, RlctlError
 from rlctl.evaluation.episode_statistics import Spread
-from rlctl.evaluation.evaluate import Gates
+from rlctl.evaluation.evaluate import Gates, measure_score
 from rlctl.evaluation.request import EvalRequest
-from rlctl.evaluation.score import measure_score
 from rlctl.policy.shipped import MeasuredScore
 from rlctl.run.group import Group
 
 
 @dataclasses.dataclass(frozen=True)
 class SeedScore:
-    """What came of a seed."""
+    """The score of one seed, or why it has none."""
 
     seed: int
     run: str = ""
@@ -46,14 +46,14 @@ class GroupScore:
         return Spread.of(known) if known else None
 
     def check(self, gates: Gates) -> None:
-        """Raise `ArtifactError` for seeds without a score, and `AnswerIsNo` for those that miss a gate.
+        """Raise `ArtifactError` if a seed has no score, and `AnswerIsNo` if one misses a gate.
 
         Raises `UsageError` for a gate on success where the task does not report it.
         """
         if failed := [seed for seed in self.seeds if seed.score is None]:
             raise ArtifactError(
-                f"{self.group.path}: {len(failed)} of {len(self.seeds)} seeds without a score, the first seed "
-                f"{failed[0].seed}: {failed[0].problem}"
+                f"{self.group.path}: {len(failed)} of {len(self.seeds)} seeds have no score; seed {failed[0].seed}: "
+                f"{failed[0].problem}"
             )
         missed = []
         for seed in self.seeds:
@@ -67,50 +67,32 @@ class GroupScore:
 
 
 def evaluate_group(group: Group, request: EvalRequest) -> GroupScore:
-    """Evaluate a policy of every seed's run, by default the best; a seed without one has a problem instead."""
-    return GroupScore(group, [_evaluate_seed(group, seed, request) for seed in group.seeds])
+    """Evaluate a policy of every seed's run, by default the best; a seed without one has a problem instead.
+
+    A warning about several seeds, such as a changed task, is printed once.
+    """
+    printed: set[str] = set()
+
+    def print_new(notes: Sequence[str]) -> None:
+        output.print_notes(note for note in notes if note not in printed)
+        printed.update(notes)
+
+    return GroupScore(group, [_evaluate_seed(group, seed, request, print_new) for seed in group.seeds])
 
 
-def _evaluate_seed(group: Group, seed: int, request: EvalRequest) -> SeedScore:
+def _evaluate_seed(
+    group: Group, seed: int, request: EvalRequest, print_notes: Callable[[Sequence[str]], None]
+) -> SeedScore:
     run = group.find_run(seed)
     if run is None:
-        return SeedScore(seed, problem="it has not begun")
+        return SeedScore(seed, problem="not started yet")
     try:
         status = run.status()
-        score = measure_score(dataclasses.replace(request, run=str(run.path)))
+        score = measure_score(dataclasses.replace(request, run=str(run.path)), print_notes)
     except RlctlError as error:
         return SeedScore(seed, run.path.name, problem=str(error).partition("\n")[0])
     steps, seconds = status.get("steps"), status.get("seconds")
     return SeedScore(seed, run.path.name, str(status.get("algo", "")), steps, seconds, score)
-
-
-def show(result: GroupScore, json: str | None) -> None:
-    """Print a row per seed and what they have in common, or JSON alone for `-`."""
-    if output.present(as_json(result), json):
-        return
-    out = output.out()
-    scores = [seed.score for seed in result.seeds if seed.score is not None]
-    episodes = f", {output.format_count(scores[0].episodes, 'episode')} each, seed {scores[0].seed}" if scores else ""
-    seeds = output.format_count(len(result.seeds), "seed")
-    out.print(f"{result.group.task}: {result.group.path}, {seeds}{episodes}")
-    success, returns = result.spread("success"), result.spread("mean_return")
-    rows = [_list_cells(seed) for seed in result.seeds]
-    for label in ("mean", "IQM", "std"):
-        rate, value = (None if spread is None else getattr(spread, label.lower()) for spread in (success, returns))
-        rows.append((label, "-" if rate is None else f"{rate:.1%}", "-" if value is None else f"{value:.4g}"))
-    output.print_table(("seed", "success", "return", "steps", "seconds", ""), rows, left=("",))
-
-
-def _list_cells(seed: SeedScore) -> tuple[str, ...]:
-    score = seed.score
-    return (
-        str(seed.seed),
-        "-" if score is None or score.success is None else f"{score.success:.1%}",
-        "-" if score is None else f"{score.mean_return:.4g}",
-        "-" if seed.steps is None else f"{seed.steps:,}",
-        "-" if seed.seconds is None else f"{seed.seconds:.0f}",
-        seed.problem,
-    )
 
 
 def as_json(result: GroupScore) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""`rlctl eval --push`: from which horizontal push at mid-episode on a policy fails."""
+"""`rlctl eval --push`: the smallest horizontal push at mid-episode at which a policy fails."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.evaluation.cells import CellPlayer
 from rlctl.evaluation.episode_statistics import summarize
 from rlctl.policy.shipped import Interval
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.robustness import PushLevel, PushTest
 
 _DURATION_S = 0.1
-_FIRST_SPEED = 0.25  # [m/s], by which the smallest push would change the speed of the whole robot
+_FIRST_SPEED = 0.25  # [m/s], the change of the whole robot's speed by the smallest push
 _DOUBLINGS = 6  # up to 16 m/s
 _BISECTIONS = 4
 _RESAMPLES = 2000
@@ -57,14 +56,14 @@ def find_pushed(spec: EnvSpec) -> PushedBody:
         inner = env.unwrapped
         if not isinstance(inner, TaskEnv):
             raise UsageError(
-                f"--push: {spec.task} is a plain Gymnasium environment; only the worlds of tasks are known"
+                f"--push: {spec.task} is a plain Gymnasium environment; only robots of tasks can be pushed"
             )
         bodies = list(inner.sim.bodies.values())
         robots = [body for body in bodies if body.joint_names] or bodies
         movable = [(body, link) for body in robots if (link := body.find_trunk()) is not None]
         if not movable:
             names = ", ".join(body.name for body in robots)
-            raise UsageError(f"--push: {spec.task} has no base that could be pushed: {names} is fixed to the world")
+            raise UsageError(f"--push: {spec.task} has no movable base: {names} is fixed to the world")
         body, link = max(movable, key=lambda pair: pair[0].total_mass())
         dt, steps = inner.task.control_dt, inner.max_steps
         return PushedBody(
@@ -77,8 +76,13 @@ def find_pushed(spec: EnvSpec) -> PushedBody:
         )
 
 
-def measure_push(player: CellPlayer, spec: EnvSpec, unpushed: Sequence[EpisodeResult]) -> PushTest:
-    """Push with twice the impulse until half of the episodes fail, then bisect, always with the same episodes."""
+def measure_push(
+    spec: EnvSpec, unpushed: Sequence[EpisodeResult], play: Callable[[dict[str, object]], Sequence[EpisodeResult]]
+) -> PushTest:
+    """Double the impulse until half of the episodes fail, then bisect.
+
+    `unpushed` are the episodes without a push; `play` plays the same with the event `push` of these parameters.
+    """
     pushed = find_pushed(spec)
     has_success = any(result.success is not None for result in unpushed)
 
@@ -91,7 +95,7 @@ def measure_push(player: CellPlayer, spec: EnvSpec, unpushed: Sequence[EpisodeRe
     outcomes = {0.0: summarize(unpushed)}
 
     def fails(impulse: float) -> bool:
-        results = player.play(spec, pushed.parameters(impulse))
+        results = play(pushed.parameters(impulse))
         held[impulse], outcomes[impulse] = find_held(results), summarize(results)
         return float(held[impulse].mean()) <= 0.5
 
@@ -132,8 +136,8 @@ def _search(fails: Callable[[float], bool], first: float) -> None:
 def find_threshold(impulses: Sequence[float], held: NDArray[np.bool_]) -> tuple[float | None, Interval | None]:
     """Return the impulse at which half of the episodes fail, and its 95 % interval; None where they never do.
 
-    `held`, shape (impulses, episodes), says which went well. The rate is made to fall with the impulse (isotonic
-    regression) and is a straight line between two of them; the interval resamples episodes (percentile bootstrap).
+    `held`, shape (impulses, episodes), is True for episodes that went well. The rate falls with the impulse (isotonic
+    regression) and is linear between two impulses; the interval resamples episodes (percentile bootstrap).
     """
     threshold = _cross(impulses, held.mean(axis=1))
     if threshold is None or held[0].mean() <= 0.5:
@@ -152,7 +156,7 @@ def _cross(impulses: Sequence[float], rates: NDArray[np.float64]) -> float | Non
     falling = isotonic_regression(rates, increasing=False).x
     if falling[-1] > 0.5:
         return None
-    return float(np.interp(-0.5, -falling, impulses))  # which needs rising values
+    return float(np.interp(-0.5, -falling, impulses))  # np.interp needs rising values
 
 
 def _describe_result(
@@ -164,14 +168,14 @@ def _describe_result(
 ) -> str:
     goes_well = "succeed" if measure == "success" else "last until the time limit"
     if held[0.0].mean() <= 0.5:
-        return f"cannot tell: without a push {held[0.0].mean():.0%} of the episodes {goes_well}"
+        return f"cannot tell: without a push only {held[0.0].mean():.0%} of the episodes {goes_well}"
     largest = max(held)
     if threshold is None or interval is None:
         if measure == "upright" and all(outcomes.all() for outcomes in held.values()):
             return "cannot tell: this task reports no success, and no episode ended early"
         return f"more than half of the episodes {goes_well} with every push tried, up to {largest:.3g} N s"
     return (
-        f"half of the episodes fail from a push of {threshold:.3g} N s on (95 % interval {interval[0]:.3g} to "
-        f"{interval[1]:.3g}), which alone would change the speed of its {pushed.mass:.3g} kg by "
+        f"half of the episodes fail at a push of {threshold:.3g} N s (95 % interval {interval[0]:.3g} to "
+        f"{interval[1]:.3g}), which changes the speed of the robot ({pushed.mass:.3g} kg) by "
         f"{threshold / pushed.mass:.2g} m/s"
     )

@@ -1,9 +1,9 @@
-"""What an evaluation prints."""
+"""What `rlctl eval` prints: one evaluation, a group of seeds, or how robust a policy is."""
 
 from __future__ import annotations
 
 import collections
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic_core import to_jsonable_python
 
@@ -11,7 +11,19 @@ from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.evaluate import Evaluation
+from rlctl.evaluation.group import GroupScore, SeedScore
+from rlctl.evaluation.group import as_json as group_as_json
+from rlctl.evaluation.vary import format_command
+from rlctl.policy.shipped import Interval, MeasuredScore
+from rlctl.run.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
 from rlctl.version import collect_versions
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+_MOST_COLUMNS = 25  # of a map that is drawn
+_MOST_ROWS = 60
+_NOMINAL, _WORST = "*", "<"
 
 
 def show(result: Evaluation, json: str | None) -> None:
@@ -32,32 +44,32 @@ def show(result: Evaluation, json: str | None) -> None:
     rows += [(f"metric {name}, per step", f"{mean:.4g}") for name, mean in result.metrics.items()]
     output.print_table(("", "mean", "IQM", "std", "min", "max"), rows, left=("",))
     reports = [episode.result.report for episode in result.played]
-    if held := sum(report.get("not_running", 0) for report in reports):
+    if stopped := sum(report.get("not_running", 0) for report in reports):
         answers = sum(len(report["round_trips_s"]) for report in reports)
-        out.print(f"the server was holding or stopped in {held:,} of {answers:,} answers: not the policy's own actions")
+        out.print(f"{stopped:,} of {answers:,} answers: the server held or stopped instead of running the policy")
     if result.unlimited is not None:
         _show_limits(result, result.unlimited)
 
 
 def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
-    """Print what the limits cost, and how often each stepped in."""
+    """Print the scores with and without limits, and how often each limit acted."""
     out = output.out()
-    without, now = unlimited.success_rate, result.success_rate
+    without, limited = unlimited.success_rate, result.success_rate
     success = ""
-    if without is not None and now is not None:
-        success = f"success rate {without:.1%} without them, {now:.1%} with them; "
+    if without is not None and limited is not None:
+        success = f"success rate {without:.1%} without them, {limited:.1%} with them; "
     returns = f"return {unlimited.returns.mean:.4g} without them, {result.returns.mean:.4g} with them"
     out.print(f"limits of {result.limited_by}: {success}{returns}")
     steps = sum(episode.result.length for episode in result.played)
     rows = [(name, f"{1000 * count / steps:.4g}") for name, count in count_interventions(result).most_common()]
     if rows:
-        output.print_table(("stepped in", "per 1,000 steps"), rows, left=("stepped in",))
+        output.print_table(("limit", "per 1,000 steps"), rows, left=("limit",))
     else:
-        out.print("they never stepped in")
+        out.print("no limit acted")
 
 
 def count_interventions(result: Evaluation) -> collections.Counter[str]:
-    """Return how often each limit stepped in and each fault occurred, over all episodes."""
+    """Return how often each limit acted and each fault occurred, over all episodes."""
     counts: collections.Counter[str] = collections.Counter()
     for episode in result.played:
         counts.update(episode.result.report.get("interventions", {}))
@@ -98,19 +110,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         "terms": result.terms,
         "metrics": result.metrics,
         "final_distance": result.final_distance,
-        "episodes": [
-            {
-                "index": index,
-                "seed": outcome.seed,
-                "success": outcome.success,
-                "return": outcome.total_reward,
-                "length": outcome.length,
-                "terms": outcome.terms,
-                "metrics": outcome.metrics,
-                "final_distance": outcome.final_distance,
-            }
-            for index, outcome in enumerate(episode.result for episode in result.played)
-        ],
+        "episodes": result.rows(),
     }
     if result.spec.stage:
         content["stage"] = result.spec.stage
@@ -123,3 +123,163 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         }
     plain: dict[str, Any] = to_jsonable_python(content)
     return plain
+
+
+def describe_score(score: MeasuredScore) -> str:
+    """Return `success 100.0% (96.3% to 100.0%), return 96.7 (95.1 to 98.2), action change 0.031`."""
+    outcome = Outcome(
+        success_rate=score.success,
+        success_interval=score.success_interval,
+        mean_return=score.mean_return,
+        return_interval=score.return_interval,
+    )
+    early = "" if score.ended_early is None else f", {score.ended_early:.0%} ended early"
+    return f"{_format_outcome(outcome)}{early}, action change {score.action_change:.3f}"
+
+
+def _format_outcome(outcome: Outcome) -> str:
+    """Return `success 97.0% (91.5% to 99.0%), return 123 (119 to 127)`."""
+    rate, interval = outcome.success_rate, _format_interval(outcome.success_interval, percent=True)
+    success = "" if rate is None else f"success {rate:.1%} ({interval}), "
+    return f"{success}return {outcome.mean_return:.4g} ({_format_interval(outcome.return_interval)})"
+
+
+def _format_interval(interval: Interval | None, *, percent: bool = False) -> str:
+    if interval is None:
+        return "-"
+    low, high = interval
+    return f"{low:.1%} to {high:.1%}" if percent else f"{low:.4g} to {high:.4g}"
+
+
+def show_group(result: GroupScore, json: str | None) -> None:
+    """Print a row per seed, then mean, IQM and standard deviation; or JSON alone for `-`."""
+    if output.present(group_as_json(result), json):
+        return
+    out = output.out()
+    scores = [seed.score for seed in result.seeds if seed.score is not None]
+    episodes = f", {output.format_count(scores[0].episodes, 'episode')} each, seed {scores[0].seed}" if scores else ""
+    seeds = output.format_count(len(result.seeds), "seed")
+    out.print(f"{result.group.task}: {result.group.path}, {seeds}{episodes}")
+    success, returns = result.spread("success"), result.spread("mean_return")
+    rows = [_list_cells(seed) for seed in result.seeds]
+    for label in ("mean", "IQM", "std"):
+        rate, value = (None if spread is None else getattr(spread, label.lower()) for spread in (success, returns))
+        rows.append((label, "-" if rate is None else f"{rate:.1%}", "-" if value is None else f"{value:.4g}"))
+    output.print_table(("seed", "success", "return", "steps", "seconds", ""), rows, left=("",))
+
+
+def _list_cells(seed: SeedScore) -> tuple[str, ...]:
+    score = seed.score
+    return (
+        str(seed.seed),
+        "-" if score is None or score.success is None else f"{score.success:.1%}",
+        "-" if score is None else f"{score.mean_return:.4g}",
+        "-" if seed.steps is None else f"{seed.steps:,}",
+        "-" if seed.seconds is None else f"{seed.seconds:.0f}",
+        seed.problem,
+    )
+
+
+def show_robustness(result: Robustness, json: str | None) -> None:
+    """Print the maps and the push, or JSON alone for `-`."""
+    if output.present(result.model_dump(mode="json"), json):
+        return
+    out = output.out()
+    out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})")
+    mode = "" if result.deterministic else ", sampled actions"
+    out.print(
+        f"{output.format_count(result.episodes, 'episode')} in every cell, the same seeds (seed {result.seed}){mode}"
+    )
+    out.print(f"nominal: {_format_outcome(result.nominal)}")
+    worst = result.find_worst()
+    for varied in result.maps:
+        out.print()
+        _show_map(varied, worst[1] if worst else None)
+    if worst is not None:
+        varied, cell = worst
+        out.print(f"\nworst: {varied.name_cell(cell)}: {_format_outcome(cell)}")
+        out.print(f"to play only these episodes: {format_command(result, varied, cell)}")
+    if result.push is not None:
+        out.print()
+        _show_push(result.push)
+
+
+def _show_map(varied: RobustnessMap, worst: Cell | None) -> None:
+    out = output.out()
+    columns, rows = len(varied.axes[-1].values), len(varied.cells) // len(varied.axes[-1].values)
+    if len(varied.axes) == 1 and columns <= _MOST_ROWS:
+        _show_list(varied, worst)
+    elif columns <= _MOST_COLUMNS and rows <= _MOST_ROWS:
+        _show_grid(varied, worst)
+    else:
+        names = " x ".join(axis.name for axis in varied.axes)
+        out.print(f"{names}: {len(varied.cells):,} cells, too many to draw; --json FILE writes all of them")
+
+
+def _show_list(varied: RobustnessMap, worst: Cell | None) -> None:
+    has_success = varied.cells[0].success_rate is not None
+    successes = ("success", "95 % interval") if has_success else ()
+    rows = []
+    for cell, color in zip(varied.cells, _color_cells(varied), strict=True):
+        cells: list[str | Text] = [f"{cell.values[0]:g}"]
+        if cell.success_rate is not None:
+            cells += [_paint(f"{cell.success_rate:.1%}", color), _format_interval(cell.success_interval, percent=True)]
+        value = f"{cell.mean_return:.4g}"
+        cells += [value if has_success else _paint(value, color), _format_interval(cell.return_interval)]
+        marks = [*(["nominal"] if cell.nominal else []), *(["worst"] if cell is worst else [])]
+        rows.append([*cells, ", ".join(marks)])
+    output.print_table((varied.axes[0].name, *successes, "return", "95 % interval", ""), rows, left=("",))
+
+
+def _show_grid(varied: RobustnessMap, worst: Cell | None) -> None:
+    """Print a heat map: the first axis downwards, the second across."""
+    down, across = varied.axes
+    has_success = varied.cells[0].success_rate is not None
+    cells = list(zip(varied.cells, _color_cells(varied), strict=True))
+    width = len(across.values)
+    rows: list[list[str | Text]] = [
+        [f"{value:.3g} ", *(_draw_cell(cell, color, cell is worst) for cell, color in cells[start : start + width])]
+        for value, start in zip(down.values, range(0, len(cells), width), strict=True)
+    ]
+    columns = [f"{down.name} \\ {across.name} ", *(f" {value:.3g} " for value in across.values)]
+    output.print_table(columns, rows, gap="")
+    out = output.out()
+    marks = [*([f"{_NOMINAL} nominal"] if any(cell.nominal for cell in varied.cells) else []), f"{_WORST} worst"]
+    out.print(f"{'success [%]' if has_success else 'mean return'}; {', '.join(marks)}")
+
+
+def _draw_cell(cell: Cell, color: str, is_worst: bool) -> Text:
+    text = f"{cell.mean_return:.3g}" if cell.success_rate is None else f"{100 * cell.success_rate:.0f}"
+    mark = f"{_NOMINAL if cell.nominal else ''}{_WORST if is_worst else ''}"
+    return _paint(f" {text}{mark or ' '}", color)
+
+
+def _paint(text: str, color: str) -> Text:
+    from rich.text import Text
+
+    return Text(text, style=f"black on {color}")
+
+
+def _color_cells(varied: RobustnessMap) -> list[str]:
+    """Return a colour per cell, from red over yellow to green: of success rates from 0 to 1, else of the returns."""
+    rates = [cell.success_rate for cell in varied.cells]
+    returns = [cell.mean_return for cell in varied.cells]
+    low, high = min(returns), max(returns)
+    parts = [
+        (mean - low) / (high - low or 1.0) if rate is None else rate for rate, mean in zip(rates, returns, strict=True)
+    ]
+    return [f"rgb({min(255, round(510 * (1 - part)))},{min(255, round(510 * part))},80)" for part in parts]
+
+
+def _show_push(push: PushTest) -> None:
+    out = output.out()
+    target = push.body if push.link is None else f"{push.link} of {push.body}"
+    out.print(f"push on {target} in the middle of the episode, {push.duration_s:g} s, from a random direction")
+    held = "success" if push.measure == "success" else "reached the time limit"
+    speeds = [level.impulse / push.mass if push.mass else 0.0 for level in push.levels]
+    rows = [
+        (f"{level.impulse:.3g}", f"{speed:.2g}", f"{level.held:.1%}", f"{level.mean_return:.4g}")
+        for level, speed in zip(push.levels, speeds, strict=True)
+    ]
+    output.print_table(("push [N s]", "speed change [m/s]", held, "return"), rows)
+    out.print(push.verdict)

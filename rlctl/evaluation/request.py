@@ -1,4 +1,4 @@
-"""What an evaluation is asked for: the arguments of `rlctl eval` as data. Imports nothing heavy."""
+"""The arguments of `rlctl eval` as data. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class EvalOptions:
-    """The arguments of `rlctl eval` that say what is played, and how."""
+    """The arguments of `rlctl eval` that choose the policy and its episodes."""
 
     run: Annotated[
         str | None,
         Argument("Run folder, policy file, task name, or latest.", completes="run", default_text="latest"),
     ] = None
-    """The task, where `baseline` is given."""
+    """With `baseline`, the name of a task."""
     task: Annotated[str | None, Option("Evaluate on this task instead of the one it was trained on.")] = None
     checkpoint: Annotated[str, Option("Which policy of the run.", metavar="best|last|STEP")] = "best"
     baseline: Annotated[
@@ -34,18 +34,16 @@ class EvalOptions:
     """What to play instead of a trained policy."""
     episodes: Annotated[int, Option("Episodes, each with its own seed.", min=1)] = 100
     seed: Annotated[int, Option("Seed of the list of episodes.", min=0)] = 0
-    stage: Annotated[
-        int | None, Option("Stage of the curriculum it was trained in.", min=1, default_text="the last")
-    ] = None
+    stage: Annotated[int | None, Option("Stage of the policy's curriculum.", min=1, default_text="the last")] = None
     """From 1."""
     deterministic: Annotated[bool, Option("Sample actions instead of taking the mean.", (" /--stochastic",))] = True
-    n_envs: Annotated[int | None, Option("Environments stepped side by side.", min=1)] = None
-    limits: Annotated[
-        Path | None, Option("Say what these safety limits (YAML) cost, and how often they act.", metavar="FILE")
-    ] = None
-    """Limits that the policy acts within; it is evaluated without them too."""
+    n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
+    limits: Annotated[Path | None, Option("Compare with and without these safety limits (YAML).", metavar="FILE")] = (
+        None
+    )
+    """Limits on the policy's actions; it is also evaluated without them."""
     env_timeout_s: Annotated[
-        float, Option("How long a step or reset may take.", ("--env-timeout",), metavar="SECONDS", min=0.1)
+        float, Option("Time limit of a step or reset.", ("--env-timeout",), metavar="SECONDS", min=0.1)
     ] = 60.0
 
 
@@ -61,6 +59,6 @@ class EvalRequest(EvalOptions):
 
     changes: EnvChanges = dataclasses.field(default_factory=_change_nothing)
     spec: EnvSpec | None = None
-    """What to play in, where it is not what the policy, or for a baseline the task's recipe, was trained in."""
+    """Default: the environment of the policy's training, or for a baseline of the task's recipe."""
     measure_actions: bool = False
-    """Whether to measure how much actions change, for which episodes are kept in memory."""
+    """Whether to measure how much actions change; all episodes are then kept in memory."""

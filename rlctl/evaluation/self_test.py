@@ -1,4 +1,4 @@
-"""`rlctl serve --self-test`: does a policy do through its server, in simulation, what it does without?"""
+"""`rlctl serve --self-test`: does a policy score the same in simulation with and without its server?"""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rlctl.rollout.workers import available_cores
 
 @dataclasses.dataclass(frozen=True)
 class SelfTest:
-    """What a policy reached with and without its server, and how long answers took."""
+    """The scores of a policy with and without its server, and how long answers took."""
 
     direct: Evaluation
     served: Evaluation
@@ -36,10 +36,10 @@ class SelfTest:
     not_running: int
     """Answers of a server that held or stopped."""
     load: float
-    """Programs that wanted a core in the last minute, those of the test among them."""
+    """Load average of the last minute, which includes the test."""
 
     def list_problems(self) -> list[str]:
-        """Return why the server is not good enough; none if it is."""
+        """Return why the self-test fails; empty if it passes."""
         problems = []
         rate, interval = self.served.success_rate, self.direct.success_interval
         if rate is not None and interval is not None and not interval[0] <= rate <= interval[1]:
@@ -48,12 +48,12 @@ class SelfTest:
                 f"(95 % interval {interval[0]:.1%} to {interval[1]:.1%})"
             )
         if self.not_running:
-            problems.append(f"{self.not_running:,} answers while holding or stopped")
+            problems.append(f"{self.not_running:,} answers came while the server was holding or stopped")
         if self.control_dt is not None and self.round_trip_p99_s >= self.control_dt:
             problems.append(f"p99 {self.round_trip_p99_s * 1e3:.3g} ms is not below control_dt, {self.control_dt:g} s")
         if self.misses:
             busy = self.load > available_cores()
-            hint = f"; other programs ran beside the test (load {self.load:.1f}): again without them?" if busy else ""
+            hint = f"; other programs were running (load {self.load:.1f}): repeat without them" if busy else ""
             problems.append(f"{self.misses:,} of {self.requests:,} answers took longer than control_dt{hint}")
         return problems
 
@@ -64,7 +64,7 @@ class SelfTest:
 
 
 def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
-    """Evaluate a policy without a server, then through `server`, which listens on a free port meanwhile.
+    """Evaluate a policy without a server, then through `server`, which listens on a free port during the test.
 
     Both act within the request's limits, on the same episodes.
     """
@@ -89,7 +89,7 @@ def run_self_test(server: PolicyServer, request: EvalRequest) -> SelfTest:
                 spec=direct.spec,
                 episodes=request.episodes,
                 seed=request.seed,
-                n_envs=1,  # as one robot: simulations beside it would take the server's time
+                n_envs=1,  # like one robot; more simulations would slow down the server
                 env_timeout_s=request.env_timeout_s,
             )
         )

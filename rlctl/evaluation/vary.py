@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import json
 import shlex
 import sys
 import time
@@ -12,20 +13,26 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rlctl import output
+from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation import axes as axes_of
-from rlctl.evaluation.cells import CellPlayer
 from rlctl.evaluation.episode_statistics import summarize
-from rlctl.evaluation.evaluate import NO_GATES, Gates, find_player, start_workers
+from rlctl.evaluation.evaluate import NO_GATES, Gates, start_workers
+from rlctl.evaluation.players import LoadedPolicy, find_player
 from rlctl.evaluation.push import measure_push
 from rlctl.evaluation.request import EvalRequest
+from rlctl.policy.players.player import Exploration
+from rlctl.rollout.collect import play_episodes
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.rollout.workers import Workers
 from rlctl.run import robustness
 from rlctl.run.robustness import Axis, Cell, Robustness, RobustnessMap
 from rlctl.version import collect_versions
 
 ASK_ABOVE_S = 600.0
-"""A measurement that takes longer than this [s] is begun only after asking."""
+"""rlctl asks before it starts a measurement that takes longer than this [s]."""
 
 
 def measure_robustness(
@@ -37,20 +44,20 @@ def measure_robustness(
     yes: bool = False,
     gates: Gates = NO_GATES,
 ) -> Robustness:
-    """Measure a policy in every cell of the maps that `vary` asks for, and with pushes, and keep the result in its run.
+    """Measure a policy in every cell of the maps of `vary`, and with pushes, and store the result in its run.
 
     `vary` is `NAME=LOWEST:HIGHEST:VALUES`, one or two, or `all`. `sim` is `mujoco`, or `mujoco:SOLREF` with a time
-    constant of contacts [s]: the same episodes in another physics engine. `yes` begins a long measurement unasked.
-    Random changes that the policy was trained with do not act, unless the request's own changes say so.
+    constant of contacts [s]: the same episodes in another physics engine. `yes` starts a long
+    measurement without asking. Domain randomization is off, unless the request's own changes turn it on.
     """
     if request.changes.randomize is None:
         request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
-    found, policy, spec = find_player(request)
+    source, policy, spec = find_player(request)
     maps = axes_of.read_axes(vary, spec) if vary else []
     if sim is not None:
-        dataclasses.replace(spec, sim=sim).make().close()  # raises, before anything is played, for what MuJoCo has not
+        dataclasses.replace(spec, sim=sim).make().close()  # raises for what MuJoCo cannot build
         maps.append([axes_of.make_contact_axis(sim)])
-    cells = axes_of.count_cells(maps)  # raises for too many, before one is played
+    cells = axes_of.count_cells(maps)  # raises for too many
     with start_workers(spec, request) as workers:
         policy.give_to(workers)
         player = CellPlayer(workers, policy, request)
@@ -62,13 +69,13 @@ def measure_robustness(
         with output.show_progress("varying", cells) as show:
             done = itertools.count(1)
             measured = [_play_map(player, spec, axes, lambda: show(next(done))) for axes in maps]
-        pushed = measure_push(player, spec, episodes) if push else None
+        pushed = measure_push(spec, episodes, lambda force: player.play(spec, force)) if push else None
     result = Robustness(
         task=spec.task,
         parameters=dict(spec.parameters),
         reward_weights=dict(spec.reward_weights),
         events={name: dict(event) for name, event in spec.events.items()},
-        policy_file=str(found.file),
+        policy_file=str(source.file),
         algo=policy.info.algo,
         training_steps=policy.info.training_steps,
         episodes=request.episodes,
@@ -80,23 +87,44 @@ def measure_robustness(
         command=shlex.join(["rlctl", *sys.argv[1:]]),
         versions=collect_versions(),
     )
-    if found.run is not None and request.task in (None, policy.info.spec.task):
-        _keep(found.run.robustness_file, result)
+    if source.run is not None and request.task in (None, policy.info.spec.task):
+        _store(source.run.robustness_file, result)
     return result
 
 
+class CellPlayer:
+    """Plays the same episodes in one setting after another, with the same workers."""
+
+    def __init__(self, workers: Workers, policy: LoadedPolicy, request: EvalRequest) -> None:
+        self.workers = workers
+        self._policy = policy
+        self._seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
+        self._exploration = Exploration(stochastic=not request.deterministic)
+        self._has_events = is_task(workers.spec.constructor())
+
+    def play(self, spec: EnvSpec, push: dict[str, object] | None = None) -> list[EpisodeResult]:
+        """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`."""
+        workers = self.workers
+        if (spec.parameters, spec.sim) != (workers.spec.parameters, workers.spec.sim):
+            workers.rebuild(spec)
+            self._policy.give_to(workers)
+        if self._has_events:
+            workers.set_events(spec, push)
+        return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration)]
+
+
 def _play_map(player: CellPlayer, spec: EnvSpec, axes: list[Axis], on_cell: Callable[[], None]) -> RobustnessMap:
-    places = list(itertools.product(*(axis.values for axis in axes)))
-    specs = [_apply(axes, values, spec) for values in places]
+    combinations = list(itertools.product(*(axis.values for axis in axes)))
+    specs = [_apply(axes, values, spec) for values in combinations]
     cells: dict[int, Cell] = {}
-    # Another parameter of the task means other worlds: cells that share it are played one after the other.
-    for index in sorted(range(len(places)), key=lambda index: sorted(specs[index].parameters.items(), key=repr)):
+    # Each value of a task parameter needs a new world, so cells with equal parameters are played one after another.
+    for index in sorted(range(len(combinations)), key=lambda index: sorted(specs[index].parameters.items(), key=repr)):
         outcome = summarize(player.play(specs[index]))
         cells[index] = Cell(
-            **outcome.model_dump(), values=list(places[index]), nominal=_is_nominal(axes, places[index])
+            **outcome.model_dump(), values=list(combinations[index]), nominal=_is_nominal(axes, combinations[index])
         )
         on_cell()
-    return RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(places))])
+    return RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(combinations))])
 
 
 def _apply(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> EnvSpec:
@@ -114,25 +142,24 @@ def _is_nominal(axes: Sequence[Axis], values: Sequence[float]) -> bool:
 
 
 def _ask(cells: int, seconds: float, yes: bool) -> None:
-    """Say how long many cells will take and ask whether to begin; raises `UsageError` where nobody can be asked."""
+    """Ask before a long measurement; raises `UsageError` without a terminal."""
     total = cells * seconds
     if yes or total <= ASK_ABOVE_S:
         return
     duration = output.format_duration(total)
     expected = f"{cells:,} cells will take about {duration}: the nominal one took {seconds:.1f} s"
-    refusal = f"--vary: {expected}; take fewer values or --episodes, or begin all the same: --yes"
-    if not output.confirm(f"{expected}; begin?", refusal):
-        raise UsageError("--vary: not begun")
+    refusal = f"--vary: {expected}; use fewer values or --episodes, or start anyway with --yes"
+    if not output.confirm(f"{expected}; start?", refusal):
+        raise UsageError("--vary: not started")
 
 
-def _keep(file: Path, result: Robustness) -> None:
-    """Write the result into its run, with what was measured before of the same policy in the same way."""
+def _store(file: Path, result: Robustness) -> None:
+    """Write the result into its run; maps and pushes of the same policy that were not measured again stay."""
     with contextlib.suppress(ArtifactError):
         before = robustness.read(file)
         measured = {"nominal", "maps", "push", "command", "versions"}
         if before.model_dump(mode="json", exclude=measured) == result.model_dump(mode="json", exclude=measured):
-            kept = {"maps": result.maps or before.maps, "push": result.push or before.push}
-            result = result.model_copy(update=kept)
+            result = result.model_copy(update={"maps": result.maps or before.maps, "push": result.push or before.push})
     try:
         robustness.write(file, result)
     except OSError as error:
@@ -145,3 +172,23 @@ def check_gates(result: Robustness, gates: Gates) -> None:
     where, outcome = ("nominal", result.nominal) if worst is None else (worst[0].name_cell(worst[1]), worst[1])
     if missed := gates.list_missed(outcome.success_rate, outcome.success_interval, outcome.mean_return):
         raise AnswerIsNo(f"gate missed in the worst cell, {where}: " + "; ".join(missed))
+
+
+def format_command(result: Robustness, varied: RobustnessMap, cell: Cell) -> str:
+    """Return the command that plays the episodes of one cell."""
+    settings = {f"task.{name}": json.dumps(value) for name, value in result.parameters.items()}
+    settings |= {f"reward_weights.{name}": json.dumps(value) for name, value in result.reward_weights.items()}
+    for name, event in result.events.items():
+        settings |= {f"events.{name}.{key}": json.dumps(value) for key, value in event.items()} or {
+            f"events.{name}": "{}"
+        }
+    settings["randomize"] = "false"
+    engine = []
+    for axis, value in zip(varied.axes, cell.values, strict=True):
+        if axis.setting == axes_of.SIM:
+            engine = ["--sim", f"mujoco:{value:g}"]
+            continue
+        settings[axis.setting] = str(int(value) if value.is_integer() else value)
+    words = ["rlctl", "eval", result.policy_file, "--episodes", str(result.episodes), "--seed", str(result.seed)]
+    words += [*engine, *([] if result.deterministic else ["--stochastic"])]
+    return shlex.join([*words, *(word for key, value in settings.items() for word in ("--set", f"{key}={value}"))])

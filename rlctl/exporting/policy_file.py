@@ -11,8 +11,9 @@ from rich.filesize import decimal as format_bytes
 from rlctl import output
 from rlctl.environments.task_version import identify_task
 from rlctl.errors import UsageError
+from rlctl.evaluation.evaluate import measure_score
+from rlctl.evaluation.report import describe_score
 from rlctl.evaluation.request import EvalRequest
-from rlctl.evaluation.score import describe_score, measure_score
 from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.players.baselines import BASELINES

@@ -12,7 +12,7 @@ from rlctl import output
 from rlctl.environments.info import describe
 from rlctl.environments.spec import UNCHANGED, EnvSpec
 from rlctl.errors import UsageError
-from rlctl.evaluation.evaluate import LoadedPolicy, load_player
+from rlctl.evaluation.players import LoadedPolicy, load_player
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.recipe.sources import parse_changes
 from rlctl.replaying.film import check_file, film_episodes, make_filmable

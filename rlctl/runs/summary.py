@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.errors import ArtifactError
+from rlctl.policy.file import Score
 from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
 from rlctl.run.group import find_run_of_seed
 from rlctl.run.job import list_jobs, read_job
@@ -20,6 +21,8 @@ Rows = list[dict[str, float | None]]
 """Of a table, oldest first; an empty field is None."""
 _LARGEST = 1e100
 """No training has larger numbers; what draws and adds them would overflow."""
+_STANDARD_ERRORS = 1.645
+"""A success rate is lower beyond this many standard errors: 5 % of equal policies count as lower (one-sided)."""
 _TAIL_BYTES = 4096
 """The last row of a table is looked for here; a row has at most some hundred bytes."""
 
@@ -68,7 +71,8 @@ class RunSummary:
     @property
     def score(self) -> tuple[float, float]:
         """Return what to rank runs of one task by: success first, then return."""
-        return _score(self.best_success, self.best_return)
+        success, mean_return = self.best_success, self.best_return
+        return -math.inf if success is None else success, -math.inf if mean_return is None else mean_return
 
 
 def find_runs(root: Path = ROOT) -> Iterator[Path]:
@@ -107,7 +111,7 @@ def summarize(path: Path) -> RunSummary:
 def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
     last = last_row(run.metrics_file) or {}
     evaluations = read_table(run.evals_file)
-    best = best_row(evaluations)
+    best = find_best_row(evaluations)
     if status.get("status") == "finished":  # new episodes may have decided for the last policy
         best = next((row for row in evaluations if row["steps"] == status.get("best_step")), best)
     state, reason = _state(run, status)
@@ -216,14 +220,41 @@ def list_points(rows: Rows, column: str) -> list[tuple[float, float]]:
     ]
 
 
-def best_row(rows: Rows) -> dict[str, float | None] | None:
-    """Return the evaluation with the best success, then return."""
-    scored = [row for row in rows if row.get("return") is not None]
-    return max(scored, key=lambda row: _score(row.get("success"), row["return"]), default=None)
+def is_lower(success: float, highest: float, episodes: float) -> bool:
+    """Say whether a success rate is lower than the highest by more than chance, both of so many episodes."""
+    pooled = (success + highest) / 2
+    standard_error = math.sqrt(max(2 * pooled * (1 - pooled), 0.0) / max(episodes, 1))
+    return highest - success > _STANDARD_ERRORS * standard_error
 
 
-def _score(success: float | None, total_reward: float | None) -> tuple[float, float]:
-    return -math.inf if success is None else success, -math.inf if total_reward is None else total_reward
+def is_better(new: Score, best: Score | None, highest: float, episodes: float) -> bool:
+    """Say whether a policy is better than the best so far: by success, and by return where success cannot tell.
+
+    `highest` is the highest success rate so far, in [0, 1]. Success cannot tell where neither rate is lower than it by
+    more than chance; comparing with the highest keeps many small losses from adding up.
+    """
+    if best is None:
+        return True
+    if new.success is None or best.success is None:
+        return new.mean_return > best.mean_return
+    highest = max(highest, new.success)
+    new_is_lower, best_is_lower = (is_lower(score.success or 0.0, highest, episodes) for score in (new, best))
+    if new_is_lower != best_is_lower:
+        return best_is_lower
+    return (new.mean_return, new.success) > (best.mean_return, best.success)
+
+
+def find_best_row(rows: Rows) -> dict[str, float | None] | None:
+    """Return the evaluation whose policy the training has kept as the best; None where no row has a return."""
+    best_row, best_score, highest = None, None, 0.0
+    for row in rows:
+        if (mean_return := row.get("return")) is None:
+            continue
+        score = Score(success=row.get("success"), mean_return=mean_return)
+        if is_better(score, best_score, highest, row.get("episodes") or 1):
+            best_row, best_score = row, score
+        highest = max(highest, score.success or 0.0)
+    return best_row
 
 
 def last_row(path: Path) -> dict[str, str] | None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rlctl import output
-from rlctl.evaluation.score import describe_score
+from rlctl.evaluation.report import describe_score
 from rlctl.policy.file import PolicyInfo
 from rlctl.recipe.stages import Stage
 from rlctl.tasks.description import Description

@@ -12,7 +12,7 @@ from typing import Any
 
 from rlctl import output
 from rlctl.run.directory import RunDirectory
-from rlctl.runs.summary import best_row, read_table
+from rlctl.runs.summary import find_best_row, read_table
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _ASCII_BLOCKS = "_.-=+*#@"
@@ -159,7 +159,7 @@ class LiveDisplay(Display):
             for row in read_table(run.metrics_file):
                 self._add_to_curves(row)
             evaluations = read_table(run.evals_file)
-            best = best_row(evaluations)
+            best = find_best_row(evaluations)
             for row in evaluations:
                 steps, success, mean = row.get("steps"), row.get("success"), row.get("return")
                 if steps is not None and mean is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 from rlctl.errors import ArtifactError, RlctlError, TaskError, UsageError
@@ -10,7 +9,7 @@ from rlctl.evaluation.episode_statistics import mean_return, success_rate
 from rlctl.policy.file import PolicyFile, PolicyInfo, Score
 from rlctl.rollout.collect import Episode
 from rlctl.runs.diagnosis import Grade, diagnose
-from rlctl.runs.summary import read_table
+from rlctl.runs.summary import is_better, read_table
 from rlctl.training import measurements
 from rlctl.training.checkpoints import Checkpoints
 from rlctl.training.display import Display, format_score
@@ -19,32 +18,6 @@ from rlctl.training.learner import Learner
 
 _FINAL_EPISODES = 30
 """At least so many new episodes decide between the best policy and the last."""
-_STANDARD_ERRORS = 1.645
-"""Beyond so many a success rate is lower: 5 % of equal policies are taken for worse (one-sided)."""
-
-
-def is_lower(success: float, highest: float, episodes: int) -> bool:
-    """Say whether a success rate is lower than the highest by more than chance, both of so many episodes."""
-    both = (success + highest) / 2
-    standard_error = math.sqrt(2 * both * (1 - both) / episodes)
-    return highest - success > _STANDARD_ERRORS * standard_error
-
-
-def is_better(new: Score, best: Score | None, highest: float, episodes: int) -> bool:
-    """Say whether a policy is better than the best so far: by success, and by return where success cannot tell.
-
-    Success cannot tell where neither rate is lower than the highest one so far, `highest`, by more than chance; so a
-    row of small losses cannot add up.
-    """
-    if best is None:
-        return True
-    if new.success is None or best.success is None:
-        return new.mean_return > best.mean_return
-    highest = max(highest, new.success)
-    new_is_lower, best_is_lower = (is_lower(score.success or 0.0, highest, episodes) for score in (new, best))
-    if new_is_lower != best_is_lower:
-        return best_is_lower
-    return (new.mean_return, new.success) > (best.mean_return, best.success)
 
 
 class Evaluator:

@@ -8,8 +8,8 @@ from rlctl.deploy.identify.follow import describe_expected, open_world
 from rlctl.deploy.identify.identify import identify
 from rlctl.deploy.identify.log import Log, read_log, write_log
 from rlctl.environments.spec import EnvChanges, EnvSpec
+from rlctl.evaluation.evaluate import measure_score
 from rlctl.evaluation.request import EvalRequest
-from rlctl.evaluation.score import measure_score
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.request import run_training
 from tests.training.comparing import rows

@@ -8,11 +8,10 @@ import pytest
 from rlctl.environments.spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.episode_statistics import Spread, mean_terms, success_interval, success_rate
-from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.evaluate import Gates, measure_score, run_evaluation
 from rlctl.evaluation.group import GroupScore, SeedScore
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.request import EvalRequest
-from rlctl.evaluation.score import measure_score
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.train_request import TrainRequest
 from rlctl.runs.summary import read_table

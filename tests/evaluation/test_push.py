@@ -1,4 +1,4 @@
-"""`rlctl eval --push`: from which push on a policy fails."""
+"""`rlctl eval --push`: the smallest push at which a policy fails."""
 
 import math
 
@@ -27,7 +27,7 @@ def test_the_threshold_by_hand_and_beside_a_map(block_run):
     assert (found.body, found.link, found.mass, found.measure) == ("block", None, pytest.approx(0.1), "success")
     assert 0.1 < found.threshold < 0.15
     assert found.threshold_interval[0] <= found.threshold <= found.threshold_interval[1]
-    assert found.verdict.startswith("half of the episodes fail from a push of 0.1")
+    assert found.verdict.startswith("half of the episodes fail at a push of 0.1")
     assert [level.impulse for level in found.levels] == sorted(level.impulse for level in found.levels)
     assert found.levels[0].held == 1.0
     kept = read(block_run.robustness_file)
@@ -46,7 +46,7 @@ def test_cannot_tell(block_run, tmp_path):
 
     never = push(block_run, changes=EnvChanges({"limit": 0.0}))
     assert never.threshold is None
-    assert never.verdict == "cannot tell: without a push 0% of the episodes succeed"
+    assert never.verdict == "cannot tell: without a push only 0% of the episodes succeed"
     assert len(never.levels) == 1
     always = push(write_run(tmp_path / "run", f"{ENVS}:Lost"), changes=EnvChanges({"limit": math.inf}))
     assert always.verdict == "cannot tell: this task reports no success, and no episode ended early"
@@ -61,7 +61,7 @@ def test_trunks_of_robots():
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        ("reach", "reach has no base that could be pushed: arm is fixed to the world"),
+        ("reach", "reach has no movable base: arm is fixed to the world"),
         ("Pendulum-v1", "Pendulum-v1 is a plain Gymnasium environment"),
     ],
 )

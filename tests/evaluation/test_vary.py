@@ -11,8 +11,7 @@ from rlctl.evaluation.axes import change, read_axes
 from rlctl.evaluation.episode_statistics import mean_interval
 from rlctl.evaluation.evaluate import Gates, run_evaluation
 from rlctl.evaluation.request import EvalRequest
-from rlctl.evaluation.robustness_report import format_command
-from rlctl.evaluation.vary import check_gates, measure_robustness
+from rlctl.evaluation.vary import check_gates, format_command, measure_robustness
 from rlctl.output import format_duration
 from rlctl.run.robustness import read
 from tests.evaluation.conftest import ENVS, write_run
@@ -95,7 +94,7 @@ def test_command_line_draws_the_map_and_gates_the_worst_cell(rlctl, block_run):
     ]
     assert lines[9].startswith("worst: push 6, mass 1: success 0.0% (0.0% to 70.8%), return -")
     assert lines[10] == (
-        f"the same episodes alone: rlctl eval {block_run.best_policy} --episodes 3 --seed 0 "
+        f"to play only these episodes: rlctl eval {block_run.best_policy} --episodes 3 --seed 0 "
         "--set randomize=false --set events.push.force=6 --set events.mass.factor=1"
     )
 
@@ -130,9 +129,7 @@ def test_command_line_as_json(rlctl, block_run):
 
 def test_a_long_measurement_is_not_begun_unasked(block_run):
     vary = ["push=0:3:1000", "mass=1:2:1000"]
-    with pytest.raises(
-        UsageError, match=r"1,000,000 cells will take about [\d.]+ (h|days): .*begin all the same: --yes"
-    ):
+    with pytest.raises(UsageError, match=r"1,000,000 cells will take about [\d.]+ (h|days): .*start anyway with --yes"):
         measure_robustness(EvalRequest(str(block_run.path), episodes=2), vary)
     assert [format_duration(seconds) for seconds in (50, 600, 5400, 200_000)] == ["50 s", "10 min", "1.5 h", "2.3 days"]
 
@@ -171,17 +168,17 @@ def test_an_event_that_acts_has_no_nominal_value():
             r"no event or number of that name\. Did you mean 'mass'\? It has: mass, friction, push, limit",
         ),
         (["push.forces=0:2:4"], r"event 'push' draws force, duration_s\. Did you mean 'force'\?"),
-        (["mass=0.5:2:1"], "1 value; to evaluate at one, use --set"),
-        (["mass=2:2:4"], "2 to 2 is no range"),
-        (["mass=2:0.5:4"], "2 to 0.5 is no range"),
-        (["mass=nan:2:4"], "nan to 2 is no range"),
+        (["mass=0.5:2:1"], "an axis needs two or more values"),
+        (["mass=2:2:4"], "2 to 2 is not a range"),
+        (["mass=2:0.5:4"], "2 to 0.5 is not a range"),
+        (["mass=nan:2:4"], "nan to 2 is not a range"),
         (["mass=0.5:2"], "write NAME=LOWEST:HIGHEST:VALUES"),
         (["mass"], "write NAME=LOWEST:HIGHEST:VALUES"),
         (["mass=-1:2:4"], "-1 is not above 0"),
         (["mass=1:2:9999999"], "at most 1,000,000 values"),
-        (["mass=1:2:2", "push=0:1:2", "friction=0:1:2"], "one or two things"),
-        (["all", "push=0:1:2"], "one or two things"),
-        (["mass=1:2:2", "mass.factor=1:2:2"], "events.mass.factor is there twice"),
+        (["mass=1:2:2", "push=0:1:2", "friction=0:1:2"], "one or two axes"),
+        (["all", "push=0:1:2"], "one or two axes"),
+        (["mass=1:2:2", "mass.factor=1:2:2"], "events.mass.factor is given twice"),
     ],
 )
 def test_bad_maps(vary, message):
@@ -192,7 +189,7 @@ def test_bad_maps(vary, message):
 def test_plain_environments_have_parameters_only():
     (axis,) = read_axes(["g=9:11:3"], EnvSpec("Pendulum-v1"))[0]
     assert (axis.setting, axis.nominal, axis.whole) == ("task.g", 10.0, False)
-    with pytest.raises(UsageError, match="Pendulum-v1 offers no events; name one of its parameters"):
+    with pytest.raises(UsageError, match="Pendulum-v1 has no events; name one of its parameters"):
         read_axes(["all"], EnvSpec("Pendulum-v1"))
 
 

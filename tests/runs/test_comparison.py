@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec, merge
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.evaluation.evaluate import choose_spec, load_player
+from rlctl.evaluation.players import choose_spec, load_player
 from rlctl.evaluation.request import EvalRequest
 from rlctl.recipe.sources import resolve
 from rlctl.run.train_request import TrainRequest

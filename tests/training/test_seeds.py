@@ -124,6 +124,19 @@ def test_a_group_that_is_being_trained_is_not_removed(group):
         plan_removal([str(group.path)], root=group.path.parent.parent)
 
 
+def test_a_changed_task_is_one_warning_for_all_seeds(group, capsys):
+    runs = [group.find_run(seed) for seed in group.seeds]
+    digests = [run.status()["source_sha256"] for run in runs]
+    for run in runs:
+        run.write_status({"source_sha256": "0" * 64})
+    try:
+        evaluate_group(read_group(group.path), EvalRequest(None, episodes=2))
+    finally:
+        for run, digest in zip(runs, digests, strict=True):
+            run.write_status({"source_sha256": digest})
+    assert capsys.readouterr().err.count("warning: ") == 1
+
+
 def test_what_is_done_stays_and_a_damaged_run_stops_no_other(group, tmp_path):
     file = group.find_run(5).status_file
     content = file.read_text()
@@ -136,9 +149,9 @@ def test_what_is_done_stays_and_a_damaged_run_stops_no_other(group, tmp_path):
             result.check()
         assert caught.value.exit_code == 5
         scores = evaluate_group(read_group(group.path), EvalRequest(None, episodes=2))
-        assert [each.score is None for each in scores.seeds] == [False, True]
+        assert [seed.score is None for seed in scores.seeds] == [False, True]
         assert "run.json: damaged" in as_json(scores)["seeds"][1]["problem"]
-        with pytest.raises(ArtifactError, match="1 of 2 seeds without a score, the first seed 5: "):
+        with pytest.raises(ArtifactError, match="1 of 2 seeds have no score; seed 5: "):
             scores.check(Gates())
     finally:
         file.write_text(content)

@@ -103,7 +103,7 @@ def test_a_baseline_is_evaluated_as_a_policy_is(functions):
 
 
 def test_what_a_baseline_does_not_take():
-    with pytest.raises(UsageError, match="nothing of a run: leave out --checkpoint, --pretrained"):
+    with pytest.raises(UsageError, match="not a run: leave out --checkpoint, --pretrained"):
         run_evaluation(EvalRequest("reach", baseline="zero", checkpoint="pretrained"), Gates())
     with pytest.raises(UsageError, match="give the task to play: rlctl eval reach --policy zero"):
         run_evaluation(EvalRequest(None, baseline="zero"), Gates())

@@ -3,7 +3,7 @@
 import pytest
 
 from rlctl.policy.file import Score
-from rlctl.training.evaluator import is_better, is_lower
+from rlctl.runs.summary import find_best_row, is_better, is_lower
 
 
 def score(successes, mean_return, episodes=30):
@@ -37,3 +37,20 @@ def test_what_is_lower_by_more_than_chance():
     assert not is_lower(28 / 30, 1.0, 30)
     assert is_lower(0.0, 1.0, 2)
     assert not is_lower(0.0, 1.0, 1)  # of one episode nothing can be told
+
+
+def test_the_best_row_is_of_the_policy_that_training_keeps():
+    # 1 and 2 of 30 are chance, so the return decides; 20 of 30 is higher than both.
+    rows = [
+        {"steps": 10.0, "episodes": 30.0, "success": 1 / 30, "return": 195.0},
+        {"steps": 20.0, "episodes": 30.0, "success": 2 / 30, "return": 86.0},
+    ]
+    assert find_best_row(rows) is rows[0]
+    rows.append({"steps": 30.0, "episodes": 30.0, "success": 20 / 30, "return": 1.0})
+    assert find_best_row(rows) is rows[2]
+    assert find_best_row([{"steps": 10.0, "return": None}]) is None
+
+
+def test_a_success_rate_above_1_in_a_damaged_table_raises_nothing():
+    rows = [{"success": 7.0, "return": 1.0, "episodes": 0.0}, {"success": -3.0, "return": 2.0, "episodes": 1.0}]
+    assert find_best_row(rows) is rows[0]

@@ -1,0 +1,133 @@
+"""The players of an evaluation, and the environment that each plays in."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rlctl import output
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import UsageError, explain_missing_package
+from rlctl.evaluation.request import EvalRequest
+from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.policy.numpy_policy import check_playable, load_policy
+from rlctl.policy.players.baselines import BASELINES, load_function
+from rlctl.policy.players.named import SERVER
+from rlctl.rollout.workers import Workers
+from rlctl.run import lookup
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedPolicy:
+    """A policy that workers can play."""
+
+    path: Path
+    info: PolicyInfo
+    policy: PolicyFile | None
+    """None for an exported file, which the workers load themselves."""
+
+    @property
+    def name(self) -> str:
+        """The file, as it is shown."""
+        return str(self.path)
+
+    def give_to(self, workers: Workers) -> None:
+        """Let workers act with the policy; raises `ArtifactError` if its spaces differ from the environment's."""
+        self.info.check_fits(workers.info, self.path)
+        if self.policy is None:
+            workers.set_other_policy(str(self.path.resolve()))
+        else:
+            workers.set_policy(self.policy)
+
+
+def load_player(path: Path, deterministic: bool) -> LoadedPolicy:
+    """Read a policy and check that it can act; raises `ArtifactError` for a damaged one."""
+    if path.suffix == ".onnx":
+        info = load_policy(path).info
+        if not deterministic:
+            raise UsageError("an exported policy cannot sample: the ONNX file contains only its deterministic action")
+        return LoadedPolicy(path, info, None)
+    policy = check_playable(PolicyFile.read(path))
+    return LoadedPolicy(path, policy.info, policy)
+
+
+def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:
+    """Return the environment to evaluate in: of the policy's task, another task, or a stage, with changes."""
+    if request.spec is not None:  # only the observation settings come from the policy
+        own = info.spec
+        return dataclasses.replace(request.spec, frame_stack=own.frame_stack, time_feature=own.time_feature)
+    if (stage := request.stage) is None:
+        return info.derive_spec(request.task, request.changes)
+    if request.task is not None and request.task != info.spec.task:
+        raise UsageError(f"--stage: the policy has only stages of {info.spec.task}; leave out --task")
+    if not info.stages:
+        raise UsageError(f"--stage {stage}: this policy was trained without stages; leave out --stage")
+    if not 1 <= stage <= len(info.stages):
+        count = len(info.stages)
+        raise UsageError(f"--stage {stage}: this policy was trained in {count} stages; give a number from 1 to {count}")
+    return request.changes.apply(info.stages[stage - 1])
+
+
+def find_player(
+    request: EvalRequest, print_notes: Callable[[Sequence[str]], None] = output.print_notes
+) -> tuple[lookup.FoundPolicy, LoadedPolicy, EnvSpec]:
+    """Find and read the policy of a request, and return it with the environment to evaluate it in.
+
+    `print_notes` prints which policy was chosen, and warnings about it.
+    """
+    source = lookup.find_policy(request.run, request.checkpoint)
+    print_notes(source.notes)
+    policy = load_player(source.file, request.deterministic)
+    return source, policy, source.locate(choose_spec(policy.info, request))
+
+
+@dataclasses.dataclass(frozen=True)
+class Baseline:
+    """Zero or random actions, a policy server, or a user's function, by the name that `make_player` takes."""
+
+    name: str
+    info: None = None
+
+    def give_to(self, workers: Workers) -> None:
+        """Let workers act with the baseline."""
+        workers.set_other_policy(self.name)
+
+
+def load_baseline(request: EvalRequest) -> Baseline:
+    """Return the baseline of a request; raises `UsageError` if it does not exist, and for options of a run."""
+    name = str(request.baseline)
+    if request.checkpoint != "best" or request.stage is not None or not request.deterministic or request.task:
+        raise UsageError(
+            f"--policy {name} plays a task, not a run: leave out --checkpoint, "
+            "--pretrained, --stage, --stochastic and --task"
+        )
+    if name in BASELINES:
+        return Baseline(name)
+    if name.startswith(SERVER):
+        _ask_server(name)
+        return Baseline(name)
+    load_function(name)  # raises before environments are built
+    place, _, function = name.rpartition(":")
+    return Baseline(f"{Path(place).expanduser().resolve()}:{function}" if place.endswith(".py") else name)
+
+
+def _ask_server(address: str) -> None:
+    """Raise `UsageError` if no policy server answers, before environments are built."""
+    try:
+        from rlctl.deploy.server.client import PolicyClient
+    except ModuleNotFoundError as error:
+        raise UsageError(explain_missing_package(f"--policy {address}", error.name, "serve")) from None
+    PolicyClient(address).close()
+
+
+def choose_task(request: EvalRequest) -> EnvSpec:
+    """Return the task of a request as its recipe would train it, in the last stage; observations are not stacked."""
+    if request.spec is not None:
+        return dataclasses.replace(request.spec, frame_stack=1, time_feature=False)
+    if request.run is None:
+        raise UsageError(f"--policy {request.baseline}: give the task to play: rlctl eval reach --policy zero")
+    from rlctl.recipe.sources import resolve_packaged
+
+    spec = resolve_packaged(request.run).env_specs(request.run)[-1]
+    return request.changes.apply(dataclasses.replace(spec, frame_stack=1, time_feature=False, stage=0))
