@@ -1,4 +1,4 @@
-"""The run folder: the only place that spells its file names."""
+"""The run folder. Only this module spells the names of its files."""
 
 from __future__ import annotations
 
@@ -28,9 +28,7 @@ _DIGITS = 18  # of a training step
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 
 
-class _Place:
-    """A file or folder below a run's own."""
-
+class _RunPath:
     def __init__(self, name: str) -> None:
         self._name = name
 
@@ -39,7 +37,7 @@ class _Place:
 
 
 class RunDirectory:
-    """What a training wrote, and where."""
+    """The folder of a training, with the paths of its files."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -51,29 +49,29 @@ class RunDirectory:
     def __repr__(self) -> str:
         return f"RunDirectory({str(self.path)!r})"
 
-    recipe_file = _Place("recipe.yaml")
+    recipe_file = _RunPath("recipe.yaml")
     """The resolved recipe."""
-    status_file = _Place("run.json")
+    status_file = _RunPath("run.json")
     """Status, versions, command line, times."""
-    metrics_file = _Place("metrics.csv")
+    metrics_file = _RunPath("metrics.csv")
     """A row per update."""
-    evals_file = _Place("evals.csv")
+    evals_file = _RunPath("evals.csv")
     """A row per evaluation."""
-    robustness_file = _Place("robustness.json")
+    robustness_file = _RunPath("robustness.json")
     """What `rlctl eval --vary` or `--push` measured last; see `rlctl.run.robustness`."""
-    best_policy = _Place("policies/best.safetensors")
+    best_policy = _RunPath("policies/best.safetensors")
     """The policy of the best evaluation."""
-    last_policy = _Place("policies/last.safetensors")
+    last_policy = _RunPath("policies/last.safetensors")
     """The policy at the end, or at the last checkpoint."""
-    claim_file = _Place(".claim")
+    claim_file = _RunPath(".claim")
     """The token of the process that may write the run."""
-    episodes = _Place("episodes")
+    episodes = _RunPath("episodes")
     """The folder of recorded episodes and recordings."""
-    tensorboard = _Place("tensorboard")
+    tensorboard = _RunPath("tensorboard")
     """The folder of TensorBoard files."""
-    onnx_file = _Place("exports/policy.onnx")
-    """Where an export goes by default."""
-    replay_segments = _Place("checkpoints/replay")
+    onnx_file = _RunPath("exports/policy.onnx")
+    """The default file of an export."""
+    replay_segments = _RunPath("checkpoints/replay")
     """The folder of the replay buffer that checkpoints share."""
 
     def checkpoint(self, steps: int) -> Path:
@@ -82,22 +80,19 @@ class RunDirectory:
 
     def checkpoints(self) -> list[Path]:
         """Return the folders of the complete checkpoints, oldest first."""
-        folder = self.path / "checkpoints"
-        if not folder.is_dir():
-            return []
-        return sorted(folder for folder in folder.iterdir() if folder.name.isdecimal())
+        return sorted(folder for folder in self.path.glob("checkpoints/*") if folder.name.isdecimal())
 
     def episode_file(self, number: int) -> Path:
         """Return the file of a recorded episode."""
         return self.episodes / f"{number:06d}.npz"
 
     def next_episode_number(self) -> int:
-        """Return the number after the highest one there is."""
+        """Return the number of the next recorded episode."""
         numbers = [int(file.stem) for file in self.episodes.glob("*.npz") if file.stem.isdecimal()]
         return max(numbers, default=-1) + 1
 
     def recipe(self) -> Recipe:
-        """Read the resolved recipe; raises `ArtifactError` if it is not the one that the training began with."""
+        """Read the resolved recipe; raises `ArtifactError` if it is missing or was changed later."""
         from rlctl.recipe.recipe import validate
         from rlctl.recipe.sources import read
 
@@ -109,13 +104,13 @@ class RunDirectory:
         content = read(self.recipe_file)
         if not files.is_as_sealed(self.recipe_file):
             raise ArtifactError(
-                f"{self.recipe_file}: not as the training wrote it: edited, or damaged. "
-                f"For a new training with it: rlctl train TASK --config {self.recipe_file}"
+                f"{self.recipe_file}: changed since the training wrote it. "
+                f"To train with the changed recipe: rlctl train TASK --config {self.recipe_file}"
             )
         return validate(content, str(self.recipe_file))
 
     def write_recipe(self, recipe: Recipe) -> None:
-        """Write the resolved recipe; what is edited in it later is noticed."""
+        """Write the resolved recipe with its SHA-256, which reveals later changes."""
         from rlctl.recipe.json_schema import format_editor_line
 
         files.write_sealed(self.recipe_file, format_editor_line() + recipe.to_yaml())
@@ -124,15 +119,15 @@ class RunDirectory:
         """Read `run.json`."""
         status = files.read_json(self.status_file)
         if not isinstance(status, dict) or not isinstance(status.get("task"), str):
-            raise ArtifactError(f"{self.status_file}: not a run of rlctl: it names no task")
+            raise ArtifactError(f"{self.status_file}: not a run of rlctl: it has no task")
         return status
 
     def id(self) -> str:
-        """Return what tells this run from all others; it stays with the folder when that is moved or copied."""
+        """Return the unique id of the run, which stays the same if the folder is moved or copied."""
         return str(self.status().get("id", ""))
 
     def write_status(self, changes: Mapping[str, Any]) -> None:
-        """Put some values into `run.json`; raises `RunTaken` after another process has claimed the run."""
+        """Update values of `run.json`; raises `RunTaken` if another process has claimed the run."""
         self.check_claim()
         known = files.read_json(self.status_file) if self.status_file.exists() else {}
         files.write_json(self.status_file, {**known, **changes})
@@ -144,7 +139,7 @@ class RunDirectory:
             if not file.is_file():
                 if which == "best" and self.evals_file.is_file() and self.checkpoints():
                     raise ArtifactError(f"{file}: missing, although the run was evaluated; use --checkpoint last")
-                hint = "train longer, or use --checkpoint last" if which == "best" else "it saved none"
+                hint = "train longer, or use --checkpoint last" if which == "best" else "the run saved none"
                 raise ArtifactError(f"{self.path}: no {which} policy yet; {hint}")
             return file
         if not which.isdecimal() or len(which) > _DIGITS:
@@ -156,22 +151,22 @@ class RunDirectory:
         return file
 
     def recover(self) -> None:
-        """Repair what a killed process left half-done; only for the holder of the lock."""
+        """Repair files that a killed process left incomplete; call it only while holding the lock."""
         for folder in [self.path, *(path for path in self.path.glob("*") if path.is_dir()), self.replay_segments]:
             files.recover(folder)
 
     def lock(self) -> RunLock:
         """Claim the folder for writing until the lock is released or the process ends.
 
-        Raises `RunTaken` if another process holds it, and `ArtifactError` for a folder with a link out of it: what is
-        written must stay in the run. Where the file system does not keep others out, the last to claim the run has it.
+        Raises `RunTaken` if another process holds it, and `ArtifactError` for a symbolic link that leads out of the
+        folder. On a file system without locks, the last process to claim the run owns it.
         """
         own = self.path.resolve()
         for place in self.path.rglob("*"):
             if place.is_symlink() and not place.resolve().is_relative_to(own):
-                raise ArtifactError(f"{place}: a link out of the run's folder; nothing is written through it")
+                raise ArtifactError(f"{place}: a symbolic link out of the run's folder; remove it")
         lock = RunLock(self.path)
-        with contextlib.suppress(OSError):  # a full disk, which takes nothing else either
+        with contextlib.suppress(OSError):  # the disk may be full
             claim = uuid.uuid4().hex
             files.write_text(self.claim_file, claim)
             self._claim = claim
@@ -180,28 +175,25 @@ class RunDirectory:
     def check_claim(self) -> None:
         """Raise `RunTaken` if another process has claimed the run since this object did.
 
-        Called before each write: locks of network file systems may hold on one machine only, or not at all.
+        Called before each write: locks of network file systems may work on one machine only, or not at all.
         """
-        if not self._claim:
-            return
-        try:
-            owner = self.claim_file.read_text(encoding="utf-8")
-        except OSError:
-            return
+        owner = self._claim
+        with contextlib.suppress(OSError):
+            owner = owner and self.claim_file.read_text(encoding="utf-8")
         if owner != self._claim:
-            raise RunTaken(f"{self.path}: another process has taken over this run; nothing more is written here")
+            raise RunTaken(f"{self.path}: another process has taken over this run; this process no longer writes to it")
 
 
 class RunLock:
-    """Keeps a second process from writing a run, or another `kind` of folder with runs.
+    """Prevents two processes from writing the same run, or another `kind` of folder with runs.
 
-    The system releases it when the process ends, however it ends.
+    The operating system releases it when the process ends, even after a crash.
     """
 
     def __init__(self, folder: Path, kind: str = "run") -> None:
         self._kind = kind
         self.keeps_out = True
-        """Whether it does keep others out: some network file systems have no locks."""
+        """False on a file system without locks, where other processes can write too."""
         self._file = folder / ".lock"
         self._descriptor = self._claim()
 
@@ -220,13 +212,13 @@ class RunLock:
                 os.close(descriptor)
                 raise
             self.keeps_out = False
-        with contextlib.suppress(OSError):  # a full disk: only the name of the owner is missing then
+        with contextlib.suppress(OSError):  # the disk may be full: then only the owner's name is missing
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"pid {os.getpid()} on {os.uname().nodename}".encode(), 0)
         return descriptor
 
     def release(self) -> None:
-        """Let go of the folder; a second call does nothing."""
+        """Release the folder; a second call does nothing."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
         self._descriptor = -1
@@ -249,7 +241,7 @@ def is_being_written(folder: Path) -> bool:
     except BlockingIOError:
         return True
     except OSError:
-        return False
+        pass
     finally:
         os.close(descriptor)
     return False
@@ -258,13 +250,13 @@ def is_being_written(folder: Path) -> bool:
 def create(task: str, seed: int, root: Path = ROOT) -> RunDirectory:
     """Make a new run folder, `<root>/<task>/<time>_s<seed>`, and point `<root>/latest` to it.
 
-    Where `root` is the folder of a group the run is in it, and `latest` where it is for all runs.
+    If `root` is the folder of a group, the run is made inside it; `latest` stays in the folder of all runs.
     """
     folder = root / registry.make_slug(task)
     if is_group(root):
         folder, root = root, root.parent.parent
     path = _make_new_folder(folder, f"s{seed}")
-    if not (folder / TUNE_FILE).is_file():  # a trial is not what was trained last
+    if not (folder / TUNE_FILE).is_file():  # `latest` never points to a trial of a tuning
         _point_latest_to(root, path)
     return RunDirectory(path)
 
@@ -275,7 +267,7 @@ def create_group_folder(task: str, kind: str, root: Path) -> Path:
 
 
 def _make_new_folder(parent: Path, kind: str) -> Path:
-    """Make `<time>_<kind>`, with a number behind it where that is there already."""
+    """Make `<time>_<kind>`, with a number appended if it exists already."""
     first = f"{datetime.datetime.now():%Y-%m-%d_%H-%M-%S}_{kind}"
     for attempt in range(1000):
         path = parent / (f"{first}_{attempt}" if attempt else first)
@@ -295,11 +287,10 @@ def is_group(path: Path) -> bool:
 
 
 def _point_latest_to(root: Path, run: Path) -> None:
-    """Let the link `latest` lead to a run."""
-    beside = root / f".latest.{os.getpid()}"
+    temporary = root / f".latest.{os.getpid()}"
     try:
-        beside.unlink(missing_ok=True)
-        beside.symlink_to(run.relative_to(root))
-        beside.replace(root / "latest")
-    except OSError:  # no links on this file system; runs are found by time without it
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
+        temporary.symlink_to(run.relative_to(root))
+        temporary.replace(root / "latest")
+    except OSError:  # a file system without symbolic links: runs are then found by time
+        temporary.unlink(missing_ok=True)

@@ -17,34 +17,34 @@ from rlctl.errors import ArtifactError
 from rlctl.storage import files, untrusted
 
 FORMAT = 2
-"""2: events draw from random streams of their own; episodes of 1 can be reproduced where no event acts."""
+"""In version 2 each event has its own random stream; episodes of version 1 can be reproduced if no event acts."""
 
 
 class EpisodeInfo(pydantic.BaseModel, extra="forbid"):
-    """What an episode was: its environment, its seed, how it ended."""
+    """The environment, the seed and the end of an episode."""
 
     format: int = FORMAT
     spec: EpisodeSpec
     """What the environment was made from."""
     seed: int = Field(ge=0)
     policy: str = ""
-    """What chose the actions, for people: a file name and a training step."""
+    """The policy's file name and training step, as text for people."""
     success: bool | None = None
     total_reward: float
     term_names: list[str] = []
     failure: str = ""
-    """What ended an episode that its environment did not finish: only its actions are known."""
+    """The error with which the environment failed; then only the actions are known."""
     versions: dict[str, str] = {}
 
 
 @dataclasses.dataclass(frozen=True)
 class Trajectory:
-    """What happened in T steps of an episode."""
+    """The data of T steps of an episode."""
 
     actions: NDArray[Any]
     """Shape (T, ...)."""
     observations: Observations
-    """What each action was chosen from and, last, what the steps ended with: shape (T + 1, ...), or a dict of such."""
+    """The observation before each action, and the last one: shape (T + 1, ...), or a dict of such arrays."""
     rewards: NDArray[np.float64]
     """Shape (T,)."""
     terms: NDArray[np.float64]
@@ -53,7 +53,7 @@ class Trajectory:
 
 @dataclasses.dataclass(frozen=True)
 class RecordedEpisode(Trajectory):
-    """An episode as its file holds it; the reward terms are in the order of `info.term_names`."""
+    """An episode of a file; the reward terms are in the order of `info.term_names`."""
 
     info: EpisodeInfo
 
@@ -91,7 +91,7 @@ def load_episode(path: Path) -> RecordedEpisode:
 
 
 def _find_mismatch(episode: RecordedEpisode) -> str | None:
-    """Say which array is not what an episode of as many steps as it has rewards would have; None if all are."""
+    """Return which array has a wrong shape or type for the number of rewards; None if all fit."""
     observations, rewards = episode.observations, episode.rewards
     if rewards.ndim != 1 or rewards.dtype != np.float64:
         return f"rewards are {_describe_array(rewards)}, not a row of float64"
@@ -99,7 +99,7 @@ def _find_mismatch(episode: RecordedEpisode) -> str | None:
     if episode.terms.shape != (steps, names) or episode.terms.dtype != np.float64:
         return f"reward terms are {_describe_array(episode.terms)}, not float64 of shape {(steps, names)}"
     parts = split(observations)
-    # Of an episode that failed there are its actions alone, however many.
+    # A failed episode has only its actions, of any number.
     acted, observed = (None, 0) if episode.info.failure and not steps else (steps, steps + 1)
     for name, values, count in (("actions", episode.actions, acted), *((k, v, observed) for k, v in parts.items())):
         label = name if name == "actions" else f"observations {name}".strip()

@@ -1,4 +1,4 @@
-"""From what the user typed for RUN to a run folder, a policy file, and what to say about the choice."""
+"""Finds the run folder or the policy file that the argument RUN names, with notes about the choice."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ class FoundPolicy:
     file: Path
     run: RunDirectory | None
     notes: tuple[str, ...] = ()
-    """What to tell a user who did not name the run: which it is, which were skipped, which older one was better."""
+    """Lines for a user who did not name the run: which run it is, which were skipped, which older one was better."""
 
     def locate(self, spec: EnvSpec) -> EnvSpec:
-        """Return `spec` with its task where it was when the run was trained; see `locate_task`."""
+        """Return `spec` with the absolute path of its task's file; see `locate_task`."""
         return dataclasses.replace(spec, task=locate_task(spec.task, self.run))
 
 
 def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> RunDirectory:
-    """Return the run that a user's word stands for: a folder, a task's name (its newest), `latest` or nothing.
+    """Return the run that the argument RUN names: a folder, a task's name (its newest run), `latest` or None.
 
-    Where there is none the error names the policy that the task ships, `to_train` from or to use.
+    If there is none, the error says how to use the policy that the task ships, or with `to_train` how to train it.
     """
     if text is not None and store.is_address(text):
         text = str(store.fetch(text))
     if text is None or text == "latest":
-        # The link first: names go by a clock, which may have been set back since.
+        # The link first: names contain the time, and the clock may have been set back.
         newest = _read_latest(root) or next(iter(_list_newest_first(root, "*/*/run.json", "*/*/*_s*/run.json")), None)
         if newest is None:
             tunings = sorted(root.glob(f"*/*/{TUNE_FILE}"))
@@ -69,21 +69,21 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
         raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
     if Path(text).is_file() and Path(text).suffix != ".zip":
         hint = f"; its run: {Path(text).parent}" if (Path(text).parent / "run.json").is_file() else ""
-        raise ArtifactError(f"{text}: not a run, and no policy (.safetensors, .onnx){hint}")
+        raise ArtifactError(f"{text}: neither a run nor a policy (.safetensors, .onnx){hint}")
     if Path(text).suffix == ".zip":
         raise ArtifactError(
-            f"{text}: a .zip, as Stable-Baselines3 saves models, not a run; make a policy of it: "
+            f"{text}: a .zip, the model format of Stable-Baselines3, not a run; convert it: "
             f"rlctl runs import {text} --task TASK"
         )
     if tunings := sorted((root / registry.make_slug(text)).glob(f"*/{TUNE_FILE}")):
         raise ArtifactError(f"no run of {text!r} but the trials of rlctl tune; name one in {tunings[-1].parent}")
     if entry := installed.find(text):
         option = f"rlctl train {text} --from {text}" if to_train else "--pretrained"
-        shipped = f"; for the policy that it ships: {option}" if entry.policy_file else ""
+        shipped = f"; to use the policy that it ships: {option}" if entry.policy_file else ""
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
     names = {folder.name for folder in root.glob("*/")} | {folder.name for folder in installed.list_installed()}
     hint = did_you_mean(text, sorted(names)) or " All runs: rlctl runs"
-    raise ArtifactError(f"no run {text!r}: not a folder, and no task with a run.{hint}")
+    raise ArtifactError(f"no run {text!r}: neither a folder nor a task with a run.{hint}")
 
 
 def refuse_tuning(path: Path) -> None:
@@ -91,15 +91,15 @@ def refuse_tuning(path: Path) -> None:
     if (path / TUNE_FILE).is_file():
         raise UsageError(
             f"{path}: the trials of rlctl tune, not seeds of one recipe; name one of its runs "
-            f"(to go on with it, or see its table: rlctl tune --resume {path})"
+            f"(to resume it or to see its table: rlctl tune --resume {path})"
         )
 
 
 def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> FoundPolicy:
-    """Return the policy for a user's word, which may be a policy file itself.
+    """Return the policy that the argument RUN names, which may be a policy file.
 
-    A task's name stands for its newest run that has such a policy; with `pretrained` for the policy it ships. Where
-    the source of the task has changed since the training a note says so.
+    A task's name means its newest run that has such a policy; if `which` is `pretrained`, the policy that it ships.
+    A note warns if the task's source has changed since the training.
     """
     if text is not None and which != PRETRAINED and store.is_address(text):
         text = str(store.fetch(text))
@@ -107,11 +107,11 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> Fou
     change = None if policy.run is None else describe_source_change(policy.run)
     if change is None:
         return policy
-    return dataclasses.replace(policy, notes=(*policy.notes, f"warning: {change}; its score may be another now"))
+    return dataclasses.replace(policy, notes=(*policy.notes, f"warning: {change}; its score may have changed"))
 
 
 def describe_source_change(run: RunDirectory) -> str | None:
-    """Say that the file of a run's task is not what it was when the run began; None where it is, or is not known."""
+    """Return how the source of a run's task has changed since the run began; None if it has not, or is not known."""
     try:
         status = run.status()
         task, digest = locate_task(str(status["task"]), run), status.get("source_sha256")
@@ -147,7 +147,7 @@ def _find_policy(text: str | None, which: str, root: Path) -> FoundPolicy:
         with contextlib.suppress(ArtifactError):
             file = candidate.policy_file(which)
             return FoundPolicy(file, candidate, _describe_choice(file, candidate, candidates[:number], older[number:]))
-    run.policy_file(which)  # which says why there is none
+    run.policy_file(which)  # raises, and says why there is none
     raise AssertionError
 
 
@@ -158,7 +158,7 @@ def _find_shipped(task: str | None) -> FoundPolicy:
     if info.provenance is not None:
         digest = info.provenance.source_sha256
         if change := _describe_source_change(info.spec.task, digest, "this policy was exported"):
-            notes.append(f"warning: {change}; its score may be another now")
+            notes.append(f"warning: {change}; its score may have changed")
     return FoundPolicy(file, None, tuple(notes))
 
 
@@ -169,10 +169,10 @@ def find_owner(file: Path) -> RunDirectory | None:
 
 
 def locate_task(task: str, run: RunDirectory | None) -> str:
-    """Return a task with the whole path of its file, if it was named by a path from the folder of the training.
+    """Return a task with the absolute path of its file, if the training named it by a relative path.
 
-    A run that has been moved to another folder finds the file there, by the path that was typed. A module that is found
-    nowhere else is imported from the folder of the training. A downloaded run names no folder of this machine.
+    A run that has been moved uses the same relative path from the current folder. A module that is found nowhere else
+    is imported from the folder of the training. A downloaded run names no folder of this machine.
     """
     place, _, name = task.rpartition(":")
     if run is None or not place or Path(place).expanduser().is_absolute() or store.is_cached(run.path):
@@ -182,7 +182,7 @@ def locate_task(task: str, run: RunDirectory | None) -> str:
         return task
     if not place.endswith(".py"):
         if registry.find_source_file(f"{place}:{name}") is None and Path(folder).is_dir() and folder not in sys.path:
-            sys.path.append(folder)  # handed on to the workers
+            sys.path.append(folder)  # the workers get the same path
         return task
     if not (original := Path(folder) / place).is_file():
         return task
@@ -192,7 +192,7 @@ def locate_task(task: str, run: RunDirectory | None) -> str:
 
 
 def _describe_choice(
-    file: Path, run: RunDirectory, passed_over: Sequence[RunDirectory], older: Sequence[RunDirectory]
+    file: Path, run: RunDirectory, skipped: Sequence[RunDirectory], older: Sequence[RunDirectory]
 ) -> tuple[str, ...]:
     try:
         info = PolicyFile.read_info(file)
@@ -201,9 +201,9 @@ def _describe_choice(
     age = format_duration(max(time.time() - file.stat().st_mtime, 0.0))
     notes = [f"run {run.path}: policy of step {info.training_steps:,}, saved {age} ago"]
     if is_group(run.path.parent):
-        notes.append(f"it is one of a group: {run.path.parent}")
-    if passed_over:
-        notes.append(f"skipped {', '.join(str(skipped.path) for skipped in passed_over)}: no such policy yet")
+        notes.append(f"it belongs to the group {run.path.parent}")
+    if skipped:
+        notes.append(f"skipped {', '.join(str(run.path) for run in skipped)}: no such policy yet")
     if (better := _find_better(info, older)) is not None:
         notes.append(better)
     return tuple(notes)
@@ -227,11 +227,11 @@ def _find_better(info: PolicyInfo, older: Sequence[RunDirectory]) -> str | None:
     if not better:
         return None
     _, run, scores = max(better, key=lambda scored: scored[0])
-    return f"an older run was better in its evaluations: {run.path} ({scores})"
+    return f"an older run had a better evaluation: {run.path} ({scores})"
 
 
 def _read_latest(root: Path) -> RunDirectory | None:
-    with contextlib.suppress(OSError, ValueError):  # no link, or one that leads elsewhere
+    with contextlib.suppress(OSError, ValueError):  # no link, or one to another place
         run = root / os.readlink(root / "latest")
         if (root / "latest").resolve().is_relative_to(root.resolve()) and (run / "run.json").is_file():
             return RunDirectory(run)
@@ -239,7 +239,7 @@ def _read_latest(root: Path) -> RunDirectory | None:
 
 
 def _list_newest_first(root: Path, *patterns: str) -> list[RunDirectory]:
-    """Return the runs below `root`, but for the trials of a tuning."""
+    """Return the runs below `root` without the trials of a tuning."""
     folders = (file.parent for pattern in patterns for file in root.glob(pattern))
     runs = [run for run in folders if _RUN_NAME.match(run.name) and not (run.parent / TUNE_FILE).is_file()]
     runs.sort(key=lambda run: (run.name[:19], (run / "run.json").stat().st_mtime_ns), reverse=True)

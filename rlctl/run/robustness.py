@@ -1,4 +1,4 @@
-"""How robust a policy is: what `rlctl eval --vary` and `--push` measured, kept in its run as `robustness.json`."""
+"""The robustness of a policy, measured by `rlctl eval --vary` and `--push`, in its run's `robustness.json`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class _Content(pydantic.BaseModel, extra="forbid", frozen=True):
 
 
 class Outcome(_Content):
-    """What the episodes of one setting came to."""
+    """The scores of the episodes in one setting."""
 
     success_rate: float | None
     """In [0, 1]; None where the task reports no success."""
@@ -26,20 +26,20 @@ class Outcome(_Content):
     """95 % interval of the success rate; see `success_interval`."""
     mean_return: float
     return_interval: Interval
-    """95 % interval of the mean, by Student's t; the value itself, twice, for a single episode."""
+    """95 % interval of the mean, by Student's t; for a single episode both ends are its return."""
 
 
 class Cell(Outcome):
-    """The episodes of one place in a map."""
+    """The scores in one cell of a map."""
 
     values: list[float]
     """One per axis."""
     nominal: bool
-    """Whether every value is that of the world as it was built."""
+    """Whether every value is that of the unchanged world."""
 
     @property
     def score(self) -> tuple[float, float]:
-        """What cells are ordered by: the success rate where there is one, then the mean return."""
+        """Cells are ordered by the success rate, if it is reported, then by the mean return."""
         return (0.0 if self.success_rate is None else self.success_rate), self.mean_return
 
 
@@ -52,13 +52,13 @@ class Axis(_Content):
     """As `--set` names it: `events.mass.factor`, `task.tolerance`."""
     values: list[float]
     nominal: float | None
-    """The value of the world as it was built; None where it is not one number."""
+    """The value in the unchanged world; None if it is not a single number."""
     whole: bool = False
     """Whether only whole numbers are possible."""
 
 
 class RobustnessMap(_Content):
-    """One or two things varied together; all else is nominal."""
+    """One or two axes varied together; everything else is nominal."""
 
     axes: list[Axis]
     cells: list[Cell]
@@ -74,16 +74,16 @@ class RobustnessMap(_Content):
 
 
 class PushLevel(Outcome):
-    """The episodes with pushes of one size."""
+    """The scores with pushes of one impulse."""
 
     impulse: float
     """Force times duration [N s]."""
     held: float
-    """Part of the episodes that went well, in [0, 1], by `PushTest.measure`."""
+    """Fraction of the episodes that went well, in [0, 1], as `PushTest.measure` defines it."""
 
 
 class PushTest(_Content):
-    """From which horizontal push at mid-episode on the policy fails."""
+    """The smallest horizontal push at mid-episode at which the policy fails."""
 
     body: str
     link: str | None
@@ -105,14 +105,14 @@ class PushTest(_Content):
 
 
 class Robustness(_Content):
-    """What was measured of one policy."""
+    """The measurements of one policy."""
 
     format: int = FORMAT
     task: str
     parameters: dict[str, Any]
     reward_weights: dict[str, float] = {}
     events: dict[str, dict[str, Any]] = {}
-    """Those that act in every cell; see `EnvSpec.events`."""
+    """Events that are active in every cell; see `EnvSpec.events`."""
     policy_file: str
     algo: str
     training_steps: int
@@ -121,11 +121,11 @@ class Robustness(_Content):
     seed: int
     deterministic: bool
     nominal: Outcome
-    """Without anything varied."""
+    """With nothing varied."""
     maps: list[RobustnessMap] = []
     push: PushTest | None = None
     command: str = ""
-    """How to measure it again."""
+    """The command that measured it."""
     versions: dict[str, str] = {}
 
     def find_worst(self) -> tuple[RobustnessMap, Cell] | None:
@@ -135,7 +135,7 @@ class Robustness(_Content):
 
 
 def write(path: Path, result: Robustness) -> None:
-    """Write a result, whole or not at all."""
+    """Write a result, atomically."""
     files.write_json(path, result.model_dump(mode="json"))
 
 

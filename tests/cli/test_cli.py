@@ -135,10 +135,10 @@ def test_no_arguments_show_the_help(rlctl):
         ),
         (["eval", "--min-success", "95"], 2, "error: --min-success 95: a rate is between 0 and 1; 95 % is 0.95"),
         (["train", "two.py"], 2, "error: two.py: give the class too: two.py:Swing or two.py:Twirl"),
-        (["eval", "model.zip"], 5, "error: model.zip: a .zip, as Stable-Baselines3 saves models, not a run; make "),
+        (["eval", "model.zip"], 5, "error: model.zip: a .zip, the model format of Stable-Baselines3, not a run"),
         (["train", "broken.py:Env"], 3, "error: task 'broken.py:Env': import failed: RuntimeError: no robot (broken."),
         (["eval"], 5, "error: no run yet under "),
-        (["eval", ""], 5, "error: no run '': not a folder, and no task with a run"),
+        (["eval", ""], 5, "error: no run '': neither a folder nor a task with a run"),
         (["eval", "reach"], 5, "error: no run of 'reach' yet under "),
         (["eval", "missing.safetensors"], 5, "error: missing.safetensors: no such file"),
         (["train", "reach", "--config", "missing.yaml"], 5, "error: no recipe file missing.yaml"),
@@ -290,5 +290,5 @@ def test_an_option_that_is_a_key_of_the_recipe(rlctl, option, setting):
 def test_resuming_a_task_without_a_run(rlctl):
     result = rlctl("train", "--resume", "reach")
     assert result.returncode == 5
-    assert "for the policy that it ships: rlctl train reach --from reach" in result.stderr
+    assert "to use the policy that it ships: rlctl train reach --from reach" in result.stderr
     assert "--pretrained" not in result.stderr

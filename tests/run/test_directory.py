@@ -32,9 +32,7 @@ def test_a_recipe_that_was_edited_is_refused(make_run):
     run.write_recipe(Recipe(algo="ppo", total_timesteps=100, n_envs=4, seed=3))
     assert run.recipe().seed == 3
     run.recipe_file.write_text(run.recipe_file.read_text().replace("seed: 3", "seed: 4"))
-    with pytest.raises(
-        ArtifactError, match=r"recipe.yaml: not as the training wrote it: edited, or damaged. For a new"
-    ):
+    with pytest.raises(ArtifactError, match=r"recipe.yaml: changed since the training wrote it. To train with"):
         run.recipe()
 
 
@@ -79,7 +77,7 @@ def test_status(root, make_run):
     run.write_status({"steps": 10})
     assert run.status() == {"task": "reach", "status": "running", "steps": 10}
     run.status_file.write_text("[]")
-    assert error(ArtifactError, run.status) == f"{run.status_file}: not a run of rlctl: it names no task"
+    assert error(ArtifactError, run.status) == f"{run.status_file}: not a run of rlctl: it has no task"
     run.status_file.write_text("{")
     assert error(ArtifactError, run.status).startswith(f"{run.status_file}: damaged: ")
 
@@ -129,6 +127,6 @@ def test_the_last_process_to_claim_a_run_has_it_where_locks_keep_nobody_out(monk
     first.write_status({"steps": 1})
     second.lock()
     message = error(RunTaken, lambda: first.write_status({"steps": 2}))
-    assert message == f"{first.path}: another process has taken over this run; nothing more is written here"
+    assert message == f"{first.path}: another process has taken over this run; this process no longer writes to it"
     second.write_status({"steps": 3})
     assert first.status()["steps"] == 3

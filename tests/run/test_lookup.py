@@ -45,7 +45,8 @@ def test_no_run_yet(root):
     expected = f"no run yet under {root}; train one: rlctl train reach"
     assert error(ArtifactError, find_run, None, root) == expected
     assert error(ArtifactError, find_run, "reach", root) == (
-        f"no run of 'reach' yet under {root}; train one: rlctl train reach; for the policy that it ships: --pretrained"
+        f"no run of 'reach' yet under {root}; train one: rlctl train reach; "
+        "to use the policy that it ships: --pretrained"
     )
     assert ArtifactError("").exit_code == 5
 
@@ -53,9 +54,9 @@ def test_no_run_yet(root):
 def test_a_word_that_stands_for_no_run(root, make_run, tmp_path):
     make_run("reach", "2026-01-01_10-00-00_s0")
     assert error(ArtifactError, find_run, "raech", root) == (
-        "no run 'raech': not a folder, and no task with a run. Did you mean 'reach'?"
+        "no run 'raech': neither a folder nor a task with a run. Did you mean 'reach'?"
     )
-    assert error(ArtifactError, find_run, "hoper", root).endswith("no task with a run. Did you mean 'hopper'?")
+    assert error(ArtifactError, find_run, "hoper", root).endswith("nor a task with a run. Did you mean 'hopper'?")
     (tmp_path / "stuff").mkdir()
     assert error(ArtifactError, find_run, "stuff", root) == "stuff: not a run of rlctl: it has no run.json"
 
@@ -66,7 +67,10 @@ def test_which_policy(root, make_run):
     assert found.file == run.best_policy
     assert found.run.path == run.path
     assert find_policy(str(run.best_policy), root=root).run.path == run.path
-    assert error(ArtifactError, find_policy, "reach", "last", root) == f"{run.path}: no last policy yet; it saved none"
+    assert (
+        error(ArtifactError, find_policy, "reach", "last", root)
+        == f"{run.path}: no last policy yet; the run saved none"
+    )
     assert error(UsageError, find_policy, "reach", "worst", root) == (
         "--checkpoint 'worst': give best, last, or the step of a checkpoint"
     )
@@ -123,7 +127,7 @@ def test_a_task_stands_for_its_newest_run_with_a_policy(root, make_run, monkeypa
     assert found.notes == (
         f"run {second.path}: policy of step 1,000, saved 2 h ago",
         f"skipped {third.path}: no such policy yet",
-        f"an older run was better in its evaluations: {first.path} (success 90.0% against 50.0%)",
+        f"an older run had a better evaluation: {first.path} (success 90.0% against 50.0%)",
     )
     # The newest run is what `latest` says, with a policy or not.
     assert error(ArtifactError, find_policy, "latest", "best", root) == (
@@ -164,7 +168,7 @@ def test_latest_is_the_newest_run_when_its_own_was_removed(root, make_run, text)
 def test_a_model_of_sb3_is_told_what_it_is(root, make_run, tmp_path):
     (tmp_path / "model.zip").write_bytes(b"PK")
     assert error(ArtifactError, find_policy, "model.zip", "best", root) == (
-        "model.zip: a .zip, as Stable-Baselines3 saves models, not a run; make a policy of it: "
+        "model.zip: a .zip, the model format of Stable-Baselines3, not a run; convert it: "
         "rlctl runs import model.zip --task TASK"
     )
 
@@ -212,5 +216,5 @@ def test_a_file_that_is_no_policy(root, make_run):
     run = make_run("reach", "2026-01-01_10-00-00_s0")
     run.metrics_file.write_text("steps\n")
     assert error(ArtifactError, find_policy, str(run.metrics_file), "best", root) == (
-        f"{run.metrics_file}: not a run, and no policy (.safetensors, .onnx); its run: {run.path}"
+        f"{run.metrics_file}: neither a run nor a policy (.safetensors, .onnx); its run: {run.path}"
     )

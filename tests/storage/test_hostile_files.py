@@ -193,7 +193,7 @@ def test_json_that_is_none(content, message, tmp_path):
 @pytest.mark.parametrize("content", ["null", "[]", '"task"', "{}", '{"task": null}', '{"task": ["reach"]}'])
 def test_a_run_that_names_no_task(content, tmp_path):
     (tmp_path / "run.json").write_text(content)
-    with pytest.raises(ArtifactError, match=r"run.json: not a run of rlctl: it names no task$"):
+    with pytest.raises(ArtifactError, match=r"run.json: not a run of rlctl: it has no task$"):
         RunDirectory(tmp_path).status()
 
 
@@ -242,7 +242,7 @@ def test_a_run_with_a_link_out_of_it_is_not_written(name, tmp_path):
     outside = tmp_path / "precious"
     outside.write_text("kept")
     (tmp_path / "run" / name).symlink_to(outside)
-    with pytest.raises(ArtifactError, match=rf"{name}: a link out of the run's folder; nothing is written through it$"):
+    with pytest.raises(ArtifactError, match=rf"{name}: a symbolic link out of the run's folder; remove it$"):
         RunDirectory(tmp_path / "run").lock()
     assert outside.read_text() == "kept"
 

@@ -139,7 +139,7 @@ def test_a_process_that_has_lost_its_run_writes_nothing_more(start, rlctl, tmp_p
     assert (
         stderr.strip()
         .splitlines()[-1]
-        .endswith("another process has taken over this run; nothing more is written here")
+        .endswith("another process has taken over this run; this process no longer writes to it")
     )
     assert resumed.returncode == 0, resumed.stderr
     steps = [int(line.partition(",")[0]) for line in (run / "metrics.csv").read_text().splitlines()[1:]]

@@ -88,7 +88,7 @@ def test_runs_of_a_group_are_found(group):
     assert sorted(names) == sorted(f"Line/{group.path.name}/{group.find_run(seed).path.name}" for seed in (4, 5))
     with pytest.raises(UsageError, match="a group of runs; name one of them"):
         find_run(str(group.path), root)
-    assert f"it is one of a group: {group.path}" in find_policy("latest", root=root).notes
+    assert f"it belongs to the group {group.path}" in find_policy("latest", root=root).notes
     assert find_policy(str(newest), root=root).notes == ()
 
 
