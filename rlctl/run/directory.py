@@ -177,9 +177,12 @@ class RunDirectory:
 
         Called before each write: locks of network file systems may work on one machine only, or not at all.
         """
-        owner = self._claim
-        with contextlib.suppress(OSError):
-            owner = owner and self.claim_file.read_text(encoding="utf-8")
+        if not self._claim:
+            return
+        try:
+            owner = self.claim_file.read_text(encoding="utf-8")
+        except OSError:
+            return
         if owner != self._claim:
             raise RunTaken(f"{self.path}: another process has taken over this run; this process no longer writes to it")
 
