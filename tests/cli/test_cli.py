@@ -136,7 +136,6 @@ def test_no_arguments_show_the_help(rlctl):
         (["eval", "--min-success", "95"], 2, "error: --min-success 95: a rate is between 0 and 1; 95 % is 0.95"),
         (["train", "two.py"], 2, "error: two.py: give the class too: two.py:Swing or two.py:Twirl"),
         (["eval", "model.zip"], 5, "error: model.zip: a .zip, the model format of Stable-Baselines3, not a run"),
-        (["eval", "model.zip"], 5, "error: model.zip: a .zip, the model format of Stable-Baselines3, not a run"),
         (["train", "broken.py:Env"], 3, "error: task 'broken.py:Env': import failed: RuntimeError: no robot (broken."),
         (["eval"], 5, "error: no run yet under "),
         (["eval", ""], 5, "error: no run '': neither a folder nor a task with a run"),
